@@ -1,0 +1,53 @@
+# On a fresh machine with Python >= 3.11, pip and make, every target sets itself up first.
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.PHONY: help setup demo test lint typecheck tests slow results paper sweeps
+
+help:  ## show this list
+	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+setup: $(INSTALLED)  ## make .venv with the project and its tools in it
+
+$(INSTALLED): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "Python >= 3.11 is needed")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+demo: $(INSTALLED)  ## identify and diagnose the recording that comes along; figures in demo/
+	$(BIN)/hmmseg demo --figures demo
+
+test: lint typecheck tests  ## all checks: style, types, tests
+
+lint: $(INSTALLED)  ## style and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+typecheck: $(INSTALLED)  ## static types
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+tests: $(INSTALLED)  ## tests alone, without those marked slow
+	$(BIN)/pytest -n auto --dist loadfile tests
+
+slow: $(INSTALLED)  ## the tests marked slow
+	$(BIN)/pytest -n auto --dist loadfile -m slow tests
+
+results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
+	$(BIN)/python -m experiments.score_recordings recordings
+	$(BIN)/python -m experiments.calibration recordings
+	$(BIN)/python -m experiments.ablation
+	$(BIN)/python -m experiments.benchmarks.moves
+	$(BIN)/python -m experiments.benchmarks.identify
+	$(BIN)/python -m experiments.write_tables
+
+paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills docs/reproduction.md
+	$(BIN)/python -m experiments.paper
+	$(BIN)/python -m paper_figs
+	$(BIN)/python -m experiments.paper.write_docs
+	$(BIN)/python -m experiments.sweeps --small --workers 2
+
+sweeps: $(INSTALLED)  ## robustness sweeps in full (half an hour on 2 cores), resumable; tables and figures
+	$(BIN)/python -m experiments.sweeps --workers 2
+	for figure in plane lines coverage; do $(BIN)/python -m paper_figs.sweep_$$figure || exit 1; done

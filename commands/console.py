@@ -1,0 +1,221 @@
+"""What every command shares: its options, its results on screen and in files, its warnings.
+
+A command opens an `Output` before it reads anything, so that a destination that cannot be
+written is found before the work and not after it. Files are staged apart and put in place
+together by `Output.finish`; a command that fails has written nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json as jsonlib
+import math
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+import hmmseg
+from hmmseg.errors import InputError
+
+TrialsArgument = Annotated[list[Path], typer.Argument(
+    metavar="TRIAL...", help="Recordings (.csv, .parquet or .npz); several are pooled.")]  # fmt: skip
+TaskArgument = Annotated[Path, typer.Argument(metavar="TASK", help="Task description (TOML).")]
+TaskOption = Annotated[Path, typer.Option("--task", metavar="T", help="Task description (TOML).")]
+RigOption = Annotated[Path, typer.Option("--rig", metavar="R", help="Nominal hand (TOML).")]
+ActualOption = Annotated[Path | None, typer.Option(
+    "--actual", metavar="A", help="Properties measured apart from the trials (TOML).")]  # fmt: skip
+JsonOption = Annotated[str | None, typer.Option(
+    "--json", metavar="FILE", help="Write the result as JSON; - is standard output.")]  # fmt: skip
+FiguresOption = Annotated[Path | None, typer.Option(
+    "--figures", metavar="DIR", help="Draw the figures into this folder.")]  # fmt: skip
+ReportOption = Annotated[Path | None, typer.Option(
+    "--report", metavar="FILE.html", help="Write one self-contained page.")]  # fmt: skip
+SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")]
+QuietOption = Annotated[bool, typer.Option(
+    "--quiet", help="Print nothing but errors; warnings stand in the JSON.")]  # fmt: skip
+
+STANDARD_OUTPUT = "-"
+INPUT_SUFFIXES = (".csv", ".parquet", ".npz", ".toml")
+
+
+class Output:
+    """Where one command's results go: the screen, a JSON document, figures and a report.
+
+    Use as a context manager. `print` and `warn` speak to people, `figure` and `stage` hand out
+    paths to draw and write to, `finish` puts everything in place. Raises InputError at once
+    when a destination cannot be written.
+    """
+
+    def __init__(self, command: str, *, json: str | None = None, figures: Path | None = None,
+                 report: Path | None = None, seed: int = 0, quiet: bool = False) -> None:  # fmt: skip
+        self.command, self.seed = command, seed
+        self.json, self.figures, self.report = json, figures, report
+        self.warnings: list[str] = []
+        self._drawn: list[Path] = []
+        self._staged: dict[Path, Path] = {}
+        self._cleanup = contextlib.ExitStack()
+        if json not in (None, STANDARD_OUTPUT):
+            check_file("--json", Path(json), refused=INPUT_SUFFIXES)
+        if report is not None:
+            check_file("--report", report, suffixes=(".html", ".htm"))
+        if figures is not None:
+            check_folder("--figures", figures)
+        only_json = json == STANDARD_OUTPUT
+        self._console = _console(sys.stderr if only_json else sys.stdout, quiet)
+        self._side = _console(sys.stderr, quiet)
+
+    def __enter__(self) -> Output:
+        self._folder = Path(self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="hmmseg-")))
+        self._stdout = sys.stdout
+        if self.json == STANDARD_OUTPUT:  # a stray print must not spoil the document
+            self._cleanup.enter_context(contextlib.redirect_stdout(sys.stderr))
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._cleanup.close()
+
+    def print(self, *renderables: Any) -> None:
+        """Show tables or text to people: standard output, or standard error beside `--json -`."""
+        for renderable in renderables:
+            self._console.print(renderable, highlight=False, markup=False)
+
+    def warn(self, text: str) -> None:
+        """Keep a warning for the JSON document and show it on standard error."""
+        self.warnings.append(text)
+        self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
+
+    @contextlib.contextmanager
+    def progress(self, text: str, total: int) -> Iterator[Callable[[int], None]]:
+        """A progress bar on standard error; yields a function that advances it by so many steps."""
+        from rich.progress import Progress
+
+        with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
+            task = bar.add_task(text, total=total)
+            yield lambda steps: bar.advance(task, steps)
+
+    def figure(self, name: str) -> Path:
+        """Path to draw a figure of this file name to; only where `--figures` was given."""
+        if self.figures is None:
+            raise ValueError("no folder for figures was given")
+        destination = self.figures / name
+        if destination not in self._drawn:
+            self._drawn.append(destination)
+        return self.stage(destination)
+
+    def stage(self, destination: Path) -> Path:
+        """Path to write to now; `finish` puts the file at its destination."""
+        if destination not in self._staged:
+            self._staged[destination] = self._folder / f"{len(self._staged)}-{destination.name}"
+        return self._staged[destination]
+
+    def finish(self, document: dict[str, Any]) -> None:
+        """Write the staged files and the JSON document (`format`, `version`, ... are added here)."""
+        envelope = {
+            "format": f"hmmseg.{self.command}/1",
+            "version": hmmseg.__version__,
+            "seed": self.seed,
+            "warnings": self.warnings,
+            "figures": [str(path) for path in self._drawn],
+        }
+        text = strict_json({**envelope, **document})
+        if self.json not in (None, STANDARD_OUTPUT):
+            self.stage(Path(self.json)).write_text(text, encoding="utf-8")
+        _publish(self._staged)
+        if self.json == STANDARD_OUTPUT:
+            self._stdout.write(text)
+            self._stdout.flush()
+
+
+def strict_json(document: Any) -> str:
+    """JSON text of dicts, sequences, numbers and arrays; NaN and infinities become null."""
+    return jsonlib.dumps(_plain(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if hasattr(value, "tolist"):  # NumPy and JAX arrays and scalars
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def distinct_trials(paths: Sequence[Path]) -> list[Path]:
+    """The trials' paths; InputError where one trial is given twice, under two names even.
+
+    A trial pooled with itself would count its noise as independent evidence.
+    """
+    seen: dict[str, Path] = {}
+    for path in paths:
+        if not path.is_file():
+            problem = "is a folder" if path.is_dir() else "no such file"
+            raise InputError(str(path), problem, "a trial (.csv, .parquet or .npz)")
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        if content in seen:
+            raise InputError(str(path), f"the same trial as {seen[content]}", "every trial once")
+        seen[content] = path
+    return list(paths)
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """InputError unless files can be written into the folder, which may be yet to be made."""
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"{option} {folder}", f"{existing} is not a folder", "a folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"{option} {folder}", f"{existing} cannot be written to", "a writable folder")
+
+
+def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: Sequence[str] = ()) -> None:
+    """InputError unless this file can be written; `suffixes` are its kinds, `refused` what it may not be."""
+    where = f"{option} {path}"
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(where, "unknown kind of file", " or ".join(suffixes))
+    if path.suffix.lower() in refused:  # `--json TRIAL.csv`, its own operand forgotten
+        raise InputError(where, "would be written over, and its name is that of an input", "a .json file")
+    if path.is_dir():
+        raise InputError(where, "is a folder", "a file")
+    if not path.absolute().parent.is_dir():
+        raise InputError(where, f"no folder {path.parent}", "a file in a folder that exists")
+    writable = os.access(path, os.W_OK) if path.exists() else os.access(path.absolute().parent, os.W_OK)
+    if not writable:
+        raise InputError(where, "cannot be written", "a writable file")
+
+
+def _publish(staged: dict[Path, Path]) -> None:
+    """Copy beside each destination first, then rename: nobody sees half a file."""
+    beside: dict[Path, Path] = {}
+    try:
+        for destination, source in staged.items():
+            if destination.exists() and not destination.is_file():  # a pipe or device: no renaming onto it
+                destination.write_bytes(source.read_bytes())
+                continue
+            target = destination.resolve()
+            target.parent.mkdir(parents=True, exist_ok=True)
+            beside[target] = target.with_name(f".{target.name}.{os.getpid()}")
+            shutil.copyfile(source, beside[target])
+        for target, temporary in beside.items():
+            os.replace(temporary, target)
+    except OSError as error:
+        for temporary in beside.values():
+            temporary.unlink(missing_ok=True)
+        raise InputError(str(error.filename), f"cannot be written ({error.strerror})") from error
+
+
+def _console(file: Any, quiet: bool) -> Console:
+    width = None if file.isatty() or "COLUMNS" in os.environ else 120  # rich would fold a pipe at 80
+    return Console(file=file, quiet=quiet, width=width)

@@ -1,0 +1,138 @@
+"""`hmmseg diagnose`: where the sim-to-real gap lies, what causes it, how far it shrinks."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from commands.console import (
+    ActualOption,
+    FiguresOption,
+    JsonOption,
+    Output,
+    QuietOption,
+    ReportOption,
+    RigOption,
+    SeedOption,
+    TaskOption,
+    TrialsArgument,
+    distinct_trials,
+)
+from hmmseg.errors import InputError
+from hmmseg.task import BlockTask, read_task
+
+EffectOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
+    ),
+]
+
+
+def diagnose(
+    trials: TrialsArgument,
+    task: TaskOption,
+    rig: RigOption,
+    actual: ActualOption = None,
+    effect: EffectOption = None,
+    json: JsonOption = None,
+    figures: FiguresOption = None,
+    report: ReportOption = None,
+    seed: SeedOption = 0,
+    quiet: QuietOption = False,
+) -> None:
+    """The sim-to-real gap: where it lies, which unmodelled effect causes it, how far it shrinks."""
+    with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
+        paths = distinct_trials(trials)
+        description = read_task(task)
+        if not isinstance(description, BlockTask):
+            raise InputError(str(task), "a plain ordered task has no virtual model", "objects and moves")
+        from estimation.actual import read_actual
+        from hmmseg.rig import read_rig
+        from hmmseg.trial import read_trial
+        from simgap.effects import effect_named
+        from simgap.gap.diagnose import diagnose as run
+
+        hand = read_rig(rig)
+        measured = None if actual is None else read_actual(actual, description.objects)
+        forced = [effect_named(name).name for name in dict.fromkeys(effect or [])]
+        recordings = [read_trial(path, hand) for path in paths]
+        with out.progress("diagnosing", total=5) as advance:
+            found = run(recordings, description, hand, measured, forced, seed, lambda text: advance(1))
+        for warning in found.warnings:
+            out.warn(warning)
+        out.print(sentence(found.body), *tables(found.body))
+        _draw(out, found, measured)
+        out.finish(found.body)
+
+
+def _draw(out: Output, found, measured) -> None:
+    """Figures where asked for, and the page with the same figures inside."""
+    if out.figures is None and out.report is None:
+        return
+    from commands.figures.gap import draw_all
+    from commands.gap_report import page
+
+    if out.figures is not None:
+        draw_all(found, out.figure)
+    if out.report is not None:
+        out.stage(out.report).write_text(page(found, sentence(found.body), measured), encoding="utf-8")
+
+
+def sentence(body: dict[str, Any]) -> str:
+    """The verdict in a sentence."""
+    p, causes = body["detection"]["p_value"], " and ".join(body["causes"])
+    if body["verdict"] == "none":
+        return f"No gap beyond the sensors' noise was found (p = {p:.2g})."
+    if body["verdict"] == "unknown":
+        return f"There is a gap (p = {p:.2g}) that none of the candidate effects explains."
+    shrinkage, far = body["shrinkage"], ""
+    if shrinkage is not None and shrinkage["fraction"] is not None:
+        percent = f"{100 * shrinkage['fraction']:.0f} %"
+        far = f"; with it in the model the gap shrinks by {percent} on {shrinkage['evaluated_on']}"
+    if body["verdict"] == "set":
+        others = ", ".join(body["indistinguishable"])
+        return (
+            f"The gap is caused by {causes}, or by what these recordings cannot tell from it: {others}{far}."
+        )
+    return f"The gap is caused by {causes}{far}."
+
+
+def tables(body: dict[str, Any]) -> list[Table]:
+    """Probabilities, parameters of the cause and the largest cells, for people to read."""
+    likely = Table(title="probabilities", title_justify="left")
+    likely.add_column("candidate", no_wrap=True)
+    likely.add_column("probability", justify="right")
+    for name, value in sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]:
+        likely.add_row(name, f"{value:.3f}")
+    out = [likely]
+    if body["causes"]:
+        values = Table(title="parameters", title_justify="left")
+        for head in ("parameter", "estimate", "90 % interval"):
+            values.add_column(head, no_wrap=True)
+        for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
+            low, high = p["interval_90"]
+            values.add_row(name, f"{p['mean']:.4g} +- {p['sd']:.2g} {p['unit']}", f"{low:.4g} to {high:.4g}")
+        out.append(values)
+    if body["next_experiment"] is not None:
+        following = Table(title="next experiment", title_justify="left", show_header=False)
+        following.add_row(body["next_experiment"]["do"])
+        out.append(following)
+    if body["where"]:
+        cells = Table(title="where the gap is largest", title_justify="left")
+        for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
+            cells.add_column(head, no_wrap=True)
+        for row in body["where"][:8]:
+            low, high = row["band"]
+            cells.add_row(
+                row["trial"],
+                row["channel"],
+                row["subtask"],
+                f"{low:g}-{high:g}",
+                f"{100 * row['share']:.0f} %",
+                f"{row['z']:.1f}",
+            )
+        out.append(cells)
+    return out

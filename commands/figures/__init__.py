@@ -1,0 +1,1 @@
+"""Figures of the commands, one file a figure."""

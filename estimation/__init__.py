@@ -1,0 +1,1 @@
+"""From subtask spans to block properties with uncertainty."""

@@ -1,0 +1,242 @@
+"""What aligned trials say of the blocks: one robust mean a grip and channel, for many alignments.
+
+Three observations a grip (the span from pickup to place of one move):
+
+- `force`: mean net vertical force over the carry [N];
+- `distance`: mean distance of the fingers while held, the pads' squeeze taken out [m];
+- `rise`: mean height of the fingers over the place less that over the pickup, the pads' shear
+  deflection taken out [m].
+
+Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2
+pooled over grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal
+1997; docs/model.md). Each of the drawn alignments gives every sample to one subtask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.contact_emissions import TAIL
+from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
+from hmmseg.features import acceleration, thin
+from hmmseg.rig import Rig
+from hmmseg.segmentation import AlignedTrials, TrialAlignment
+from hmmseg.signals import Signals
+
+CHANNELS = ("force", "distance", "rise")
+MAX_RATE = 50.0  # Hz; noise of finer samples is averaged before it is weighed
+NUM_ALIGNMENTS = 16
+MIN_STRETCH = 0.5
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Sample weights (num_alignments, num_timesteps) of each grip's means in one trial.
+
+    `grips[m]` maps "force", "distance", "pickup" and "place" to weights that sum to 1 over the
+    samples (0 everywhere: nothing recorded), `counts[m]` to effective sample numbers
+    (num_alignments,); `free` are weights (num_timesteps,) over free motion.
+    """
+
+    grips: dict[int, dict[str, np.ndarray]]
+    counts: dict[int, dict[str, np.ndarray]]
+    free: np.ndarray
+    free_count: float
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Of each channel: variance of one effective sample and the number it was learned from."""
+
+    variance: dict[str, float]
+    count: dict[str, float]
+
+
+def draw_boundaries(trial: TrialAlignment, rng: np.random.Generator, num: int) -> np.ndarray:
+    """Boundary times (num, num_subtasks - 1) drawn from their posteriors, kept in order [s]."""
+    columns = []
+    for boundary in trial.boundaries:
+        cumulative = np.cumsum(boundary.probabilities)
+        columns.append(np.interp(rng.uniform(size=num) * cumulative[-1], cumulative, boundary.times))
+    return np.maximum.accumulate(np.stack(columns, axis=1), axis=1)
+
+
+def channel_values(signals: Signals, rig: Rig) -> dict[str, np.ndarray]:
+    """The sample values behind each mean, arrays (num_timesteps,)."""
+    squeeze = (signals.fx1 - signals.fx2) / rig.fingertip.normal_stiffness
+    deflection = signals.fy / (2 * rig.fingertip.shear_stiffness)
+    height = signals.y - deflection
+    return {
+        "force": signals.fy, "distance": signals.distance + squeeze, "pickup": height, "place": height,
+    }  # fmt: skip
+
+
+def gravity_factor(signals: Signals, rig: Rig) -> np.ndarray:
+    """1 + a / g (num_timesteps,): the net force of a carried block in units of its weight."""
+    return 1 + np.nan_to_num(acceleration(signals.t, signals.vy)) / rig.gravity
+
+
+def subtask_masks(times: np.ndarray, boundaries: np.ndarray, num_subtasks: int) -> np.ndarray:
+    """Booleans (num_alignments, num_subtasks, num_timesteps): which subtask each sample is in."""
+    index = (times[None, :, None] >= boundaries[:, None, :]).sum(axis=2)
+    return index[:, None, :] == np.arange(num_subtasks)[None, :, None]
+
+
+def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
+    """Subtask indices that each mean of a grip is taken over."""
+    of_move = [s for s in steps if s.move == move]
+    ground = [s.index for s in of_move if s.state == ON_GROUND]
+    return {
+        "force": [s.index for s in of_move if s.state == ABOVE_GROUND],
+        "distance": [s.index for s in of_move if s.state != FREE],
+        "pickup": ground[:1],
+        "place": ground[1:],
+    }
+
+
+def robust_weights(
+    values: np.ndarray, mask: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Student-t weights (num_timesteps,), residuals and location of the masked values."""
+    there = mask & np.isfinite(values)
+    if not there.any():
+        return np.zeros_like(values), np.full_like(values, np.nan), np.nan
+    centre = float(np.median(values[there]))
+    for _ in range(20):
+        weight = (TAIL + 1) / (TAIL + ((values[there] - centre) / scale) ** 2)
+        centre = float(weight @ values[there] / weight.sum())
+    residual = values - centre
+    weights = (TAIL + 1) / (TAIL + (residual / scale) ** 2)
+    return np.where(np.isfinite(values), weights, 0.0), residual, centre
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """One trial thinned for estimation: signals, drawn alignments' masks and mean weights."""
+
+    signals: Signals
+    masks: np.ndarray
+    weights: Weights
+
+
+def aligned_weights(
+    aligned: AlignedTrials, signals: list[Signals], rig: Rig, rng: np.random.Generator,
+    num_alignments: int = NUM_ALIGNMENTS,
+) -> tuple[list[Aligned], Noise]:  # fmt: skip
+    """Weights of every grip's means for drawn alignments, and the noise of each channel."""
+    steps = aligned.subtasks
+    prepared = []
+    for trial, raw in zip(aligned.trials, signals, strict=True):
+        thinned = thin(raw, MAX_RATE)
+        medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
+        drawn = draw_boundaries(trial, rng, num_alignments)
+        best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]
+        present = _present(trial, len(steps))
+        masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
+        prepared.append((thinned, best & present[:, None], masks))
+    moves = sorted({s.move for s in steps if s.move is not None})
+    keys = ("force", "distance", "pickup", "place")
+    scales = {key: _scale(prepared, steps, moves, key, rig) for key in keys}
+    pooled: dict[str, list] = {key: [] for key in keys}
+    out = []
+    for thinned, best, masks in prepared:
+        values, factor = channel_values(thinned, rig), gravity_factor(thinned, rig)
+        grips, counts = {}, {}
+        for move in moves:
+            grips[move], counts[move] = {}, {}
+            for key, members in _members(steps, move).items():
+                chosen = best[members].any(axis=0)
+                v = values[key] / factor if key == "force" else values[key]
+                weight, residual, _ = robust_weights(v, chosen, scales[key])
+                pooled[key].append((residual[chosen], weight[chosen]))
+                every = masks[:, members].any(axis=1) * weight
+                total = every.sum(axis=1, keepdims=True)
+                grips[move][key] = every / np.where(total > 0, total, 1.0)
+                counts[move][key] = (masks[:, members].any(axis=1) & (weight > 0)).sum(axis=1)
+        free = best[[s.index for s in steps if s.state == FREE]].any(axis=0)
+        free &= np.isfinite(thinned.fx1 + thinned.fy1 + thinned.fx2 + thinned.fy2)
+        # The samples beside a contact change may be contact already.
+        free &= np.convolve(~free, [1, 1, 1], "same") == 0
+        weights = Weights(grips, counts, free / max(free.sum(), 1), float(free.sum()))
+        out.append(Aligned(thinned, masks, weights))
+    return out, _noise(pooled, scales)
+
+
+def _present(trial: TrialAlignment, num_subtasks: int) -> np.ndarray:
+    """Subtasks that the trial shows: all, or those before the one at which it fails."""
+    failed = trial.segmentation.failed
+    return np.arange(num_subtasks) < (num_subtasks if failed is None else failed.index)
+
+
+def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: str, rig: Rig) -> float:
+    """Robust scale of one channel's residuals, pooled over grips [unit of the channel]."""
+    residuals = []
+    for thinned, best, _ in prepared:
+        v = channel_values(thinned, rig)[key]
+        v = v / gravity_factor(thinned, rig) if key == "force" else v
+        for move in moves:
+            chosen = v[best[_members(steps, move)[key]].any(axis=0)]
+            chosen = chosen[np.isfinite(chosen)]
+            if chosen.size > 2:
+                residuals.append(chosen - np.median(chosen))
+    if not residuals:
+        return 1.0
+    return max(1.4826 * float(np.median(np.abs(np.concatenate(residuals)))), 1e-9)
+
+
+def _noise(pooled: dict[str, list], scales: dict[str, float]) -> Noise:
+    variance, count = {}, {}
+    for key, pairs in pooled.items():
+        pairs = [(r[np.isfinite(r)], w[np.isfinite(r)]) for r, w in pairs]
+        pairs = [(r, w) for r, w in pairs if r.size > 1]
+        if not pairs:
+            variance[key], count[key] = scales[key] ** 2, 1.0
+            continue
+        psi = np.concatenate([w * r for r, w in pairs])
+        z2 = np.concatenate([(r / scales[key]) ** 2 for r, _ in pairs])
+        slope = np.mean((TAIL + 1) * (TAIL - z2) / (TAIL + z2) ** 2)
+        # One location a grip was fitted: correct for the lost degrees of freedom.
+        lost = psi.size / max(psi.size - len(pairs), 1)
+        stretch = autocorrelation_time([w * r for r, w in pairs])
+        variance[key] = float(np.mean(psi**2) / slope**2 * lost * stretch)
+        count[key] = float(max(psi.size - len(pairs), 1) / stretch)
+    return Noise(variance, count)
+
+
+def autocorrelation_time(series: list[np.ndarray], max_lag: int = 11) -> float:
+    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
+
+    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of
+    lags (0, 1), (2, 3), ... up to the first pair that is not positive. Below 1 where successive
+    residuals cancel, as differentiated noise does. Series about their own mean are biased by
+    -1 / length, which is put back.
+    """
+    bias = len(series) / max(sum(r.size for r in series), 1)
+    power = sum(float(r @ r) for r in series)
+    size = sum(r.size for r in series)
+
+    def rho(lag: int) -> float:
+        if lag == 0:
+            return 1.0
+        pairs = sum(max(r.size - lag, 0) for r in series)
+        if pairs < 8 or power <= 0:
+            return 0.0
+        products = sum(float(r[lag:] @ r[: r.size - lag]) for r in series if r.size > lag)
+        return products / power * size / pairs + bias
+
+    total, lags = -1.0, 1
+    for lag in range(0, max_lag, 2):
+        pair = rho(lag) + rho(lag + 1)
+        # A pair counts only where it stands out of its own sampling noise.
+        if lag > 0 and pair <= 2 / np.sqrt(size):
+            break
+        total += 2 * pair
+        lags = lag + 1
+    # Estimated from few samples, the excess over white noise is mostly noise itself: its variance is
+    # about 4 / size a lag, and it is shrunk by that (positive-part James and Stein 1961).
+    excess = total - 1
+    if excess != 0 and size:
+        total = 1 + excess * max(0.0, 1 - 4 * lags / size / excess**2)
+    return max(total, MIN_STRETCH)

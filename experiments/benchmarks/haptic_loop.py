@@ -1,0 +1,162 @@
+"""Benchmark of the virtual model in a haptic loop: its rate on one core, and its passivity.
+
+    python -m experiments.benchmarks.haptic_loop [--seconds 60] [--realtime] [--output FILE.json]
+
+Rate: two blocks picked and stacked over and over at 4 kHz, every step timed on one core, memory
+watched. With `--realtime` it runs as a haptic loop would: paced by the clock, before all other
+processes; without, as fast as it can. Passivity: a light device, squeezed onto a block by a
+spring, feels forces that are held for a period and one sample old; port energy and remaining
+motion over a range of pad stiffness, at 1 and 4 kHz, without and with passivity control, beside
+the sampled-data limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import itertools
+import json
+import os
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+
+from hmmseg.rig import Fingertip, Rig
+from hmmseg.task import GROUND, BlockTask, Move
+from simgap.haptics import PassivityControl, stiffest_passive
+from simgap.properties import PAPER_BLOCKS
+from simgap.scene import Surroundings
+from simgap.simulate import simulate_trial
+from simgap.virtual_model import VirtualModel
+
+TASK = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
+PADS = Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0)
+RATES = (1000.0, 4000.0)  # Hz
+STIFFNESS = (1000.0, 2000.0, 4000.0, 8000.0, 16e3, 32e3, 64e3, 128e3, 256e3)  # N/m
+FOAM_TIMES = (0.0, 2e-3)  # s; damping over stiffness of the virtual pads
+DEVICE_MASS, DEVICE_DAMPING = 0.1, 2.0  # kg, N s/m, of one fingertip
+HAND_STIFFNESS, SQUEEZE = 150.0, 0.01  # N/m and m: the operator closes by 1.5 N
+
+
+def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str, float]:
+    """Times of every step [us] of so many seconds at a rate, and what memory grew by [bytes]."""
+    done = simulate_trial(TASK, Rig(fingertip=PADS), PAPER_BLOCKS, seed=0)
+    places = {name: float(done.motion.blocks[0, k, 0]) for k, name in enumerate(TASK.objects)}
+    model = VirtualModel(Rig(fingertip=PADS), TASK, PAPER_BLOCKS, places)
+    t = np.arange(0, done.t[-1], 1 / rate)
+    column = lambda z: np.stack([np.interp(t, done.t, c) for c in z.reshape(len(z), -1).T], 1)  # noqa: E731
+    position, velocity = column(done.motion.position), column(done.motion.velocity)
+    model.prepare(1 / rate)
+    steps = round(seconds * rate)
+    times = np.zeros(steps)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    used, start = time.process_time(), time.perf_counter()
+    for k in range(steps):
+        if paced:
+            time.sleep(max(0.0, start + k / rate - time.perf_counter()))
+        if k % len(t) == 0:
+            model.reset()
+        row = k % len(t)
+        begin = time.perf_counter()
+        model.step(position[row], velocity[row], 1 / rate)
+        times[k] = time.perf_counter() - begin
+    used = time.process_time() - used
+    gc.enable()
+    grown = _growth(model, position, velocity, 1 / rate)
+    micro = 1e6 * times
+    return {
+        "steps": steps, "cpu_mean_us": 1e6 * used / steps, "mean_us": micro.mean(),
+        "median_us": float(np.median(micro)),
+        "p99_us": float(np.percentile(micro, 99)), "p99_99_us": float(np.percentile(micro, 99.99)),
+        "worst_us": micro.max(), "late": int((micro > 1e6 / rate).sum()), "rate_hz": 1e6 / micro.mean(),
+        "grown_bytes_in_10000_steps": grown,
+    }  # fmt: skip
+
+
+def _growth(model: VirtualModel, position: np.ndarray, velocity: np.ndarray, dt: float) -> int:
+    """Bytes that Python holds more after ten thousand steps than after a thousand."""
+    held = []
+    tracemalloc.start()
+    for k in range(11_000):
+        model.step(position[k], velocity[k], dt)
+        if k in (1000, 10_999):
+            gc.collect()
+            held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    return held[1] - held[0]
+
+
+def squeeze(
+    rate: float, stiffness: float, foam_time: float, controlled: bool, seconds: float = 1.0
+) -> dict[str, float]:
+    """A device squeezed onto a block: largest energy the port returned [J], speed left at the end [m/s]."""
+    period, substeps = 1 / rate, 8
+    pads = Fingertip(normal_stiffness=stiffness, shear_stiffness=stiffness * 0.6)
+    model = VirtualModel(Rig(fingertip=pads), TASK, PAPER_BLOCKS, {"block1": 0.12, "block2": 0.12},
+                         Surroundings(pad_time=foam_time))  # fmt: skip
+    control = PassivityControl(period)
+    height = 0.0127 + 0.008
+    width = PAPER_BLOCKS["block1"].width
+    place = np.array([[0.12 - width / 2 - 0.001, height], [0.12 + width / 2 + 0.001, height]])
+    aim = np.array([[0.12 - width / 2 + SQUEEZE, height], [0.12 + width / 2 - SQUEEZE, height]])
+    speed, waiting = np.zeros((2, 2)), np.zeros((2, 2))
+    energy, returned, speeds = 0.0, 0.0, []
+    for _ in range(round(seconds * rate)):
+        force = model.step(place, speed, period)
+        # One sample of delay: what the model says now is rendered a period later.
+        held, waiting = waiting, force
+        if controlled:
+            held = control.render(held, place)
+        before = place.copy()
+        for _ in range(substeps):
+            pull = HAND_STIFFNESS * (aim - place) - DEVICE_DAMPING * speed - held
+            speed = speed + period / substeps / DEVICE_MASS * pull
+            place = place + period / substeps * speed
+        energy += float((held * (place - before)).sum())
+        returned = max(returned, -energy)
+        speeds.append(float(np.abs(speed).max()))
+    return {"returned_J": returned, "speed_left": max(speeds[-round(0.2 * rate):])}  # fmt: skip
+
+
+def measure_passivity() -> list[dict[str, float | bool]]:
+    """The squeeze over rates and stiffnesses, without and with control."""
+    rows = []
+    for rate in RATES:
+        limit = stiffest_passive(DEVICE_DAMPING, 1 / rate, 1 / rate)
+        for foam_time, stiffness, controlled in itertools.product(FOAM_TIMES, STIFFNESS, (False, True)):
+            found = squeeze(rate, stiffness, foam_time, controlled)
+            rows.append({"rate": rate, "foam_time": foam_time, "stiffness": stiffness,
+                         "controlled": controlled, "sampled_data_limit": limit, **found})  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Rate and passivity of the virtual model in a haptic loop.")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the timed run")
+    parser.add_argument("--output", type=Path, default=Path("experiments/results/haptic_loop.json"))
+    parser.add_argument("--realtime", action="store_true", help="real-time priority (Linux, with the right)")
+    options = parser.parse_args()
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    if options.realtime:  # before the first computation: its threads inherit the priority
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    rate = measure_rate(options.seconds, paced=options.realtime) | {"realtime": options.realtime}
+    if options.realtime:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    result = {"rate": rate, "passivity": measure_passivity()}
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    for key, value in result["rate"].items():
+        print(f"{key:28s} {value:12.1f}")
+    print("rate  stiffness  foam [s]  limit  control  returned [J]  speed left [m/s]")
+    for row in result["passivity"]:
+        numbers = (row[key] for key in ("rate", "stiffness", "foam_time", "sampled_data_limit", "controlled"))
+        print("{:5.0f} {:9.0f} {:8.3f} {:7.0f} {!s:>7}".format(*numbers), end=" ")
+        print(f"{row['returned_J']:12.2e} {row['speed_left']:10.4f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Which moves sample the posterior best: ours against emcee's own.
+
+    python -m experiments.benchmarks.moves [--cases 2]
+
+Per set of moves: acceptance, the largest autocorrelation time over parameters (steps), R-hat, and
+effective samples per second of the worst parameter, on single trials and four pooled trials of
+simulated cases. Writes experiments/results/benchmark_moves.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import emcee
+import jax.numpy as jnp
+import numpy as np
+
+from estimation.design import build
+from estimation.identify import start
+from estimation.mode import Mode, find_mode
+from estimation.observations import aligned_weights
+from estimation.posterior import log_prob_batch, pack
+from estimation.proposal import proposal
+from estimation.sampler import (
+    BURN_IN,
+    INDEPENDENT,
+    WALKERS,
+    effective_sample_size,
+    independence_move,
+    split_rhat,
+)
+from experiments.bank import SEED, simulated_cases
+from experiments.recordings import Case
+from hmmseg.segmentation import align_trials
+
+RESULTS = Path(__file__).parents[1] / "results"
+STEPS = 600
+
+
+def mode_of(case: Case, num_trials: int) -> Mode:
+    """Posterior mode of a case's first trials."""
+    trials, signals = list(case.trials[:num_trials]), list(case.signals[:num_trials])
+    aligned = align_trials([t.file for t in trials], signals, case.task, case.rig)
+    weighed, noise = aligned_weights(aligned, signals, case.rig, np.random.default_rng(0))
+    sd_force = case.rig.noise.force or aligned.fit.parameters.scale["force"]
+    design = build(trials, weighed, noise, case.task, case.rig, sd_force)
+    return find_mode(start(design), pack(design))
+
+
+def move_sets(mode: Mode) -> dict[str, list]:
+    """Sets of moves by name."""
+    differential = emcee.moves.DEMove()
+    return {
+        "ours": [(independence_move(mode), INDEPENDENT), (differential, 1 - INDEPENDENT)],
+        "differential evolution": [(differential, 1.0)],
+        "differential evolution with snooker": [(differential, 0.8), (emcee.moves.DESnookerMove(), 0.2)],
+        "stretch (emcee's default)": [(emcee.moves.StretchMove(), 1.0)],
+    }
+
+
+def measure(mode: Mode, moves: list) -> dict[str, float]:
+    """Efficiency of a set of moves from the same start."""
+    random = np.random.RandomState(0)
+    first, _ = proposal(mode).draw(WALKERS, random)
+
+    def log_prob(x: np.ndarray) -> np.ndarray:
+        return np.asarray(log_prob_batch(jnp.asarray(x), mode.data))
+
+    sampler = emcee.EnsembleSampler(WALKERS, mode.x.size, log_prob, moves=moves, vectorize=True)
+    state = sampler.run_mcmc(emcee.State(first, random_state=random.get_state()), BURN_IN)
+    sampler.reset()
+    began = time.process_time()
+    sampler.run_mcmc(state, STEPS)
+    seconds = time.process_time() - began
+    chain = np.swapaxes(sampler.get_chain(), 0, 1)
+    ess = effective_sample_size(chain)
+    return {
+        "acceptance": float(sampler.acceptance_fraction.mean()),
+        "autocorrelation_time": chain.shape[0] * chain.shape[1] / max(ess, 1e-9),
+        "rhat": split_rhat(chain), "ess_per_second": ess / seconds,
+    }  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line of this benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=int, default=2)
+    options = parser.parse_args(arguments)
+    cases = simulated_cases(options.cases, seed=SEED + 3000)
+    document: dict = {"walkers": WALKERS, "steps": STEPS, "seconds": "processor time", "trials": {}}
+    for num_trials in (1, 4):
+        modes = [mode_of(case, num_trials) for case in cases]
+        rows = {}
+        for name in move_sets(modes[0]):
+            found = [measure(mode, move_sets(mode)[name]) for mode in modes]
+            rows[name] = {key: float(np.median([f[key] for f in found])) for key in found[0]}
+            print(f"{num_trials} trials, {name}: tau {rows[name]['autocorrelation_time']:.1f} steps, "
+                  f"{rows[name]['ess_per_second']:.0f} effective samples a second", flush=True)  # fmt: skip
+        document["trials"][str(num_trials)] = rows
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    path = RESULTS / "benchmark_moves.json"
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

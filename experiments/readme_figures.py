@@ -1,0 +1,24 @@
+"""Figures of the README: run the demo and keep two of its pictures in docs/figures."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+DOCS = Path(__file__).parents[1] / "docs" / "figures"
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "commands.main", "demo", "--figures", folder, "--quiet"]
+        subprocess.run(command, check=True)
+        DOCS.mkdir(parents=True, exist_ok=True)
+        for source, target in (("trial_01_segments", "demo_segments"), ("estimates", "demo_estimates")):
+            shutil.copyfile(Path(folder) / f"{source}.png", DOCS / f"{target}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""Score a method on every case of a recordings folder.
+
+    python -m experiments.score_recordings RECORDINGS --method hmm qualitative first-change
+
+Boundaries are scored against truth/, properties (of groups of pooled trials) against labels.json
+or actual.toml. Prints a table a method and writes experiments/results/score_METHOD.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from estimation.plugin import estimate_plugin
+from experiments.recordings import Case, list_cases, read_case
+from experiments.scoring import (
+    boundaries_covered,
+    boundary_residuals,
+    property_scores,
+    state_accuracy,
+    summarise_boundaries,
+    summarise_properties,
+)
+from hmmseg.decompose import subtasks
+from hmmseg.qualitative import Rule, segment_qualitative
+from hmmseg.spans import Segmentation
+
+RESULTS = Path(__file__).parent / "results"
+Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
+
+
+def by_hmm(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation], dict]:
+    """Spans of the switching model and properties of the Bayesian model."""
+    from estimation.identify import identify  # JAX takes seconds to import; the rules do without
+
+    found = identify(case.trials[group], case.task, case.rig, seed)
+    return found.segmentations, found.to_json()["properties"]
+
+
+def by_rule(rule: Rule) -> Method:
+    """Spans of the thresholds, with this rule of order, and the paper's estimates."""
+
+    def run(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation], dict]:
+        pairs = zip(case.trials[group], case.signals[group], strict=True)
+        spans = [segment_qualitative(trial, signals, case.task, rule=rule) for trial, signals in pairs]
+        return spans, estimate_plugin(case.signals[group], spans, case.task).to_json()["properties"]
+
+    return run
+
+
+METHODS: dict[str, Method] = {
+    "hmm": by_hmm,
+    "qualitative": by_rule("monotone"),
+    "first-change": by_rule("first-change"),
+}
+
+
+def score_case(case: Case, method: Method, pooled: int, seed: int) -> dict:
+    """Scores of one case, its trials in groups of `pooled` (a last smaller group is merged)."""
+    steps, size = subtasks(case.task), len(case.trials)
+    starts = list(range(0, max(size - pooled + 1, 1), pooled))
+    groups = [slice(a, b) for a, b in zip(starts, [*starts[1:], size], strict=True)]
+    residuals, covered, accuracy, properties, complete = [], [], [], [], 0
+    for group in groups:
+        spans, estimates = method(case, group, seed)
+        properties += property_scores(estimates, case.blocks)
+        for segmentation, signals, truth in zip(spans, case.signals[group], case.truth[group], strict=True):
+            complete += segmentation.complete
+            if truth is not None:
+                residuals.append(boundary_residuals(segmentation, truth))
+                covered.append(boundaries_covered(segmentation, truth))
+                accuracy.append(state_accuracy(segmentation, truth, signals.t, steps))
+    return {
+        "case": case.name, "healthy": case.healthy, "trials": size, "complete": complete,
+        "residuals": np.array(residuals).tolist(), "covered": np.array(covered).tolist(),
+        "state_accuracy": float(np.mean(accuracy)) if accuracy else None, "properties": properties,
+    }  # fmt: skip
+
+
+def summarise(scores: Sequence[dict]) -> dict:
+    """Boundaries and properties of several cases together."""
+    residuals = np.concatenate([np.ravel(s["residuals"]) for s in scores])
+    covered = np.concatenate([np.ravel(s["covered"]) for s in scores])
+    return {
+        "cases": len(scores),
+        "trials": sum(s["trials"] for s in scores),
+        "complete": sum(s["complete"] for s in scores),
+        "boundaries": summarise_boundaries(residuals, covered),
+        "properties": summarise_properties([p for s in scores for p in s["properties"]]),
+    }
+
+
+def table(method: str, rows: Sequence[tuple[str, dict]]) -> Table:
+    """Summaries for people to read."""
+    out = Table(title=method, title_justify="left")
+    heads = (
+        "case",
+        "complete",
+        "median [ms]",
+        "95 % [ms]",
+        "coverage 90 %",
+        "weight rms",
+        "width rms",
+        "height rms",
+    )
+    for head in heads:
+        out.add_column(head, justify="left" if head == "case" else "right")
+    for name, summary in rows:
+        b, p = summary["boundaries"], summary["properties"]
+        cells = [f"{summary['complete']}/{summary['trials']}"]
+        cells += [_cell(b[key], 1e3, ".1f") for key in ("median", "percentile_95")]
+        cells += [_cell(b["coverage_90"], 100, ".0f", " %")]
+        cells += [_cell(p[key].get("rms"), 100, ".2f", " %") for key in ("weight", "width", "height")]
+        out.add_row(name, *cells)
+    return out
+
+
+def _cell(value: float | None, factor: float, form: str, unit: str = "") -> str:
+    return "" if value is None else f"{value * factor:{form}}{unit}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line of this experiment."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recordings", type=Path)
+    parser.add_argument("--method", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--pooled", type=int, default=4, help="trials pooled for one estimate")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    cases = [read_case(folder) for folder in list_cases(options.recordings)]
+    for name in options.method:
+        scores = [score_case(case, METHODS[name], options.pooled, options.seed) for case in cases]
+        rows = [(score["case"], summarise([score])) for score in scores]
+        together = {"all": scores, "healthy": [score for score in scores if score["healthy"]]}
+        summaries = {key: summarise(group) for key, group in together.items() if group}
+        Console(width=120).print(table(name, [*rows, *summaries.items()]))
+        options.output.mkdir(parents=True, exist_ok=True)
+        document = {"method": name, "pooled": options.pooled, "seed": options.seed,
+                    "summary": summaries, "cases": scores}  # fmt: skip
+        text = json.dumps(_null(document), indent=1, allow_nan=False)
+        (options.output / f"score_{name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _null(value):
+    if isinstance(value, dict):
+        return {key: _null(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_null(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The virtual model, unmodelled effects and the diagnosis of the sim-to-real gap."""

@@ -1,0 +1,192 @@
+"""What an effect is: one unmodelled mechanism, its parameters, and how it acts on what is recorded.
+
+The diagnosis never simulates with an effect. It takes the recording back to what the nominal hand
+would have shown (`correct`), and asks whether the contact equations then hold. The simulator's
+truth is taken forward (`apply`, `scene`) to make recordings with a known effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from hmmseg.rig import Rig
+
+Array = Any  # jax.Array under a trace, np.ndarray outside of one
+Values = dict[str, Array]  # parameter name -> scalar
+
+
+class World(NamedTuple):
+    """Aligned trials and the constants of the hand, as far as an effect may change them.
+
+    T trials, N samples, M moves. `joints`, `rates`, `force` (T, N, 4): link angles and their rates
+    (tip positions and velocities of a Cartesian hand), forces fx1, fy1, fx2, fy2. `link` (4,)
+    relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
+    `delay`, `smoothing` [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
+    the pads' delayed part. `tilt` [rad] and `give_support` [m/N] of the support. `inertia`: factor
+    of the mass times acceleration. `couple` [m]: how far the mass lies right of the middle.
+    `loudness`: recorded noise over the noise of corrected forces. `slip` (T, N): whether (0 to 1) pads
+    slide on the block.
+    `free`, `ground`, `carry` (T, N): which state each sample is in (1 or 0); `events` (T, 4 M) [s]:
+    touch, leave, meet, part of every move.
+    """
+
+    t: Array
+    joints: Array
+    rates: Array
+    force: Array
+    base: Array
+    length: Array
+    jointed: Array
+    gravity: Array
+    link: Array
+    give_normal: Array
+    give_shear: Array
+    delay: Array
+    smoothing: Array
+    creep: Array
+    creep_time: Array
+    tilt: Array
+    give_support: Array
+    inertia: Array
+    couple: Array
+    loudness: Array
+    slip: Array
+    free: Array
+    ground: Array
+    carry: Array
+    move: Array
+    events: Array
+
+
+class Performance(NamedTuple):
+    """A simulated truth that effects act on: n fine times `t` [s], tips' `position`, `velocity` and
+    `force` (n, 2 fingers, 2 axes) as the sensors will have them, `events` [s] and carried `blocks`.
+    """
+
+    t: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    force: np.ndarray
+    events: np.ndarray
+    rig: Rig
+    carried: np.ndarray  # (n,) weight [N] of the block in the air, else 0
+    width: np.ndarray  # (n,) width [m] of the block in the air, else 1
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter: prior normal about `neutral` with `sd`, in `unit`; `low`, `high` bound it.
+
+    `starts` are the values a search starts from. `log`: the prior is of the logarithm, with median
+    `neutral` and `sd` in natural units. `hidden` parameters are fitted but not reported.
+    """
+
+    name: str
+    unit: str
+    sd: float
+    neutral: float = 0.0
+    starts: tuple[float, ...] = (0.0,)
+    low: float = -np.inf
+    high: float = np.inf
+    log: bool = False
+    hidden: bool = False
+
+    def value(self, u: Array) -> Array:
+        """The parameter from its standard normal coordinate."""
+        return self.neutral * jnp.exp(self.sd * u) if self.log else self.neutral + self.sd * u
+
+    def coordinate(self, value: float) -> float:
+        """The inverse of `value`."""
+        return float(np.log(value / self.neutral) / self.sd if self.log else (value - self.neutral) / self.sd)
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Bounds of the standard normal coordinate; five standard deviations at most."""
+        low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -5.0
+        high = self.coordinate(self.high) if np.isfinite(self.high) else 5.0
+        return max(low, -5.0), min(high, 5.0)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One mechanism. `stage` orders corrections: what is nearest to the recorded number comes first.
+
+    `correct(world, values, on)` takes the recording back; `on` is 1 where the effect is in the
+    candidate and 0 elsewhere, for parameters that have no neutral value. `spread(world, values)`
+    gives standard deviations of a random disturbance instead (see `simgap.gap.spread`).
+    `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
+    scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
+    `local` counts free amounts per grip of a trial. `chosen` is false for effects that only
+    `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them.
+    """
+
+    name: str
+    acts_on: str
+    says: str
+    shows: str
+    mistaken_for: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    stage: int
+    correct: Callable[[World, Values, Array], World] | None = None
+    apply: Callable[[Performance, dict[str, float], np.random.Generator], Performance] | None = None
+    scene: Callable[[dict[str, float]], dict[str, float]] | None = None
+    finish: Callable[[np.ndarray, dict[str, float]], np.ndarray] | None = None
+    local: int = 0
+    chosen: bool = True
+    report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
+    random: bool = False
+
+    def neutral(self) -> dict[str, float]:
+        """Values at which nothing is changed (where that exists)."""
+        return {p.name: p.neutral for p in self.parameters}
+
+
+# Stages: the sensor's chain backwards, then what the hand carries, then the contact.
+READOUT, FILTER, SCALE, MIX, HAND, KINEMATICS, CONTACT = range(7)
+
+
+def tips(world: World) -> tuple[Array, Array]:
+    """Tip positions and velocities (T, N, 4): x1, y1, x2, y2 [m, m/s]."""
+    length = (world.length * world.link)[None, None, :]
+    jx, jy = -length * jnp.sin(world.joints), length * jnp.cos(world.joints)
+
+    def paired(x: Array, y: Array) -> Array:
+        return jnp.stack(
+            [x[..., 0] + x[..., 1], y[..., 0] + y[..., 1], x[..., 2] + x[..., 3], y[..., 2] + y[..., 3]], -1
+        )
+
+    position = world.base[None, None, :] + paired(jy, -jx)
+    velocity = paired(jx * world.rates, jy * world.rates)
+    there = world.jointed > 0.5
+    return jnp.where(there, position, world.joints), jnp.where(there, velocity, world.rates)
+
+
+def gradient(t: Array, values: Array) -> Array:
+    """Central differences along the second axis of (T, N, C) or (T, N), times (T, N) [s]."""
+    step = t[:, 2:] - t[:, :-2]
+    step = step[..., None] if values.ndim == 3 else step
+    inner = (values[:, 2:] - values[:, :-2]) / jnp.maximum(step, 1e-6)
+    return jnp.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
+
+
+def per_channel(values: Values, names: tuple[str, ...]) -> Array:
+    """Scalars stacked and shaped (1, 1, len(names)) to act on (T, N, channels)."""
+    return jnp.stack([jnp.asarray(values[n], float) for n in names])[None, None, :]
+
+
+FORCES = ("fx1", "fy1", "fx2", "fy2")
+
+
+def flat(performance: Performance) -> np.ndarray:
+    """Forces of a performance as columns fx1, fy1, fx2, fy2 (n, 4)."""
+    return performance.force.reshape(-1, 4)
+
+
+def with_force(performance: Performance, force: np.ndarray) -> Performance:
+    """The performance with other forces (n, 4)."""
+    return performance._replace(force=force.reshape(-1, 2, 2))

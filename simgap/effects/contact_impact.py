@@ -1,0 +1,41 @@
+"""A short pulse of vertical force when a block touches down."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from simgap.effects.base import CONTACT, Effect, Parameter, Performance, World, flat, with_force
+
+LENGTH = 0.06  # s; a pulse shorter than a sample is known as an impulse only
+
+
+def _pulse(since, xp):
+    """A raised cosine of unit area [1/s] over LENGTH from the event."""
+    inside = (since >= 0) & (since < LENGTH)
+    return xp.where(inside, (1 - xp.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0)
+
+
+def _correct(world: World, values, on) -> World:
+    since = world.t[:, :, None] - world.events[:, None, 2::4]
+    pulse = _pulse(since, jnp).sum(-1)[..., None] * jnp.asarray([0.0, 0.5, 0.0, 0.5])[None, None, :]
+    return world._replace(force=world.force + values["impulse"] * pulse)
+
+
+def _apply(performance: Performance, values, rng) -> Performance:
+    pulse = _pulse(performance.t[:, None] - performance.events[None, 2::4], np).sum(1)
+    share = np.array([0.0, 0.5, 0.0, 0.5])
+    return with_force(performance, flat(performance) - values["impulse"] * pulse[:, None] * share)
+
+
+EFFECT = Effect(
+    name="contact_impact",
+    acts_on="dynamics",
+    says="a pulse of -impulse in net fy at touchdown",
+    shows="place, first samples",
+    mistaken_for=("structural_vibration",),
+    parameters=(Parameter("impulse", "N s", 0.03),),
+    stage=CONTACT,
+    correct=_correct,
+    apply=_apply,
+)

@@ -1,0 +1,25 @@
+"""Forces that arrive late by a constant delay."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from simgap.effects.base import FILTER, Effect, Parameter, Performance, flat, with_force
+
+
+def _apply(performance: Performance, values, rng) -> Performance:
+    force, late = flat(performance), performance.t - values["delay"]
+    return with_force(performance, np.stack([np.interp(late, performance.t, f) for f in force.T], 1))
+
+
+EFFECT = Effect(
+    name="force_lag",
+    acts_on="sensing",
+    says="recorded F(t) = F(t - delay)",
+    shows="every contact change, late",
+    mistaken_for=("force_lowpass",),
+    parameters=(Parameter("delay", "s", 0.1, starts=(0.03, 0.08, 0.15, 0.25), low=0.0, high=0.4),),
+    stage=FILTER,
+    correct=lambda w, v, on: w._replace(delay=w.delay + v["delay"]),
+    apply=_apply,
+)

@@ -1,0 +1,49 @@
+"""Pads that slide on the block when the shear exceeds mu times the normal force.
+
+A slide shows as a shift of the fingers against the block that grows only while the shear is at its
+bound. How far it slides is free in every grip (marginalised with the grip's other constants); when
+is told by mu.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from simgap.effects.base import CONTACT, Effect, Parameter, World
+
+LOADED = 0.8  # N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
+
+
+def _correct(world: World, values, on) -> World:
+    shear = jnp.abs(world.force[..., jnp.asarray([1, 3])])
+    push = jnp.stack([world.force[..., 0], -world.force[..., 2]], -1)
+    ratio = shear / jnp.maximum(push, 0.5 * LOADED)
+    sliding = jax.nn.sigmoid((ratio / values["mu"] - 0.96) / 0.02).max(axis=-1)
+    sliding = sliding * jax.nn.sigmoid((push.min(axis=-1) - LOADED) / 0.05)
+    return world._replace(slip=world.slip + on * sliding * (world.ground + world.carry))
+
+
+EFFECT = Effect(
+    name="grip_slip",
+    acts_on="contact",
+    says="the pad slides on the block when shear exceeds mu N",
+    shows="height changes that do not come back, at impact",
+    mistaken_for=("fingertip_creep",),
+    parameters=(
+        Parameter(
+            "mu",
+            "1",
+            0.6,
+            neutral=0.5,
+            starts=(0.2, 0.28, 0.36, 0.46, 0.6, 0.8),
+            low=0.08,
+            high=1.5,
+            log=True,
+        ),
+    ),
+    stage=CONTACT,
+    correct=_correct,
+    local=1,
+    scene=lambda v: {"friction": v["mu"]},
+)

@@ -1,0 +1,20 @@
+"""Joint angles read with constant offsets."""
+
+from __future__ import annotations
+
+from simgap.effects.base import KINEMATICS, Effect, Parameter, per_channel
+from simgap.effects.kinematics import moved_joints
+
+JOINTS = ("q11", "q12", "q21", "q22")
+
+EFFECT = Effect(
+    name="joint_offset",
+    acts_on="kinematics",
+    says="recorded q = q + q0, per joint",
+    shows="positions, widths, heights, by pose",
+    mistaken_for=("link_length",),
+    parameters=tuple(Parameter(q, "rad", 0.012) for q in JOINTS),
+    stage=KINEMATICS,
+    correct=lambda w, v, on: w._replace(joints=w.joints - per_channel(v, JOINTS) * w.jointed),
+    apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (q + [v[n] for n in JOINTS], dq)),
+)

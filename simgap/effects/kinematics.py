@@ -1,0 +1,36 @@
+"""Helper of effects that act on joint angles: from true tips to what the nominal hand would read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from simgap.effects.base import Performance
+from simgap.hand import forward, inverse, joint_velocity, tip_velocity
+
+Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def moved_joints(performance: Performance, change: Change, scale: float = 0.0) -> Performance:
+    """Tips as read by a nominal hand whose angles and rates (n, 4) pass through `change`.
+
+    The true links are longer than nominal by `scale`.
+    """
+    rig = performance.rig
+    if not rig.jointed:
+        raise ValueError("a Cartesian hand has no joints")
+    q, dq = [], []
+    for i in (1, 2):
+        nominal = rig.finger(i)
+        true = nominal.model_copy(update={"links": tuple(length * (1 + scale) for length in nominal.links)})
+        angles = inverse(true, i, performance.position[:, i - 1])
+        q.append(angles)
+        dq.append(joint_velocity(true, angles, performance.velocity[:, i - 1]))
+    q, dq = change(np.concatenate(q, 1), np.concatenate(dq, 1))
+    position = np.stack([forward(rig.finger(i + 1), q[:, 2 * i : 2 * i + 2]) for i in (0, 1)], 1)
+    velocity = np.stack(
+        [tip_velocity(rig.finger(i + 1), q[:, 2 * i : 2 * i + 2], dq[:, 2 * i : 2 * i + 2]) for i in (0, 1)],
+        1,
+    )
+    return performance._replace(position=position, velocity=velocity)

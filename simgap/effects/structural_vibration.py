@@ -1,0 +1,73 @@
+"""A lightly damped mode of the hand's structure, rung by every contact change."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from simgap.effects.base import FORCES, READOUT, Effect, Parameter, Performance, World, flat, with_force
+
+GROUPS = (("grip", (0, 3)), ("support", (1, 2)))  # events of a move that ring alike
+AMPLITUDES = tuple(f"{part}_{group}_{c}" for group, _ in GROUPS for part in ("sin", "cos") for c in FORCES)
+
+
+def _ringing(world: World, values) -> jnp.ndarray:
+    omega = 2 * np.pi * values["frequency"]
+    moves = world.events.shape[1] // 4
+    total = jnp.zeros_like(world.force)
+    for group, kinds in GROUPS:
+        since = jnp.stack([world.t - world.events[:, 4 * m + k, None] for m in range(moves) for k in kinds])
+        started = (since >= 0) & (since < 3.0)
+        since = jnp.where(started, since, 0.0)
+        decay = jnp.where(started, jnp.exp(-values["damping"] * omega * since), 0.0)
+        for part, wave in (("sin", jnp.sin), ("cos", jnp.cos)):
+            shape = (decay * wave(omega * since)).sum(0)
+            total += (
+                shape[..., None] * jnp.stack([values[f"{part}_{group}_{c}"] for c in FORCES])[None, None, :]
+            )
+    return total
+
+
+def _correct(world: World, values, on) -> World:
+    return world._replace(force=world.force - _ringing(world, values))
+
+
+def _apply(performance: Performance, values, rng) -> Performance:
+    omega, zeta = 2 * np.pi * values["frequency"], values["damping"]
+    since = performance.t[:, None] - performance.events[None, :]
+    ring = np.where(since >= 0, np.exp(-zeta * omega * since.clip(0)) * np.sin(omega * since), 0.0).sum(1)
+    return with_force(
+        performance, flat(performance) + values["gain"] * ring[:, None] * np.array([0, 1.0, 0, 1.0])
+    )
+
+
+def _report(draws, rig):
+    size = np.sqrt(sum(np.asarray(draws[name]) ** 2 for name in AMPLITUDES) / 4)
+    return {"frequency": (draws["frequency"], "Hz"), "damping": (draws["damping"], "1"), "gain": (size, "N")}
+
+
+EFFECT = Effect(
+    name="structural_vibration",
+    acts_on="dynamics",
+    says="a mode rung by contact changes: gain exp(-damping w t) sin(w t)",
+    shows="decaying oscillation after contact changes",
+    mistaken_for=("noise", "contact_impact"),
+    parameters=(
+        Parameter(
+            "frequency",
+            "Hz",
+            0.7,
+            neutral=5.0,
+            starts=(1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5),
+            low=0.7,
+            high=10.0,
+            log=True,
+        ),
+        Parameter("damping", "1", 1.0, neutral=0.05, starts=(0.05,), low=0.003, high=0.5, log=True),
+        *(Parameter(name, "N", 0.1, hidden=True) for name in AMPLITUDES),
+    ),
+    stage=READOUT,
+    correct=_correct,
+    apply=_apply,
+    report=_report,
+)

@@ -1,0 +1,67 @@
+"""Where to start a search: every candidate's grid of start values, screened before it is refined."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from simgap.effects import catalogue
+from simgap.gap.fit import STEPS, Fitted, Problem, Start, fit, neutral, slots
+
+SCREEN = 2  # steps before the best start of an effect is chosen
+
+
+def starts(
+    given: Problem, effects: tuple[str, ...], base: np.ndarray | None = None, keep: tuple[str, ...] = ()
+) -> list[Start]:
+    """Starts of a candidate; effects in `keep` stay where `base` (all columns) has them."""
+    base = neutral(given) if base is None else base
+    places = {s.effect.name: s for s in slots(given.num_properties)[0]}
+    grids = []
+    for name in effects:
+        if name in keep:
+            continue
+        slot = places[name]
+        for j, p in enumerate(slot.effect.parameters):
+            if p.starts != (0.0,):
+                grids.append([(slot.start + j, p.coordinate(value)) for value in p.starts])
+    out = []
+    for chosen in itertools.product(*grids):
+        u = base.copy()
+        for column, value in chosen:
+            u[column] = value
+        out.append(Start(effects, u))
+    return out
+
+
+def deterministic(names: Sequence[str]) -> list[str]:
+    """Those of the named effects that shift signals (the others only spread them)."""
+    return [n for n in names if catalogue()[n].correct is not None]
+
+
+def best_fits(
+    given: Problem,
+    wanted: Sequence[tuple[str, ...]],
+    healthy: Fitted,
+    bases: Sequence[Fitted] | None = None,
+    steps: int = STEPS,
+) -> list[Fitted]:
+    """The best fit of every candidate: all starts for a few steps, then the better ones to the end.
+
+    `bases[k]` is a fit of fewer effects that candidate k extends.
+    """
+    jobs: list[tuple[int, Start]] = []
+    for k, effects in enumerate(wanted):
+        base = bases[k] if bases is not None else healthy
+        kept = base.effects if bases is not None else ()
+        jobs += [(k, s) for s in starts(given, effects, base.u, kept)]
+    many = {k for k, _ in jobs if sum(j == k for j, _ in jobs) > 1}
+    screened = fit(given, [s for k, s in jobs if k in many], SCREEN) if many else []
+    best: dict[int, Start] = {k: s for k, s in jobs if k not in many}
+    cost: dict[int, float] = {}
+    for (k, _), found in zip([job for job in jobs if job[0] in many], screened, strict=True):
+        if found.cost < cost.get(k, np.inf):
+            cost[k], best[k] = found.cost, Start(found.effects, found.u)
+    return fit(given, [best[k] for k in range(len(wanted))], steps)

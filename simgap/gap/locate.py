@@ -1,0 +1,112 @@
+"""Where the gap lies: excess of whitened residuals by trial, channel, subtask and frequency band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.fft import dct
+from scipy.stats import gumbel_r
+
+from simgap.gap.fit import Problem
+from simgap.gap.frame import CHANNELS
+
+BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges, the last band ends at half the sampling rate
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: squared whitened residual over its `count` degrees of freedom, as a normal score `z`.
+
+    `trial` and `subtask` are indices; `band` [Hz] is half-open.
+    """
+
+    trial: int
+    channel: str
+    subtask: int
+    band: tuple[float, float]
+    energy: float
+    count: int
+    z: float
+
+
+def normal_score(energy: np.ndarray | float, count: np.ndarray | float) -> Any:
+    """Chi-square of `count` degrees as a standard normal score (Wilson & Hilferty, PNAS 17, 1931)."""
+    spread = 2 / (9 * np.maximum(count, 1))
+    return (np.cbrt(np.asarray(energy) / np.maximum(count, 1)) - (1 - spread)) / np.sqrt(spread)
+
+
+def cells(given: Problem, z: np.ndarray) -> list[Cell]:
+    """All cells of whitened residuals z (T, N, C) that hold anything."""
+    frame, there = given.frame, given.whitening.weight > 0
+    out = []
+    for trial in range(frame.num_trials):
+        step = float(np.median(np.diff(frame.world.t[trial, : frame.lengths[trial]])))
+        edges = (*BANDS, 0.5 / step)
+        for subtask in range(len(frame.steps)):
+            inside = frame.arrays.subtask[trial] == subtask
+            for c, channel in enumerate(CHANNELS):
+                values = z[trial, inside & there[trial, :, c], c]
+                if not values.size:
+                    continue
+                power = np.asarray(dct(values, norm="ortho")) ** 2
+                frequency = np.arange(values.size) / (2 * values.size * step)
+                band = np.searchsorted(np.array(edges[1:-1]), frequency, side="right")
+                for b in np.unique(band):
+                    energy, count = float(power[band == b].sum()), int((band == b).sum())
+                    out.append(
+                        Cell(
+                            trial,
+                            channel,
+                            subtask,
+                            (edges[b], edges[b + 1]),
+                            energy,
+                            count,
+                            float(normal_score(energy, count)),
+                        )
+                    )
+    return out
+
+
+def pooled(found: list[Cell]) -> np.ndarray:
+    """Scores of the cells with trials taken together."""
+    table: dict[tuple, list[float]] = {}
+    for cell in found:
+        entry = table.setdefault((cell.channel, cell.subtask, cell.band[0]), [0.0, 0.0])
+        entry[0] += cell.energy
+        entry[1] += cell.count
+    energy, count = np.array(list(table.values())).T
+    return normal_score(energy, count)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Gumbel distributions (location, scale) of the largest score of healthy recordings.
+
+    `cell`: single cells; `pooled`: cells with trials taken together; `gain`: log evidence of the best
+    candidate over none. `margin` widens them: a recording is not our own simulation.
+    """
+
+    cell: tuple[float, float]
+    pooled: tuple[float, float]
+    gain: tuple[float, float]
+    margin: float = 1.25
+
+    def p_values(self, largest: dict[str, float]) -> dict[str, float]:
+        """Chance of a healthy recording to exceed each of the given statistics."""
+        out = {}
+        for name, value in largest.items():
+            location, scale = getattr(self, name)
+            out[name] = float(gumbel_r.sf(value / self.margin if name != "gain" else value, location, scale))
+        return out
+
+    def threshold(self, name: str, level: float) -> float:
+        """Value that a healthy recording exceeds with probability `level`."""
+        location, scale = getattr(self, name)
+        return float(gumbel_r.isf(level, location, scale)) * (self.margin if name != "gain" else 1.0)
+
+
+def largest(found: list[Cell]) -> dict[str, float]:
+    """The largest scores of `cells`."""
+    return {"cell": max(c.z for c in found), "pooled": float(pooled(found).max())}

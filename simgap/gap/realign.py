@@ -1,0 +1,59 @@
+"""Align again with an effect taken out: late or softened forces displace the boundaries themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hmmseg.rig import Rig
+from hmmseg.segmentation import AlignedTrials, align_trials
+from hmmseg.signals import task_space
+from hmmseg.trial import Trial
+from simgap.effects.base import tips
+from simgap.gap.fit import Fitted, Problem, _extended, _on, corrected
+from simgap.gap.frame import thinned
+from simgap.gap.residuals import undelayed
+
+
+def realigned(trials: Sequence[Trial], given: Problem, found: Fitted) -> AlignedTrials:
+    """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
+    frame, rig = given.frame, given.frame.rig
+    world = jax.tree.map(jnp.asarray, frame.world)
+    world = corrected(
+        world, jnp.asarray(_extended(found.u)), jnp.asarray(_on(given, found.effects)), given.num_properties
+    )
+    (position, velocity), force = tips(world), undelayed(world)
+    rows = []
+    for r, trial in enumerate(trials):
+        n = frame.lengths[r]
+        names = [f"{kind}{axis}{i}" for kind in ("", "v", "f") for i in (1, 2) for axis in "xy"]
+        columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
+        small, _ = thinned(trial)
+        rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
+    return align_trials([t.file for t in trials], rows, frame.task, _hand(rig, world))
+
+
+def _hand(rig: Rig, world) -> Rig:
+    """The rig with the pads that the candidate gives it."""
+    give = {
+        "normal_stiffness": float(np.mean(world.give_normal)),
+        "shear_stiffness": float(np.mean(world.give_shear)),
+    }
+    pads = {k: 1 / v for k, v in give.items() if v > 1e-7}
+    return rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
+
+
+def moved(before: AlignedTrials, after: AlignedTrials) -> float:
+    """Largest shift of a boundary [s]; infinite where a trial no longer fits its task."""
+    shifts = []
+    for a, b in zip(before.trials, after.trials, strict=True):
+        if not b.segmentation.complete:
+            return float("inf")
+        shifts += [
+            abs(p.quantile(0.5) - q.quantile(0.5)) for p, q in zip(a.boundaries, b.boundaries, strict=True)
+        ]
+    return max(shifts)

@@ -1,0 +1,115 @@
+"""Effects that spread samples instead of shifting them: irregular clocks and quantisation.
+
+They leave the mean where it is, so the fit of properties stands and their evidence is that of a
+variance (clock) or of a lattice (quantisation).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from simgap.effects.base import gradient, tips
+from simgap.gap.fit import Fitted, Problem, residual_at
+from simgap.gap.frame import CHANNELS
+
+SPREADS = ("clock_jitter", "quantisation")
+REPEATED = 0.5  # share of repeated values that only a lattice has
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Evidence [nats] of a spread effect over none, its parameter and that parameter's log sd.
+
+    `explained`: share of the excess square it accounts for, per trial and subtask energies `after`.
+    """
+
+    effect: str
+    evidence: float
+    value: float
+    log_sd: float
+    scale: np.ndarray
+
+
+def clock(given: Problem, fitted: Fitted, samples: np.ndarray) -> Spread:
+    """Variance in proportion to the squared rate of change, on a grid of jitters [s]."""
+    z = residual_at(given, fitted.effects, fitted.u)
+    rate = _rates(given)
+    there = (given.whitening.weight > 0) & (rate > 0)
+    h2, z2 = rate[there] ** 2, z[there] ** 2
+
+    def nats(sd: float) -> float:
+        v = 1 + sd**2 * h2
+        return float(0.5 * (z2 * (1 - 1 / v) - np.log(v)).sum())
+
+    return _on_grid("clock_jitter", nats, samples, lambda sd: np.sqrt(1 + sd**2 * rate**2))
+
+
+def _on_grid(name, nats, grid, scale) -> Spread:
+    score = np.array([nats(float(v)) for v in grid])
+    best = int(score.argmax())
+    weight = np.exp(score - score.max())
+    centre = np.average(np.log(grid), weights=weight)
+    sd = max(float(np.sqrt(np.average((np.log(grid) - centre) ** 2, weights=weight))), 1e-3)
+    evidence = float(score.max() + np.log(np.mean(weight)))  # uniform over the grid's logarithm
+    return Spread(name, evidence, float(grid[best]), sd, scale(float(grid[best])))
+
+
+def _rates(given: Problem) -> np.ndarray:
+    """Whitened change per second of clock error (T, N, C): only where motion is fast."""
+    w, frame = given.frame.world, given.frame
+    import jax
+    import jax.numpy as jnp
+
+    world = jax.tree.map(jnp.asarray, w)
+    _, velocity = tips(world)
+    step = np.median(np.diff(w.t, axis=1))
+    mean_v = np.asarray((velocity[..., :2] + velocity[..., 2:]) / 2)
+    change = np.asarray(gradient(world.t, world.force))
+    out = np.zeros_like(given.whitening.weight)
+    # Central differences of positions read at wrong times: v times the times' difference over 2 steps.
+    for k, c in enumerate(("vx", "vy")):
+        out[..., CHANNELS.index(c)] = np.abs(mean_v[..., k]) / (np.sqrt(2) * step)
+    held = frame.arrays.phase[..., 2]
+    relative = np.abs(np.asarray(velocity[..., 2] - velocity[..., 0]))
+    out[..., CHANNELS.index("distance")] = relative * (1 - held)
+    out[..., CHANNELS.index("fx")] = np.abs(change[..., 0] + change[..., 2]) * held * 0.3
+    out[..., CHANNELS.index("fy")] = np.abs(change[..., 1] + change[..., 3]) * held * 0.3
+    return out * given.whitening.weight
+
+
+def quantised(given: Problem) -> Spread:
+    """Whether forces repeat the same values: levels of a lattice through zero.
+
+    Rounded to 1e-5 N, as files are, one sample in ten repeats another's value by chance; on a lattice
+    most do. The step is the usual gap between neighbouring levels, refined on all samples.
+    """
+    frame = given.frame
+    force = frame.world.force[: frame.num_trials]
+    values = np.concatenate([force[r, :n].ravel() for r, n in enumerate(frame.lengths)])
+    levels = np.unique(np.round(np.abs(values), 6))
+    repeated = 1 - levels.size / values.size
+    plain = np.ones_like(given.whitening.weight)
+    if repeated < REPEATED or levels.size < 4:
+        return Spread("quantisation", -10.0, 0.05, 1.0, plain)
+    step = float(np.median(np.diff(levels)))
+    for reach in (4, 16, 64, 256):  # farther levels tell the step ever more closely
+        count = np.round(values / step)
+        near = (np.abs(count) <= reach) & (count != 0)
+        if near.any():
+            step = float(values[near] @ count[near] / (count[near] @ count[near]))
+    off = np.abs(values / step - np.round(values / step))
+    if np.mean(off < 0.1) < 0.9:
+        return Spread("quantisation", -10.0, step, 1.0, plain)
+    parts = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}
+    scale = plain.copy()
+    for channel, share in parts.items():
+        c = CHANNELS.index(channel)
+        scale[..., c] = np.sqrt(1 + share * step**2 / 12 * given.whitening.weight[..., c] ** 2)
+    return Spread("quantisation", repeated * values.size, step, 1e-3, scale)
+
+
+def spreads(given: Problem, fitted: Fitted) -> list[Spread]:
+    """Both spread effects, tried on top of a fit."""
+    return [clock(given, fitted, np.geomspace(5e-4, 0.03, 40)), quantised(given)]

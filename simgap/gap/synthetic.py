@@ -1,0 +1,132 @@
+"""Simulated recordings with known effects: what the diagnosis is calibrated on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hmmseg.rig import Rig
+from hmmseg.task import BlockTask
+from hmmseg.trial import Trial
+from simgap.effects import effect_named
+from simgap.effects.base import Performance
+from simgap.operator import OperatorSettings
+from simgap.properties import Block, Blocks
+from simgap.scene import Surroundings
+from simgap.sensors import record
+from simgap.simulate import SimulatedTrial, simulate_trials
+
+Values = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value
+
+
+def performed(
+    task: BlockTask,
+    rig: Rig,
+    blocks: Sequence[Blocks],
+    seeds: Sequence[int],
+    effects: Values,
+    operator: OperatorSettings | None = None,
+) -> list[SimulatedTrial]:
+    """Simulated trials in a scene changed by those effects that change scenes (one scene for all)."""
+    scene: dict[str, float] = {}
+    for name, values in effects.items():
+        change = effect_named(name).scene
+        scene |= change(dict(values)) if change else {}
+    pads = {k: scene[k] for k in ("normal_stiffness", "shear_stiffness") if k in scene}
+    hand = rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
+    around = Surroundings(**{k: scene[k] for k in ("tilt", "support_stiffness") if k in scene})
+    if "friction" in scene:
+        blocks = [{n: replace(b, friction=scene["friction"]) for n, b in each.items()} for each in blocks]
+        operator = operator or OperatorSettings(grip=(1.2, 1.8))
+    return simulate_trials(task, hand, blocks, seeds, operator, around)
+
+
+def recorded(simulated: SimulatedTrial, task: BlockTask, rig: Rig, effects: Values) -> Trial:
+    """What the nominal hand's sensors record of a simulated trial under the given effects."""
+    rng = np.random.default_rng([simulated.seed, 7])
+    motion = simulated.motion
+    truth = Performance(
+        simulated.t,
+        motion.position,
+        motion.velocity,
+        motion.force,
+        simulated.boundaries,
+        rig,
+        *_carried(simulated, task),
+    )
+    chosen = [effect_named(n) for n in effects]
+    for effect in sorted(chosen, key=lambda e: -e.stage):
+        if effect.apply is not None:
+            truth = effect.apply(truth, dict(effects[effect.name]), rng)
+    t = simulated.trial.t
+    times = t + rng.normal(0, effects["clock_jitter"]["sd"], t.size) if "clock_jitter" in effects else t
+
+    def at(values: np.ndarray) -> np.ndarray:
+        columns = [np.interp(times, truth.t, c) for c in values.reshape(-1, 4).T]
+        return np.stack(columns, 1).reshape(-1, 2, 2)
+
+    trial = record(t, at(truth.position), at(truth.velocity), at(truth.force), rig, rng, simulated.trial.file)
+    for effect in chosen:
+        if effect.finish is not None:
+            finish, values = effect.finish, dict(effects[effect.name])
+            changed = {c: finish(trial.channels[c], values) for c in ("fx1", "fy1", "fx2", "fy2")}
+            trial = replace(trial, channels=trial.channels | changed)
+    return trial
+
+
+def _carried(simulated: SimulatedTrial, task: BlockTask) -> tuple[np.ndarray, np.ndarray]:
+    """Weight [N] and width [m] of the block in the air (0 and 1 where there is none)."""
+    weight, width = np.zeros(simulated.t.size), np.ones(simulated.t.size)
+    for m, move in enumerate(task.performed):
+        leave, meet = simulated.boundaries[4 * m + 1 : 4 * m + 3]
+        inside = (simulated.t >= leave) & (simulated.t < meet)
+        block: Block = simulated.blocks[move.object]
+        weight[inside], width[inside] = block.weight, block.width
+    return weight, width
+
+
+def draw(name: str, rng: np.random.Generator, size: float = 1.0, rig: Rig | None = None) -> dict[str, float]:
+    """Parameters of an effect drawn about its prior, as `apply` and `scene` name them."""
+    sign = rng.choice([-1.0, 1.0])
+    special = {
+        "fingertip_compliance": lambda: {
+            "normal_stiffness": 4000.0 * np.exp(sign * rng.uniform(0.4, 1.2) * size),
+            "shear_stiffness": 2500.0 * np.exp(rng.choice([0.0, sign * rng.uniform(0.4, 1.2)]) * size),
+        },
+        "table_compliance": lambda: {"stiffness": np.exp(rng.uniform(np.log(800), np.log(5000))) / size},
+        "cable_force": lambda: {
+            "stiffness": sign * size * rng.uniform(0.8, 3),
+            "x0": rng.uniform(0.05, 0.2),
+            "y0": rng.uniform(-0.02, 0.1),
+        },
+        "structural_vibration": lambda: {
+            "frequency": rng.uniform(3, 9),
+            "damping": rng.uniform(0.02, 0.1),
+            "gain": size * rng.uniform(0.04, 0.2),
+        },
+        "grip_slip": lambda: {"mu": rng.uniform(0.24, 0.36)},
+        "clock_jitter": lambda: {"sd": size * np.exp(rng.uniform(np.log(0.003), np.log(0.015)))},
+        "quantisation": lambda: {"step": size * np.exp(rng.uniform(np.log(0.03), np.log(0.15)))},
+        "force_lag": lambda: {"delay": size * rng.uniform(0.03, 0.25)},
+        "force_lowpass": lambda: {"time_constant": size * rng.uniform(0.03, 0.2)},
+        "fingertip_creep": lambda: {
+            "ratio": size * rng.uniform(0.2, 1.2),
+            "time_constant": rng.uniform(0.2, 2.0),
+        },
+        "backlash": lambda: {"width": size * rng.uniform(0.002, 0.012)},
+        "fingertip_mass": lambda: {"mass": size * rng.uniform(0.004, 0.025)},
+        "link_length": lambda: {"scale": sign * size * rng.uniform(0.008, 0.04)},
+        "force_gain": lambda: {"gain": sign * size * rng.uniform(0.04, 0.15)},
+        "table_tilt": lambda: {"angle": sign * size * rng.uniform(0.01, 0.04)},
+        "contact_impact": lambda: {"impulse": size * rng.uniform(0.01, 0.06)},
+        "offcentre_mass": lambda: {"offset": sign * size * rng.uniform(0.001, 0.005)},
+        "viscous_drag": lambda: {"coefficient": sign * size * rng.uniform(0.3, 1.5)},
+    }
+    if name in special:
+        return {k: float(v) for k, v in special[name]().items()}
+    return {
+        p.name: float(size * p.sd * rng.uniform(0.4, 1.5) * rng.choice([-1, 1]))
+        for p in effect_named(name).parameters
+    }

@@ -1,0 +1,94 @@
+"""`hmmseg diagnose` and `hmmseg effects`: documents, refusals, figures and the page."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from commands.main import main
+
+
+def test_effects_are_listed_with_priors(tmp_path, capsys):
+    assert main(["effects", "--json", str(tmp_path / "e.json")]) == 0
+    document = json.loads((tmp_path / "e.json").read_text())
+    assert document["format"] == "hmmseg.effects/1"
+    bias = next(e for e in document["effects"] if e["name"] == "force_bias")
+    assert [p["name"] for p in bias["parameters"]] == ["fx1", "fy1", "fx2", "fy2"]
+    assert bias["parameters"][0]["unit"] == "N"
+    assert "force_bias" in capsys.readouterr().out
+
+
+def test_an_unknown_effect_is_refused(shared, capsys):
+    folder = shared / "recordings/none_1"
+    args = [
+        "diagnose",
+        str(folder / "trial_01.csv"),
+        "--task",
+        str(folder / "task.toml"),
+        "--rig",
+        str(folder / "rig.toml"),
+        "--effect",
+        "force_bais",
+    ]
+    assert main(args) == 2
+    assert "force_bias" in capsys.readouterr().err
+
+
+def test_a_plain_task_is_refused(tmp_path, shared, capsys):
+    (tmp_path / "task.toml").write_text('sequence = ["approach", "mating"]\n')
+    folder = shared / "recordings/none_1"
+    args = [
+        "diagnose",
+        str(folder / "trial_01.csv"),
+        "--task",
+        str(tmp_path / "task.toml"),
+        "--rig",
+        str(folder / "rig.toml"),
+    ]
+    assert main(args) == 2
+    assert "virtual model" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("case", "verdict", "cause"),
+    [
+        ("none_1", "none", []),
+        ("cable_force_1", "named", ["cable_force"]),
+        ("force_lag_1", "named", ["force_lag"]),
+    ],
+)
+def test_recordings_are_diagnosed(shared, tmp_path, case, verdict, cause):
+    folder = shared / "recordings" / case
+    trials = sorted(str(p) for p in folder.glob("trial_*.csv"))[:3]
+    args = [
+        "diagnose",
+        *trials,
+        "--task",
+        str(folder / "task.toml"),
+        "--rig",
+        str(folder / "rig.toml"),
+        "--json",
+        str(tmp_path / "d.json"),
+        "--figures",
+        str(tmp_path / "figures"),
+        "--report",
+        str(tmp_path / "page.html"),
+        "--quiet",
+    ]
+    assert main(args) == 0
+    document = json.loads((tmp_path / "d.json").read_text())
+    assert document["verdict"] == verdict
+    assert document["causes"] == cause
+    assert sum(document["probabilities"].values()) == pytest.approx(1.0)
+    assert all(
+        (tmp_path / "figures" / name).stat().st_size > 5000 for name in ("gap_where.png", "gap_signal.png")
+    )
+    page = (tmp_path / "page.html").read_text()
+    assert 'id="verdict"' in page
+    assert not re.search(r"(src|href)=\"(?!data:)", page)  # nothing is fetched from anywhere
+    if cause:
+        assert document["shrinkage"]["fraction"] > 0.9
+        assert document["where"]

@@ -1,0 +1,55 @@
+"""Reading actual.toml: what it gives, and every refusal by its message."""
+
+import re
+
+import pytest
+
+from estimation.actual import parse_actual, read_actual
+from hmmseg.errors import InputError
+
+GOOD = {"block1": {"weight": {"unit": "N", "value": 0.343, "sd": 0.0005}}}
+
+
+def test_reads_values_with_deviations(tmp_path):
+    path = tmp_path / "actual.toml"
+    path.write_text(
+        '[block1.weight]\nunit = "N"\nvalue = 0.343\nsd = 0.0005\n'
+        '[block2.height]\nunit = "m"\nvalue = 1\n[block2.friction]\nunit = "1"\nvalue = 1.2\nsd = 0.1\n'
+    )
+    assert read_actual(path, ["block1", "block2"]) == {
+        "block1": {"weight": (0.343, 0.0005)},
+        "block2": {"height": (1.0, 0.0), "friction": (1.2, 0.1)},
+    }
+
+
+@pytest.mark.parametrize("entry, message", [
+    ({"unit": "kg", "value": 1.0}, "key block1.weight.unit: found 'kg'; expected \"N\""),
+    ({"value": 1.0}, "key block1.weight.unit: found None"),
+    ({"unit": "N"}, "key block1.weight.value: found None; expected a number > 0"),
+    ({"unit": "N", "value": 0.0}, "key block1.weight.value: found 0.0; expected a number > 0"),
+    ({"unit": "N", "value": True}, "key block1.weight.value: found True"),
+    ({"unit": "N", "value": float("nan")}, "key block1.weight.value: found nan"),
+    ({"unit": "N", "value": 1.0, "sd": -0.1}, "key block1.weight.sd: found -0.1; expected a number >= 0"),
+    ({"unit": "N", "value": 1.0, "sdd": 0.1}, "key block1.weight.sdd: unknown key; expected one of sd, "),
+    (0.3, "key block1.weight: found 0.3; expected a table with unit, value and sd"),
+])  # fmt: skip
+def test_refused_entries(entry, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        parse_actual({"block1": {"weight": entry}}, ["block1"])
+
+
+@pytest.mark.parametrize("table, message", [
+    ({"blok1": GOOD["block1"]}, "key blok1: is not an object of the task; expected one of block1, block2 "
+                                "(did you mean block1?)"),
+    ({"block1": {"wieght": {}}}, "key block1.wieght: unknown property; expected one of friction, height, "
+                                 "weight, width (did you mean weight?)"),
+    ({"block1": 3}, "key block1: found 3; expected tables [block1.PROPERTY]"),
+])  # fmt: skip
+def test_refused_tables(table, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        parse_actual(table, ["block1", "block2"])
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.toml: no such file"):
+        read_actual(tmp_path / "absent.toml", ["block1"])

@@ -1,0 +1,169 @@
+"""Sensitivities against analytic ones; what the recording determines and what it does not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimation.design import build, unexpected_bias
+from estimation.mode import find_mode
+from estimation.observations import aligned_weights
+from estimation.posterior import pack
+from experiments.bank import simulated_cases
+from hmmseg.rig import Fingertip, Rig, Systematic
+from hmmseg.segmentation import align_trials
+
+EVERY = Systematic(
+    force_bias=(0.01,) * 4, force_gain=(0.02,) * 4, joint_offset=(0.001,) * 4,
+    link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case():
+    return simulated_cases(1, trials=2, seed=20_900)[0]
+
+
+@pytest.fixture(scope="module")
+def aligned(case):
+    signals = list(case.signals)
+    found = align_trials([t.file for t in case.trials], signals, case.task, case.rig)
+    return (*aligned_weights(found, signals, case.rig, np.random.default_rng(0)), found)
+
+
+def design_of(case, aligned, systematic):
+    rig = case.rig.model_copy(update={"systematic": systematic})
+    weighed, noise, _ = aligned
+    return build(list(case.trials), weighed, noise, case.task, rig, rig.noise.force)
+
+
+@pytest.fixture(scope="module")
+def design(case, aligned):
+    return design_of(case, aligned, EVERY)
+
+
+def shift(design, name):
+    """What a deviation of one unit shifts, (num_trials, num_alignments, num_moves, 3)."""
+    j = [n.name for n in design.nuisances].index(name)
+    per_sd = design.shifts[..., j].reshape(*design.mean.shape[:2], -1, 3)
+    return per_sd / design.nuisances[j].sd
+
+
+def test_a_force_bias_adds_to_the_net_force_and_through_the_pads_to_lengths(design, case):
+    k_n = case.rig.fingertip.normal_stiffness
+    fy = shift(design, "force_bias.fy1")
+    np.testing.assert_allclose(fy[..., 0], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(fy[..., 1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(fy[..., 2], 0.0, atol=1e-9)  # the same on pickup and place
+    fx = shift(design, "force_bias.fx1")
+    np.testing.assert_allclose(fx[..., 0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(fx[..., 1], 1 / k_n, rtol=1e-5)
+
+
+def test_a_force_gain_scales_what_that_finger_carries(design, case, aligned):
+    gain = shift(design, "force_gain.fy1")[..., 0] + shift(design, "force_gain.fy2")[..., 0]
+    carried = design.mean.reshape(*design.mean.shape[:2], -1, 3)[..., 0]
+    np.testing.assert_allclose(gain, carried, rtol=2e-3)  # both fingers: the whole weight; steps of 1e-3
+    grip = shift(design, "force_gain.fx1")[..., 1]
+    weighed = aligned[0]
+    for i, a in enumerate(weighed):
+        for m, move in enumerate(sorted(a.weights.grips)):
+            mean = a.weights.grips[move]["distance"] @ np.nan_to_num(a.signals.fx1)
+            np.testing.assert_allclose(grip[i, :, m], mean / case.rig.fingertip.normal_stiffness, rtol=2e-3)
+
+
+def test_a_stiffer_pad_gives_less(design, case, aligned):
+    """d(distance) = -(N / k) d(give): recorded tips lie N / k further apart for a pad twice as stiff."""
+    pad = shift(design, "pad_stiffness.1")[..., 1]
+    for i, a in enumerate(aligned[0]):
+        for m, move in enumerate(sorted(a.weights.grips)):
+            grip = a.weights.grips[move]["distance"] @ np.nan_to_num(a.signals.fx1)
+            np.testing.assert_allclose(pad[i, :, m], grip / case.rig.fingertip.normal_stiffness, rtol=3e-3)
+
+
+def test_a_joint_offset_moves_the_tip_by_the_jacobian(design, case, aligned):
+    """dx1/dq11 = -L1 sin q11; finger 1 further right makes the distance shorter."""
+    offset = shift(design, "joint_offset.q11")[..., 1]
+    length = case.rig.finger(1).links[0]
+    for i, a in enumerate(aligned[0]):
+        q = case.trials[i].channels["q11"]
+        for m, move in enumerate(sorted(a.weights.grips)):
+            expected = a.weights.grips[move]["distance"] @ (length * np.sin(q))
+            np.testing.assert_allclose(offset[i, :, m], expected, rtol=1e-3)
+
+
+def test_a_longer_link_moves_the_tip_in_proportion(design, case, aligned):
+    """The true link is (1 + e) of the nominal: the nominal hand reads what is e L cos q less."""
+    link = shift(design, "link_length.11")[..., 1]
+    length = case.rig.finger(1).links[0]
+    for i, a in enumerate(aligned[0]):
+        q = case.trials[i].channels["q11"]
+        for m, move in enumerate(sorted(a.weights.grips)):
+            expected = a.weights.grips[move]["distance"] @ (length * np.cos(q))
+            np.testing.assert_allclose(link[i, :, m], expected, rtol=1e-3)
+
+
+def test_free_motion_shows_biases_and_nothing_else(design):
+    for j, n in enumerate(design.nuisances):
+        kind, _, channel = n.name.partition(".")
+        expected = np.zeros(4)
+        if kind == "force_bias":
+            expected[("fx1", "fy1", "fx2", "fy2").index(channel)] = n.sd
+        # A gain acts on noise about zero: a thousandth of it.
+        np.testing.assert_allclose(design.free_shifts[0, :, j], expected, atol=2e-4)
+
+
+def test_observations_and_coefficients_agree_with_the_truth(design, case):
+    true = np.array([case.blocks[obj][prop][0] for obj, prop in design.names])
+    residual = (design.mean - design.coefficients @ true) / np.sqrt(design.variance)
+    assert np.sqrt(np.mean(residual**2)) < 2.0
+    assert {p for _, p in design.names} == {"weight", "width", "height"} and len(design.names) == 6
+
+
+def test_a_bias_that_free_motion_sees_hardly_widens_weight(case, aligned):
+    """A prior of 0.1 N on the biases, narrowed by free motion to a few mN; gains are not narrowed."""
+
+    def sd_of_weight(systematic):
+        design = design_of(case, aligned, systematic)
+        start = np.array([np.log(case.blocks[obj][prop][0]) for obj, prop in design.names])
+        mode = find_mode(np.concatenate([start, np.zeros(9 + len(design.nuisances))]), pack(design))
+        i = design.names.index(("block1", "weight"))
+        return np.sqrt(mode.covariance[i, i]) * np.exp(mode.x[i])
+
+    none, bias = sd_of_weight(Systematic()), sd_of_weight(Systematic(force_bias=(0.1,) * 4))
+    gain = sd_of_weight(Systematic(force_gain=(0.1,) * 4))
+    weight = case.blocks["block1"]["weight"][0]
+    assert none < bias < 2.5 * none  # without free motion it would be sqrt(2) x 0.1 N
+    assert bias < 0.01
+    assert 0.03 * weight < gain < 0.1 * weight  # two fingers share the load: about 0.1 / sqrt(2)
+
+
+def test_what_a_failed_trial_does_not_show_is_left_out(case, aligned):
+    """Trials that end before the second move: only the first block's own properties are determined."""
+    weighed, noise, _ = aligned
+    cut = []
+    for a in weighed:
+        grips, counts = dict(a.weights.grips), dict(a.weights.counts)
+        grips[1] = {k: np.zeros_like(v) for k, v in grips[1].items()}
+        counts[1] = {k: np.zeros_like(v) for k, v in counts[1].items()}
+        cut.append(replace(a, weights=replace(a.weights, grips=grips, counts=counts)))
+    design = build(list(case.trials), cut, noise, case.task, case.rig, 0.012)
+    # Block 1 moved down from block 2 onto the ground: its rise tells block 2's height.
+    assert set(design.names) == {("block1", "weight"), ("block1", "width"), ("block2", "height")}
+    assert np.isfinite(design.mean).all() and np.isfinite(design.variance).all()
+
+
+def test_unexpected_biases_are_those_beyond_noise_and_the_rig():
+    mean = np.tile([0.05, 0.002, -0.05, 0.0], (3, 1))
+    variance = np.full((3, 4), 0.003**2)
+    plain = unexpected_bias(mean, variance, Rig())
+    np.testing.assert_allclose(plain, [0.05, 0.0, 0.05, 0.0])
+    admitted = Rig(systematic=Systematic(force_bias=(0.05, 0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(unexpected_bias(mean, variance, admitted), [0.0, 0.0, 0.05, 0.0])
+
+
+def test_rigid_pads_have_no_stiffness_to_be_uncertain_of(case, aligned):
+    rig = case.rig.model_copy(update={"systematic": EVERY, "fingertip": Fingertip()})
+    weighed, noise, _ = aligned
+    design = build(list(case.trials), weighed, noise, case.task, rig, 0.012)
+    assert not [n for n in design.nuisances if n.name.startswith("pad")]

@@ -1,0 +1,133 @@
+"""Robust means, their sampling variance against Monte Carlo, autocorrelation times."""
+
+import numpy as np
+import pytest
+
+from estimation.observations import (
+    MIN_STRETCH,
+    _noise,
+    autocorrelation_time,
+    channel_values,
+    draw_boundaries,
+    gravity_factor,
+    robust_weights,
+    subtask_masks,
+)
+from hmmseg.boundaries import BoundaryPosterior
+from hmmseg.contact_emissions import TAIL
+from hmmseg.rig import Fingertip, Rig
+from hmmseg.segmentation import TrialAlignment
+from hmmseg.signals import Signals
+
+
+def made_signals(t, **columns):
+    names = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
+    zero = np.zeros(t.size)
+    spread = {name: zero for name in ("sd_x", "sd_y", "sd_vx", "sd_vy")}
+    values = {name: np.broadcast_to(np.asarray(columns.get(name, 0.0), float), t.shape) for name in names}
+    return Signals(t=t, **values, **spread, sd_force=0.0)
+
+
+def test_weights_are_those_of_the_student_location():
+    rng = np.random.default_rng(0)
+    values = 5 + rng.normal(size=60)
+    values[[3, 40]] = [40.0, np.nan]
+    mask = np.ones(60, bool)
+    mask[50:] = False
+    weights, residual, centre = robust_weights(values, mask, 1.0)
+    inside = mask & np.isfinite(values)
+    # The location solves sum w (v - m) = 0 over the masked values.
+    assert weights[inside] @ residual[inside] == pytest.approx(0.0, abs=1e-5)
+    assert centre == pytest.approx(5.0, abs=0.4)
+    np.testing.assert_allclose(weights[inside], (TAIL + 1) / (TAIL + residual[inside] ** 2))
+    assert weights[40] == 0 and weights[3] < 0.02 * np.median(weights[inside])
+
+
+def test_nothing_recorded_has_no_weight():
+    weights, residual, centre = robust_weights(np.full(4, np.nan), np.ones(4, bool), 1.0)
+    assert not weights.any() and np.isnan(residual).all() and np.isnan(centre)
+
+
+@pytest.mark.parametrize("noise", ["gaussian", "student"])
+def test_sampling_variance_of_the_mean_against_monte_carlo(noise):
+    """The sandwich estimate predicts how the weighted mean of a grip scatters from grip to grip."""
+    rng, per_grip, scale = np.random.default_rng(1), 25, 1.0
+    centres, pairs = [], []
+    for _ in range(3000):
+        v = rng.normal(size=per_grip) if noise == "gaussian" else rng.standard_t(3, size=per_grip)
+        weights, residual, centre = robust_weights(v, np.ones(per_grip, bool), scale)
+        centres.append(centre)
+        pairs.append((residual, weights))
+    predicted = _noise({"force": pairs}, {"force": scale}).variance["force"] / per_grip
+    assert predicted == pytest.approx(np.var(centres), rel=0.1)
+
+
+def test_noise_of_a_channel_without_residuals_is_its_scale():
+    noise = _noise({"force": [(np.array([np.nan]), np.array([1.0]))]}, {"force": 0.3})
+    assert noise.variance["force"] == pytest.approx(0.09) and noise.count["force"] == 1.0
+
+
+def ar1(num, length, rho, rng):
+    out = rng.normal(size=(num, length))
+    for k in range(1, length):
+        out[:, k] = rho * out[:, k - 1] + np.sqrt(1 - rho**2) * out[:, k]
+    return list(out)
+
+
+@pytest.mark.parametrize(("rho", "expected"), [(0.0, 1.0), (0.3, 13 / 7), (0.5, 3.0)])
+def test_autocorrelation_time_of_a_known_process(rho, expected):
+    """(1 + rho) / (1 - rho) for an AR(1); the sum is cut where it drowns in noise."""
+    series = ar1(60, 200, rho, np.random.default_rng(2))
+    assert autocorrelation_time(series) == pytest.approx(expected, rel=0.12)
+
+
+def test_means_of_differentiated_noise_are_better_than_of_white_noise():
+    rng = np.random.default_rng(3)
+    series = list(np.diff(rng.normal(size=(40, 101)), axis=1))
+    assert autocorrelation_time(series) == MIN_STRETCH
+
+
+def test_short_series_are_taken_as_white():
+    assert autocorrelation_time([np.array([1.0, -0.5])]) == 1.0
+
+
+def test_every_sample_belongs_to_one_subtask():
+    times = np.arange(10) * 0.1
+    masks = subtask_masks(times, np.array([[0.25, 0.6], [0.0, 0.9]]), 3)
+    assert masks.shape == (2, 3, 10)
+    np.testing.assert_array_equal(masks.sum(axis=1), 1)
+    np.testing.assert_array_equal(masks[0, 0], times < 0.25)
+    np.testing.assert_array_equal(masks[1].argmax(axis=0), [1] * 9 + [2])  # half-open: 0.0 starts the second
+
+
+def test_drawn_boundaries_follow_their_posterior_and_keep_order():
+    rng = np.random.default_rng(4)
+    times = np.linspace(0, 1, 501)
+    density = np.exp(-0.5 * ((times - 0.4) / 0.05) ** 2)
+    one = BoundaryPosterior(times, density / density.sum())
+    trial = TrialAlignment.__new__(TrialAlignment)
+    object.__setattr__(trial, "boundaries", (one, one))
+    drawn = draw_boundaries(trial, rng, 20_000)
+    assert (np.diff(drawn, axis=1) >= 0).all()
+    assert drawn[:, 0].mean() == pytest.approx(0.4, abs=2e-3) and drawn[:, 0].std() == pytest.approx(
+        0.05, rel=0.03
+    )
+
+
+def test_pads_give_is_taken_out():
+    rig = Rig(fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))
+    t = np.arange(6) * 0.05
+    # A block 20 mm wide held with 2 N: each pad gives 0.5 mm; its weight of 0.5 N shears both pads.
+    signals = made_signals(t, x1=0.1005, x2=0.1195, fx1=2.0, fx2=-2.0, y1=0.05, y2=0.05, fy1=0.25, fy2=0.25)
+    values = channel_values(signals, rig)
+    np.testing.assert_allclose(values["distance"], 0.02)
+    np.testing.assert_allclose(values["pickup"], 0.05 - 0.25 / 2500)
+    rigid = channel_values(signals, Rig())
+    np.testing.assert_allclose(rigid["distance"], 0.019)
+    np.testing.assert_allclose(rigid["pickup"], 0.05)
+
+
+def test_gravity_factor_is_one_plus_acceleration_over_g():
+    t = np.arange(30) * 0.05
+    signals = made_signals(t, vy1=2.0 * t, vy2=2.0 * t)
+    np.testing.assert_allclose(gravity_factor(signals, Rig()), 1 + 2.0 / 9.80665)

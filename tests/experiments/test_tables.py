@@ -1,0 +1,82 @@
+"""Tables written into documents; the bank's deviating hands and the summaries of estimates."""
+
+import numpy as np
+import pytest
+
+from experiments.bank import Deviations, deviated, nominal, simulated_cases
+from experiments.estimates import Estimates, summarise_estimates
+from experiments.write_tables import covered, fill, markdown
+from hmmseg.signals import task_space
+
+
+def test_fill_replaces_what_stands_between_the_markers():
+    text = "a\n<!-- x -->\nold\n<!-- /x -->\nb\n<!-- y -->\n<!-- /y -->\n"
+    once = fill(text, "x", "| new \\1 |")
+    assert once == "a\n<!-- x -->\n\n| new \\1 |\n\n<!-- /x -->\nb\n<!-- y -->\n<!-- /y -->\n"
+    assert fill(once, "x", "| new \\1 |") == once
+    with pytest.raises(ValueError, match="no markers <!-- z -->"):
+        fill(text, "z", "table")
+
+
+def test_markdown_and_coverage():
+    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
+    assert covered({"c": 0.9, "c_se": 0.0123}, "c") == "90.0 ± 1.2 %"
+    assert covered({"c": 0.9, "c_se": None}, "c") == "90.0 %"
+
+
+def test_coverages_have_clusters_as_their_units():
+    names = (("block", "weight"), ("block", "width"))
+
+    def one(z, ranks, release):
+        inside, errors = np.array([[1.0, 0.0, 1.0, release]]), np.array([0.01, -0.03])
+        return Estimates(np.zeros((1, 4)), inside, names, errors, np.array(z), np.array(ranks), 1.0, 1000.0)
+
+    cases = [[one([0.5, 3.0], [0.5, 0.999], np.nan)], [one([0.1, -0.2], [0.4, 0.1], 0.0)]]
+    found = summarise_estimates(cases)
+    assert found["boundaries"]["all"]["coverage_90"] == pytest.approx(4 / 7)  # one is unknown
+    assert found["boundaries"]["lift"]["coverage_90"] == 0.0
+    weight, every = found["properties"]["weight"], found["properties"]["all"]
+    assert weight["rms"] == pytest.approx(0.01) and weight["coverage_68"] == 1.0
+    assert every["coverage_95"] == 0.75 and every["laplace_95"] == 0.75
+    # Cases cover 1/2 and 2/2: their mean has a standard error of half the difference.
+    assert every["coverage_95_se"] == pytest.approx(0.25)
+
+
+def hand(**deviations):
+    zero = {"force_bias": 4, "force_gain": 4, "joint_offset": 4, "link_length": 4, "pad_stiffness": 2}
+    return Deviations(**{k: np.zeros(n) + deviations.get(k, 0.0) for k, n in zero.items()})
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return simulated_cases(1, trials=1, seed=20_990)[0].trials[0]
+
+
+def test_a_hand_without_deviations_records_the_same(trial):
+    rig, _ = nominal()
+    again = deviated(trial, rig, hand())
+    for name, values in trial.channels.items():
+        np.testing.assert_allclose(again.channels[name], values, atol=1e-9)
+
+
+def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):
+    rig, _ = nominal()
+    changed = deviated(trial, rig, hand(link_length=0.01, joint_offset=0.002))
+    true = {
+        i: f.model_copy(update={"links": tuple(1.01 * x for x in f.links)}) for i, f in rig.fingers.items()
+    }
+    channels = {k: v - 0.002 if k.startswith("q") else v for k, v in changed.channels.items()}
+    knowing = task_space(type(trial)(trial.file, trial.t, channels), rig.model_copy(update={"fingers": true}))
+    expected = task_space(trial, rig)
+    for name in ("x1", "y1", "x2", "y2", "vx1", "vy2"):
+        np.testing.assert_allclose(getattr(knowing, name), getattr(expected, name), atol=1e-9)
+
+
+def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
+    rig, _ = nominal()
+    changed = deviated(trial, rig, hand(force_gain=0.1, force_bias=0.05, pad_stiffness=1.0))
+    np.testing.assert_allclose(changed.channels["fx1"], 1.1 * trial.channels["fx1"] + 0.05)
+    before, after = task_space(trial, rig), task_space(changed, rig)
+    # Twice the stiffness halves the give: tips under grip N lie N / (2 k) further back.
+    give = trial.channels["fx1"] / (2 * rig.fingertip.normal_stiffness)
+    np.testing.assert_allclose(before.x1 - after.x1, give, atol=1e-9)

@@ -1,0 +1,176 @@
+"""Boundary posteriors against analytic roots and Monte Carlo over the model they assume."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmmseg.boundaries import (
+    APPROACH,
+    LAUNCH,
+    ONSET,
+    POINTS,
+    UNIFORM,
+    BoundaryPosterior,
+    Crossing,
+    _hermite,
+    _hermite_slopes,
+    combine,
+    crossing_density,
+    first_of,
+)
+
+WIDTH = 0.05
+NODES = (np.arange(POINTS) + 0.5) / POINTS * WIDTH
+SOME = [
+    Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
+    Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
+    Crossing(-2e-4, 1e-3, 0.01, 0.05, 3e-6, 3e-5, 2e-3, "launch"),
+]
+
+
+def linear(root, speed, kind, sd=1e-7):
+    """Uniform motion with this speed that crosses zero at `root` [s]."""
+    left = -speed * root
+    if kind == "impact":  # stops dead after the touch, up to the pad's compression
+        return Crossing(left, 0.15 * speed * (WIDTH - root), speed, 0.0, sd, sd, 1e-5, kind)
+    if kind == "launch":  # from rest under load, constant jerk: a third of the speed on the mean
+        after = WIDTH - root
+        creep = 1e-3 * speed
+        return Crossing(-creep * root, (creep + (speed - creep) / 3) * after, 0.75 * creep, speed, sd, sd,
+                        1e-5, kind)  # fmt: skip
+    return Crossing(left, speed * (WIDTH - root), speed, speed, sd, sd, 1e-5)
+
+
+def quantiles(density, levels):
+    return np.interp(levels, np.cumsum(density) - density / 2, NODES)
+
+
+@pytest.mark.parametrize("c", SOME, ids=lambda c: c.kind)
+@pytest.mark.parametrize("combined", [crossing_density, first_of])
+def test_densities_are_normalised(c, combined):
+    for crossings in ([c], [c, SOME[0]], [c, c, c]):
+        density = combined(crossings, WIDTH)
+        assert density.shape == (POINTS,) and (density > 0).all()
+        np.testing.assert_allclose(density.sum(), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("combined", [crossing_density, first_of])
+def test_without_a_crossing_nothing_is_known(combined):
+    np.testing.assert_allclose(combined([], WIDTH), 1 / POINTS)
+
+
+@pytest.mark.parametrize("root", [0.011, 0.025, 0.04])
+@pytest.mark.parametrize("kind", ["smooth", "impact", "launch"])
+def test_without_noise_the_root_is_found(kind, root):
+    density = crossing_density([linear(root, 0.05, kind)], WIDTH)
+    # What is left is the model's own: an unknown acceleration, by root^2 / 2 APPROACH before a
+    # touch; an unknown profile, by 3 LAUNCH of the time after a launch (as sd).
+    sd = {"smooth": 0.0, "impact": root**2 / (2 * APPROACH), "launch": 3 * LAUNCH * (WIDTH - root)}
+    near = 1.645 * sd[kind] + 0.001 + WIDTH / POINTS
+    assert density[np.abs(NODES - root) < near].sum() > 0.8
+    assert quantiles(density, 0.5) == pytest.approx(root, abs=0.001 + 0.5 * sd[kind])
+
+
+def test_hermite_slopes_are_the_derivatives_of_the_cubic():
+    u = np.linspace(0.1, 0.9, 7)
+    numeric = [(a - b) / 2e-6 for a, b in zip(_hermite(u + 1e-6), _hermite(u - 1e-6), strict=True)]
+    np.testing.assert_allclose(_hermite_slopes(u), numeric, atol=1e-8)
+
+
+def test_the_cubic_passes_through_values_and_velocities():
+    ends = np.array([0.0, 1.0])
+    np.testing.assert_allclose(_hermite(ends), [[1, 0], [0, 0], [0, 1], [0, 0]], atol=1e-12)
+    np.testing.assert_allclose(_hermite_slopes(ends), [[0, 0], [1, 0], [0, 0], [0, 1]], atol=1e-12)
+
+
+def test_last_and_first_of_two_against_monte_carlo():
+    # Broad enough that the grid of nodes resolves them.
+    ends = ((-1.2e-3, 8e-4), (-7e-4, 1.3e-3))
+    pair = [Crossing(*values, 0.04, 0.04, 3e-4, 3e-4, 1e-3) for values in ends]
+    rng, num = np.random.default_rng(0), 100_000
+    parts = [(crossing_density([c], WIDTH) - UNIFORM / POINTS) / (1 - UNIFORM) for c in pair]
+    drawn = [rng.choice(POINTS, size=num, p=p / p.sum()) for p in parts]
+    for combined, chosen in ((crossing_density, np.maximum), (first_of, np.minimum)):
+        expected = np.bincount(chosen(*drawn), minlength=POINTS) / num
+        found = combined(pair, WIDTH)
+        np.testing.assert_allclose(found, (1 - UNIFORM) * expected + UNIFORM / POINTS, atol=5e-3)
+
+
+def test_known_needs_every_number():
+    assert SOME[0].known
+    for name in ("left", "right", "v_left", "v_right", "sd_left", "sd_right", "sd_v"):
+        assert not replace(SOME[0], **{name: np.nan}).known
+
+
+def test_quantiles_and_moments_of_a_known_distribution():
+    times = np.linspace(-5, 5, 4001)
+    density = np.exp(-0.5 * times**2)
+    posterior = BoundaryPosterior(1.0 + 0.1 * times, density / density.sum())
+    assert posterior.mean == pytest.approx(1.0)
+    assert posterior.sd == pytest.approx(0.1, rel=1e-4)
+    for q, z in ((0.05, -1.6449), (0.5, 0.0), (0.95, 1.6449)):
+        assert posterior.quantile(q) == pytest.approx(1.0 + 0.1 * z, abs=1e-4)
+
+
+def test_combine_weighs_intervals_and_keeps_their_shapes():
+    t = np.array([0.0, 0.1, 0.2, 0.35, 0.4])
+    probability = np.array([0.0, 0.25, 0.75, 1e-9])
+    point = np.zeros(POINTS)
+    point[POINTS // 2] = 1.0
+    posterior = combine(t, probability, {2: point})
+    assert (np.diff(posterior.times) >= 0).all()
+    assert posterior.probabilities.sum() == pytest.approx(1.0)
+    early = posterior.times < 0.2 + 4 * ONSET
+    # The uniform interval, mean 0.15; the known one, mean in its middle.
+    assert posterior.probabilities[early].sum() == pytest.approx(0.25, abs=2e-3)
+    assert posterior.mean == pytest.approx(0.25 * 0.15 + 0.75 * 0.275, abs=1e-4)
+    variance = 0.25 * (0.15**2 + 0.1**2 / 12) + 0.75 * 0.275**2 - posterior.mean**2 + ONSET**2
+    assert posterior.sd == pytest.approx(np.sqrt(variance), rel=0.01)
+
+
+def test_combined_posteriors_stay_inside_the_recording():
+    t = np.array([0.0, 1e-3, 2e-3])
+    posterior = combine(t, np.array([1.0, 0.0]), {})
+    assert posterior.times.min() >= 0.0 and posterior.times.max() <= 2e-3
+
+
+def coverage(draw, rng, num=600):
+    """Share of true roots inside the central 90 % interval, roots drawn by `draw(rng)`."""
+    inside = 0
+    for _ in range(num):
+        root, crossing = draw(rng)
+        density = crossing_density([crossing], WIDTH)
+        low, high = quantiles(density, [0.05, 0.95])
+        inside += low <= root <= high
+    return inside / num
+
+
+def smooth_case(rng):
+    """Constant velocity, measured at both ends with noise; the root is uniform in the interval."""
+    root, speed, sd, sd_v = rng.uniform(0, WIDTH), 0.05, 2e-4, 2e-3
+    values = np.array([-speed * root, speed * (WIDTH - root)]) + sd * rng.normal(size=2)
+    rates = speed + sd_v * rng.normal(size=2)
+    return root, Crossing(*values, *rates, sd, sd, sd_v)
+
+
+def impact_case(rng):
+    """Nearly uniform approach, then an exponential stop with a log-uniform time constant."""
+    root, speed, sd_left, sd_right, sd_v = rng.uniform(0, WIDTH), 0.05, 4e-5, 5e-6, 2e-3
+    acceleration = 0.4 * speed / WIDTH * rng.normal()
+    v = speed + acceleration * root
+    stop = WIDTH * np.exp(rng.uniform(np.log(0.02), np.log(1.0)))
+    after = WIDTH - root
+    left = -(speed * root + acceleration * root**2 / 2)
+    right = v * stop * -np.expm1(-after / stop)
+    v_right = v * np.exp(-after / stop)
+    noise = rng.normal(size=4)
+    return root, Crossing(left + sd_left * noise[0], right + sd_right * noise[1], speed + sd_v * noise[2],
+                          v_right + sd_v * noise[3], sd_left, sd_right, sd_v, "impact")  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [smooth_case, impact_case], ids=["smooth", "impact"])
+def test_ninety_percent_intervals_cover(case):
+    share = coverage(case, np.random.default_rng(3))
+    # Wider than nominal by design: bends that the cubic misses, a uniform part.
+    assert 0.86 < share < 0.99, share

@@ -1,0 +1,177 @@
+"""Misfit trials are found, named and kept out of the pool; healthy ones pass."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.misfit_edits import EDITS, FORCES, join, let_go
+from experiments.recordings import list_cases, read_case
+from hmmseg.rig import read_rig
+from hmmseg.segmentation import align_trials
+from hmmseg.signals import task_space
+from hmmseg.task import BlockTask, Move
+from hmmseg.trial import Trial, read_trial
+
+STACK = Path(__file__).parents[1] / "data" / "stack"
+RIG = read_rig(STACK / "rig.toml")
+MOVES = (Move("block1", "ground"), Move("block2", "block1"))
+TASK = BlockTask({"block1": "block2", "block2": "ground"}, MOVES)
+TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
+TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
+ONE_BLOCK = BlockTask({"block1": "ground"}, (Move("block1", "ground"),))
+
+
+def align(*trials: Trial, task: BlockTask = TASK):
+    return align_trials([t.file for t in trials], [task_space(t, RIG) for t in trials], task, RIG)
+
+
+def segment(*trials: Trial, task: BlockTask = TASK):
+    return [t.segmentation for t in align(*trials, task=task).trials]
+
+
+def names(segmentation) -> list[str]:
+    return [f"{s.subtask} {s.object}" for s in segmentation.spans]
+
+
+@pytest.mark.parametrize("which", range(2))
+@pytest.mark.parametrize("edit", EDITS)
+def test_misfits_are_found_at_the_subtask_that_fails(edit, which):
+    trial, expected = EDITS[edit](TRIALS[which], TRUTH[which])
+    (found,) = segment(trial)
+    assert found.failed is not None
+    assert found.failed.index == expected
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert document["complete"] is False and document["failed"]["reason"]
+
+
+def test_healthy_trials_pass():
+    assert all(s.complete and len(s.spans) == 9 for s in segment(*TRIALS))
+
+
+def test_all_recordings_pass_whatever_effect_is_on_them(shared):
+    for folder in list_cases(shared / "recordings"):
+        case = read_case(folder)
+        some = slice(0, 2)  # experiments/misfits.py takes all
+        files = [t.file for t in case.trials[some]]
+        aligned = align_trials(files, case.signals[some], case.task, case.rig)
+        for trial in aligned.trials:
+            assert trial.segmentation.complete, (case.name, trial.segmentation.failed)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        ("drop_first", "block1 was let go in mid-air at "),
+        ("drop_and_retry", " and gripped again at "),
+        ("regrasp", "block1 was gripped again at "),
+        ("regrasp_on_ground", "block1 was let go without being lifted at "),
+        ("no_second_move", "no second grip: the recording ends in free motion"),
+        ("only_free_motion", "no grip: the recording ends in free motion"),
+        ("extra_move", "goes on after the task's end with another grip at "),
+        ("starts_in_carry", "the recording starts while a block is held above the ground"),
+        ("stops_in_carry", "the recording ends while block2 is held above the ground"),
+        ("swapped", "block1 was raised by 16 mm from pickup to place, against the task"),
+    ],
+)
+def test_reasons_are_plain_words(edit, words):
+    (found,) = segment(EDITS[edit](TRIALS[0], TRUTH[0])[0])
+    assert found.failed is not None and words in found.failed.reason
+
+
+def test_time_of_the_drop_is_told():
+    dropped, _ = EDITS["drop_first"](TRIALS[0], TRUTH[0])
+    (found,) = segment(dropped)
+    assert found.failed is not None
+    told = float(found.failed.reason.split(" at ")[1].split()[0])
+    assert told == pytest.approx((TRUTH[0][1] + TRUTH[0][2]) / 2, abs=0.06)
+
+
+def test_what_is_good_before_and_after_a_drop_is_kept():
+    aligned = align(EDITS["drop_first_go_on"](TRIALS[0], TRUTH[0])[0]).trials[0]
+    kept = aligned.segmentation.spans
+    assert names(aligned.segmentation) == [
+        "pregrasp block1", "pickup block1", "carry block1",
+        "release block1", "pickup block2", "carry block2", "place block2", "release block2",
+    ]  # fmt: skip
+    starts = {f"{s.subtask} {s.object}": s.start for s in kept}
+    for k, name in ((0, "pickup block1"), (1, "carry block1"), (4, "pickup block2"), (7, "release block2")):
+        assert starts[name] == pytest.approx(TRUTH[0][k], abs=0.05)
+    assert len(aligned.boundaries) == 8
+    medians = [b.quantile(0.5) for b in aligned.boundaries]
+    assert np.all(np.diff(medians) >= 0)
+    assert medians[4] == pytest.approx(TRUTH[0][4], abs=0.05)
+
+
+def test_a_bad_trial_does_not_touch_the_others():
+    bad, _ = EDITS["drop_first"](TRIALS[2], TRUTH[2])
+    alone, pooled = align(*TRIALS[:2]), align(TRIALS[0], bad, TRIALS[1])
+    assert [t.segmentation.complete for t in pooled.trials] == [True, False, True]
+    assert pooled.fit.parameters.weight == alone.fit.parameters.weight
+    for a, b in zip(alone.trials, (pooled.trials[0], pooled.trials[2]), strict=True):
+        assert a.segmentation == b.segmentation
+
+
+def test_the_others_tell_which_block_is_which():
+    """Two moves of one block alone could be the task's two blocks; next to other trials they cannot."""
+    b = TRUTH[0]
+    twice = join(TRIALS[0], (-np.inf, b[3] + 0.5), (b[0] - 0.5, b[3] + 0.8))
+    (*_, found) = segment(TRIALS[1], TRIALS[2], TRIALS[1], twice)
+    assert found.failed is not None
+    assert (found.failed.index, found.failed.object) == (5, "block2")
+    assert "block1 was gripped again" in found.failed.reason
+
+
+def test_a_bounce_at_touchdown_is_no_drop():
+    down = TRUTH[0][2] + 0.05
+    bounced = let_go(TRIALS[0], TRUTH[0], down, down + 0.05)
+    (found,) = segment(bounced)
+    assert found.complete
+
+
+def test_a_longer_recording_than_the_task():
+    (found,) = segment(TRIALS[0], task=ONE_BLOCK)
+    assert found.failed is not None and found.failed.index == 4
+    assert names(found) == [f"{n} block1" for n in ("pregrasp", "pickup", "carry", "place", "release")]
+
+
+@pytest.mark.parametrize("rounds", [1, 3])
+def test_unknown_number_of_rounds(rounds):
+    b = TRUTH[0]
+    piece = (b[0] - 0.6, b[3] + 0.5)
+    trial = join(TRIALS[0], *[piece] * rounds)
+    aligned = align(trial, task=replace(ONE_BLOCK, repeat="unknown"))
+    assert aligned.task.repeat == rounds
+    assert len(aligned.subtasks) == 1 + 4 * rounds
+    assert aligned.trials[0].segmentation.complete
+
+
+def flat(trial: Trial, value: float) -> Trial:
+    return Trial(trial.file, trial.t, trial.channels | {n: np.full(trial.t.size, value) for n in FORCES})
+
+
+def scattered(trial: Trial) -> Trial:
+    """Forces missing but for two samples."""
+    there = np.isin(np.arange(trial.t.size), (20, 60))
+    return Trial(
+        trial.file, trial.t, trial.channels | {n: np.where(there, trial.channels[n], np.nan) for n in FORCES}
+    )
+
+
+@pytest.mark.parametrize(
+    "trial",
+    [
+        join(TRIALS[0], (1.5, 1.9)), join(TRIALS[0], (2.5, 2.9)), flat(TRIALS[0], 0.0), flat(TRIALS[0], 0.7),
+        scattered(TRIALS[0]),
+    ],
+    ids=["eight samples", "eight in a carry", "no force", "constant force", "two samples of force"],
+)  # fmt: skip
+def test_hopeless_recordings_are_reported_not_raised(trial):
+    aligned = align(trial).trials[0]
+    assert aligned.segmentation.failed is not None
+    assert len(aligned.boundaries) == 8
+    json.dumps(aligned.segmentation.to_json(), allow_nan=False)

@@ -1,0 +1,163 @@
+"""Emission densities integrate to one, skip what is missing, and prefer their own samples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+
+from hmmseg.contact_emissions import (
+    STRAY,
+    TAIL,
+    Features,
+    Parameters,
+    _log_between,
+    _log_ungripped,
+    log_likelihoods,
+    log_student,
+)
+from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
+from hmmseg.task import BlockTask, Move
+
+PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
+SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
+SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0}
+PARAMETERS = Parameters(
+    bias=np.array([0.02, -0.01, 0.0, 0.03]), weight={"block": 0.4}, width={"block": 0.02},
+    scale={"force": 0.01, "carry": 0.02, "net_x": 0.05, "shear": 0.05, "velocity": 0.003,
+           "level": 1e-4, "width": 1e-4},
+    levels=({1: 0.01, 2: 0.01, 3: 0.01},),
+)  # fmt: skip
+
+
+def features(num, **columns):
+    """Features of `num` samples, columns by name (scalar or array)."""
+    blank = {name: np.zeros(num) for name in ("vx", "vy", "ay", "y", "d")}
+    values = {name: np.broadcast_to(np.asarray(v, float), (num,)) for name, v in columns.items()
+              if name != "force"}  # fmt: skip
+    force = np.broadcast_to(np.asarray(columns.get("force", np.zeros(4)), float), (num, 4))
+    noise = {name: np.full(num, sd) for name, sd in
+             (("sd_y", 3e-5), ("sd_d", 6e-5), ("sd_vx", 2e-3), ("sd_vy", 2e-3))}  # fmt: skip
+    return Features(np.arange(num) * 0.05, force, **(blank | values), **noise, compliance=2e-4,
+                    squeeze=2.5e-4, gravity=9.81, span=SPAN)  # fmt: skip
+
+
+def step(state: str) -> tuple[Subtask, ...]:
+    task = SLIDE if state == SLIDING else PICK
+    return tuple(s for s in subtasks(task) if s.state == state)[:1]
+
+
+def score(f: Features, state: str) -> np.ndarray:
+    return log_likelihoods(f, step(state), PARAMETERS, 0)[:, 0]
+
+
+def own_sample(state: str, num: int, rng) -> Features:
+    """Samples drawn as the state has them (Gaussian noise at the parameters' scales)."""
+    p, scale = PARAMETERS, PARAMETERS.scale
+    noise = scale["force"] * rng.normal(size=(num, 4))
+    if state == FREE:
+        return features(num, force=p.bias + noise, vx=rng.uniform(-0.2, 0.2, num),
+                        vy=rng.uniform(-0.15, 0.15, num), y=rng.uniform(0, 0.06, num),
+                        d=rng.uniform(0.02, 0.06, num))  # fmt: skip
+    grip = rng.uniform(1, 3, num)
+    above = state == ABOVE_GROUND
+    ay = rng.normal(size=num) if above else np.zeros(num)
+    fy = 0.4 * (1 + ay / 9.81) if above else rng.uniform(-1, 0.2, num)
+    force = np.stack([grip, fy / 2, -grip, fy / 2], axis=1) + p.bias + noise
+    moving = rng.uniform(-0.2, 0.2, num)
+    still = 0.003 * rng.normal(size=(2, num))
+    return features(
+        num, force=force, ay=ay, d=0.02 - 2 * grip * 2.5e-4 + 1e-4 * rng.normal(size=num),
+        vx=still[0] if state == ON_GROUND else moving, vy=moving if above else still[1],
+        y=rng.uniform(0.015, 0.06, num) if above else 0.01 + fy * 2e-4 + 1e-4 * rng.normal(size=num),
+    )  # fmt: skip
+
+
+def test_student_is_scipys_t():
+    x = np.linspace(-3, 3, 13)
+    np.testing.assert_allclose(log_student(x, 0.3), stats.t.logpdf(x, TAIL, scale=0.3), rtol=1e-12)
+
+
+def test_soft_uniform_is_a_density():
+    def density(x):
+        return float(np.exp(_log_between(np.array([x]), 0.5, 4.0, 0.05))[0])
+
+    total, _ = quad(density, -1, 6, points=[0.5, 4.0], epsabs=1e-9)
+    # Both soft edges together lose what one edge's noise carries beyond the other: nothing here.
+    np.testing.assert_allclose(total, 1.0, atol=1e-6)
+
+
+def test_ungripped_force_density_integrates_to_one():
+    # Importance sampling with a proposal of the same three parts, heavier at the edges.
+    rng, num, scale, span = np.random.default_rng(0), 400_000, 0.1, 6.0
+    part = rng.integers(3, size=num)
+    silent = stats.t(3, scale=0.15)
+    x = silent.rvs(size=(num, 4), random_state=rng)
+    wide = np.stack([rng.uniform(-1, 7, num), rng.uniform(-7, 7, num)], axis=1)
+    x[part == 1, :2] = wide[part == 1]
+    mirrored = wide * np.array([-1.0, 1.0])
+    x[part == 2, 2:] = mirrored[part == 2]
+    quiet = silent.logpdf(x)
+    box = -np.log(8.0 * 14.0)
+    one = np.where((x[:, 0] > -1) & (x[:, 0] < 7) & (np.abs(x[:, 1]) < 7), box, -np.inf)
+    two = np.where((x[:, 2] < 1) & (x[:, 2] > -7) & (np.abs(x[:, 3]) < 7), box, -np.inf)
+    proposal = np.logaddexp.reduce(
+        [quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1), quiet[:, :2].sum(axis=1) + two]
+    ) - np.log(3)
+    ratio = np.exp(_log_ungripped(x, scale, span) - proposal)
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(num) + 1e-3
+
+
+@pytest.mark.parametrize("state", [FREE, ON_GROUND, SLIDING, ABOVE_GROUND])
+@pytest.mark.parametrize("name", ["vx", "vy", "y", "d"])
+def test_density_over_one_feature_integrates_to_one(state, name):
+    """The joint density factorises over these features, so its ratio to one point's is a density."""
+    centre = {"vx": 0.0, "vy": 0.0, "y": 0.01, "d": 0.019}[name]
+    half = 0.5 * SPAN[name]
+    grid = centre + np.linspace(-half, half, 200_001)
+    base = {"force": PARAMETERS.bias + np.array([2.0, 0.0, -2.0, 0.0]), "y": 0.01, "d": 0.019}
+    table = score(features(grid.size, **(base | {name: grid})), state)
+    without = score(features(1, **(base | {name: np.nan})), state)[0]
+    total = np.trapezoid(np.exp(table - without), grid)
+    np.testing.assert_allclose(total, 1.0, rtol=2e-3)  # heavy tails beyond the range
+
+
+@pytest.mark.parametrize("state", [FREE, ON_GROUND, SLIDING, ABOVE_GROUND])
+def test_a_sample_without_values_says_nothing(state):
+    f = features(3, force=np.full(4, np.nan), vx=np.nan, vy=np.nan, ay=np.nan, y=np.nan, d=np.nan)
+    table = score(f, state)
+    expected = np.zeros(3)
+    if state == FREE:  # its mixture has no weight left but its own
+        np.testing.assert_allclose(table, expected, atol=1e-12)
+    else:
+        np.testing.assert_array_equal(table, expected)
+
+
+def test_one_missing_channel_leaves_the_others():
+    f = own_sample(ON_GROUND, 50, np.random.default_rng(1))
+    lost = replace(f, vx=np.full(50, np.nan))
+    difference = score(f, ON_GROUND) - score(lost, ON_GROUND)
+    spread = np.hypot(2e-3, PARAMETERS.scale["velocity"])
+    close, stray = stats.t.pdf(f.vx, TAIL, scale=spread), 1 / f.span["vx"]
+    np.testing.assert_allclose(difference, np.log((1 - STRAY) * close + STRAY * stray), rtol=1e-9)
+
+
+@pytest.mark.parametrize("own", [FREE, ON_GROUND, SLIDING, ABOVE_GROUND])
+def test_every_state_prefers_its_own_samples(own):
+    f = own_sample(own, 300, np.random.default_rng(2))
+    scores = {state: score(f, state).sum() for state in (FREE, ON_GROUND, SLIDING, ABOVE_GROUND)}
+    others = [scores[state] for state in scores if state != own]
+    assert scores[own] > max(others) + 100
+
+
+def test_weight_of_a_carried_block_includes_its_inertia():
+    force = PARAMETERS.bias + np.array([2.0, 0.3, -2.0, 0.3])  # 0.6 N: 0.4 N at half a g upwards
+    still, rising = (score(features(1, force=force, d=0.019, ay=a), ABOVE_GROUND)[0] for a in (0.0, 4.905))
+    assert rising > still + 5
+
+
+def test_an_unknown_state_is_refused():
+    other = replace(step(FREE)[0], state="in-orbit", object="block")
+    with pytest.raises(ValueError, match="no emission for the contact state 'in-orbit'"):
+        log_likelihoods(features(2), (other,), PARAMETERS, 0)

@@ -1,0 +1,60 @@
+"""The unconstrained model against enumeration of every state path."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from hmmseg.ergodic import log_evidence, viterbi
+
+
+def problem(num_timesteps, num_states, seed=0):
+    rng = np.random.default_rng(seed)
+    return (
+        rng.normal(size=(num_timesteps, num_states)),
+        rng.normal(size=num_states),
+        rng.normal(size=(num_states, num_states)),
+    )
+
+
+def enumerate_paths(ll, initial, transition):
+    paths = list(itertools.product(range(ll.shape[1]), repeat=len(ll)))
+    weights = [
+        initial[p[0]] + sum(ll[t, k] for t, k in enumerate(p))
+        + sum(transition[i, j] for i, j in itertools.pairwise(p))
+        for p in paths
+    ]  # fmt: skip
+    return paths, np.array(weights)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 3), (5, 2), (6, 4)])
+def test_matches_enumeration(size):
+    ll, initial, transition = problem(*size, seed=sum(size))
+    if size[1] > 2:
+        transition[0, 1] = initial[2] = -np.inf
+    paths, weights = enumerate_paths(ll, initial, transition)
+    best = viterbi(ll, initial, transition)
+    assert tuple(best.path.tolist()) == paths[weights.argmax()]
+    np.testing.assert_allclose(best.log_prob, weights.max())
+    np.testing.assert_allclose(log_evidence(ll, initial, transition), np.logaddexp.reduce(weights))
+
+
+def test_padding_changes_nothing():
+    ll, initial, transition = problem(5, 3)
+    padded = np.pad(ll, ((0, 4), (0, 0)), constant_values=np.inf)
+    np.testing.assert_allclose(
+        log_evidence(padded, initial, transition, 5), log_evidence(ll, initial, transition)
+    )
+    best = viterbi(padded, initial, transition, 5)
+    assert best.path[:5].tolist() == viterbi(ll, initial, transition).path.tolist()
+
+
+def test_refusals():
+    ll, initial, transition = problem(4, 2)
+    with pytest.raises(ValueError, match=r"log_transition: shape \(2,\), expected \(2, 2\)"):
+        viterbi(ll, initial, initial)
+    with pytest.raises(ValueError, match="no state path"):
+        viterbi(np.full((4, 2), -np.inf), initial, transition)
+    ll[1, 1] = np.nan
+    with pytest.raises(ValueError, match=r"log_likelihoods: NaN at \[1, 1\]"):
+        log_evidence(ll, initial, transition)

@@ -1,0 +1,121 @@
+"""Whole segmentations against the truth: recordings, and simulated trials under hard conditions."""
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.bank import nominal, simulated_cases
+from experiments.recordings import read_case
+from hmmseg.rig import Fingertip, Noise, Rig
+from hmmseg.segmentation import align_trials, segment_trials
+from hmmseg.signals import task_space
+from hmmseg.task import BlockTask, Move
+from hmmseg.trial import Trial
+from simgap.properties import random_properties
+from simgap.simulate import simulate_trials
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+NEAR = 0.05  # s
+
+
+def residuals(trials, truth, task, rig):
+    """Boundary residuals [s] (num_trials, num_boundaries), spans checked for sense."""
+    found = segment_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    out = []
+    for segmentation, trial, times in zip(found, trials, truth, strict=True):
+        assert segmentation.complete
+        spans = segmentation.spans
+        assert len(spans) == 9 and spans[0].start == trial.t[0] and spans[-1].end == trial.t[-1]
+        for a, b in itertools.pairwise(spans):
+            assert a.end == b.start and a.end_90 == b.start_90 and a.end_sd == b.start_sd
+            assert a.end_90[0] <= a.end <= a.end_90[1] and a.end_sd > 0
+        out.append([span.start for span in spans[1:]] - np.asarray(times))
+    return np.array(out)
+
+
+def simulated(rate, trials=1, seed=20_950):
+    case = simulated_cases(1, trials=trials, seed=seed, rate=rate)[0]
+    return list(case.trials), [np.array(t) for t in case.truth], case.task, case.rig
+
+
+@pytest.mark.parametrize("name", ["none_1", "none_2"])
+def test_recordings_are_segmented_within_50_ms(name):
+    case = read_case(RECORDINGS / name)
+    found = residuals(list(case.trials[:2]), case.truth[:2], case.task, case.rig)
+    assert np.abs(found).max() < NEAR and np.median(np.abs(found)) < 0.015
+
+
+@pytest.mark.parametrize("rate", [10.0, 100.0, 1000.0])
+def test_any_rate_from_10_hz_to_1_khz(rate):
+    trials, truth, task, rig = simulated(rate)
+    found = residuals(trials, truth, task, rig)
+    assert np.abs(found).max() < (0.1 if rate == 10.0 else NEAR)  # one sample of 10 Hz is 100 ms
+    assert np.median(np.abs(found)) < 0.015
+
+
+def lossy(trial, rng, share=0.1):
+    channels = {k: np.where(rng.uniform(size=v.size) < share, np.nan, v) for k, v in trial.channels.items()}
+    return replace(trial, channels=channels)
+
+
+def irregular(trial, rng, share=0.25):
+    keep = np.sort(rng.choice(trial.t.size, size=int((1 - share) * trial.t.size), replace=False))
+    keep = np.union1d(keep, [0, trial.t.size - 1])
+    return replace(trial, t=trial.t[keep], channels={k: v[keep] for k, v in trial.channels.items()})
+
+
+@pytest.mark.parametrize("change", [lossy, irregular])
+def test_missing_samples_and_irregular_times(change):
+    trials, truth, task, rig = simulated(50.0)
+    found = residuals([change(t, np.random.default_rng(0)) for t in trials], truth, task, rig)
+    assert np.abs(found).max() < NEAR
+
+
+def test_a_cartesian_hand_without_velocities():
+    case = read_case(RECORDINGS / "none_1")
+    signals = case.signals[0]
+    names = ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
+    trial = Trial("cartesian.csv", signals.t, {name: getattr(signals, name) for name in names})
+    rig = Rig(
+        rate=20.0, fingertip=case.rig.fingertip, noise=Noise(position=2.5e-5, velocity=4e-3, force=0.012)
+    )
+    found = residuals([trial], case.truth[:1], case.task, rig)
+    assert np.abs(found).max() < NEAR
+
+
+def test_noise_that_the_rig_does_not_state():
+    case = read_case(RECORDINGS / "none_2")
+    rig = case.rig.model_copy(update={"noise": Noise()})
+    found = residuals(list(case.trials[:2]), case.truth[:2], case.task, rig)
+    assert np.abs(found).max() < NEAR
+
+
+def test_pads_taken_as_rigid():
+    case = read_case(RECORDINGS / "none_2")
+    rig = case.rig.model_copy(update={"fingertip": Fingertip()})
+    found = residuals(list(case.trials[:2]), case.truth[:2], case.task, rig)
+    assert np.abs(found).max() < NEAR
+
+
+def test_pooling_shares_parameters_and_keeps_trials_apart():
+    case = read_case(RECORDINGS / "none_1")
+    files, signals = [t.file for t in case.trials], list(case.signals)
+    together = align_trials(files, signals, case.task, case.rig)
+    turned = align_trials(files[::-1], signals[::-1], case.task, case.rig)
+    for a, b in zip(together.trials, turned.trials[::-1], strict=True):
+        assert a.segmentation.file == b.segmentation.file
+        ends = [[s.end for s in x.segmentation.spans] for x in (a, b)]
+        np.testing.assert_allclose(*ends, atol=1e-4)
+        assert a.segmentation.log_evidence == pytest.approx(b.segmentation.log_evidence, abs=0.5)
+
+
+def test_one_object_picked_and_placed():
+    rig, _ = nominal()
+    task = BlockTask({"block": "ground"}, (Move("block", "ground"),))
+    s = simulate_trials(task, rig, [random_properties(task, 20_960)], [20_960])[0]
+    segmentation = segment_trials(["one.csv"], [task_space(s.trial, rig)], task, rig)[0]
+    starts = np.array([span.start for span in segmentation.spans[1:]])
+    assert np.abs(starts - s.boundaries).max() < NEAR

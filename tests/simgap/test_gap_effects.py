@@ -1,0 +1,207 @@
+"""Effects: gradients, neutrality, composition, and that a planted effect is taken out again."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hmmseg import jaxconfig  # noqa: F401
+from hmmseg.errors import InputError
+from hmmseg.rig import Finger, Fingertip, Rig
+from simgap.effects import catalogue, effect_named
+from simgap.effects.base import Performance, World, flat, tips
+from simgap.hand import inverse
+
+CONTRACT = {
+    "force_bias",
+    "force_drift",
+    "force_gain",
+    "force_crosstalk",
+    "sensor_rotation",
+    "force_lag",
+    "force_lowpass",
+    "quantisation",
+    "joint_offset",
+    "link_length",
+    "backlash",
+    "clock_jitter",
+    "fingertip_compliance",
+    "fingertip_creep",
+    "fingertip_mass",
+    "grip_slip",
+    "object_inertia",
+    "offcentre_mass",
+    "table_tilt",
+    "table_compliance",
+    "cable_force",
+    "viscous_drag",
+    "structural_vibration",
+    "contact_impact",
+}
+RIG = Rig(
+    fingers={
+        "1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
+        "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12)),
+    },
+    fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0),
+)
+DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
+
+
+def performance(n: int = 400) -> Performance:
+    """Fingers that go round slowly and press in the second half."""
+    t = np.arange(n) * 5e-3
+    x, y = 0.12 + 0.02 * np.sin(3 * t), 0.03 + 0.01 * np.cos(2 * t)
+    position = np.stack([np.stack([x - 0.01, y], 1), np.stack([x + 0.01, y], 1)], 1)
+    velocity = np.gradient(position, t, axis=0)
+    grip = 2.0 / (1 + np.exp(-(t - 1.0) / 0.03))
+    force = np.stack([np.stack([grip, 0.2 * grip], 1), np.stack([-grip, 0.25 * grip], 1)], 1)
+    held = (t > 1.2).astype(float)
+    return Performance(
+        t,
+        position,
+        velocity,
+        force,
+        np.array([1.0, 1.2, 1.6, 1.9]),
+        RIG,
+        0.5 * held,
+        np.where(held > 0, 0.02, 1.0),
+    )
+
+
+def world_of(p: Performance) -> World:
+    """The world that the nominal hand records of a performance, every tenth sample."""
+    k = slice(None, None, 10)
+    joints = np.concatenate([inverse(RIG.finger(i), i, p.position[k, i - 1]) for i in (1, 2)], 1)
+    rates = np.gradient(joints, p.t[k], axis=0)
+    held = (p.t[k] > 1.0).astype(float)
+    carry = ((p.t[k] > 1.2) & (p.t[k] < 1.6)).astype(float)
+    one, zero = np.ones(()), np.zeros(())
+    return World(
+        t=p.t[k][None],
+        joints=joints[None],
+        rates=rates[None],
+        force=flat(p)[k][None],
+        base=np.array([0.05, 0.17, 0.21, 0.17]),
+        length=np.full(4, 0.12),
+        jointed=one,
+        gravity=9.81 * one,
+        link=np.ones(4),
+        give_normal=np.full(2, 1 / 4000),
+        give_shear=np.full(2, 1 / 2500),
+        delay=zero,
+        smoothing=zero,
+        creep=zero,
+        creep_time=one,
+        tilt=zero,
+        give_support=zero,
+        inertia=one,
+        couple=zero,
+        loudness=one,
+        slip=np.zeros((1, held.size)),
+        free=1 - held[None],
+        ground=(held - carry)[None],
+        carry=carry[None],
+        move=np.ones((1, held.size, 1)),
+        events=p.events[None],
+    )
+
+
+def as_jax(world: World) -> World:
+    return jax.tree.map(jnp.asarray, world)
+
+
+def test_every_name_of_the_contract_is_an_effect():
+    assert set(catalogue()) == CONTRACT
+
+
+def test_an_unknown_effect_is_refused_with_the_nearest_name():
+    with pytest.raises(InputError, match="force_bias"):
+        effect_named("force_bais")
+
+
+@pytest.mark.parametrize("name", DETERMINISTIC)
+def test_gradients_are_finite_at_every_start(name):
+    effect, world = catalogue()[name], as_jax(world_of(performance()))
+
+    def size(u):
+        values = {p.name: p.value(u[k]) for k, p in enumerate(effect.parameters)}
+        out = effect.correct(world, values, 1.0)
+        return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(out))
+
+    for which in (0, -1):
+        start = [
+            p.coordinate(p.starts[which]) if p.starts != (0.0,) else p.coordinate(p.neutral)
+            for p in effect.parameters
+        ]
+        gradient = jax.grad(size)(jnp.asarray(start, float))
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("name", DETERMINISTIC)
+def test_an_effect_that_is_off_changes_nothing(name):
+    effect, world = catalogue()[name], as_jax(world_of(performance()))
+    out = effect.correct(world, {p.name: jnp.asarray(p.neutral) for p in effect.parameters}, 0.0)
+    for before, after, field in zip(world, out, World._fields, strict=True):
+        if field != "creep_time":  # without a share that creeps, its time says nothing
+            np.testing.assert_allclose(after, before, atol=1e-12, err_msg=field)
+
+
+PLANTED = {
+    "force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
+    "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005},
+    "force_gain": {"gain": 0.08},
+    "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
+    "sensor_rotation": {"angle1": 0.05, "angle2": -0.04},
+    "viscous_drag": {"coefficient": 0.7},
+    "fingertip_mass": {"mass": 0.012},
+    "contact_impact": {"impulse": 0.02},
+}
+
+
+@pytest.mark.parametrize("name", sorted(PLANTED))
+def test_what_apply_puts_in_correct_takes_out(name):
+    truth, values = performance(), PLANTED[name]
+    effect = catalogue()[name]
+    recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
+    out = effect.correct(as_jax(recorded), {k: jnp.asarray(v) for k, v in values.items()}, 1.0)
+    before = np.abs(recorded.force - world_of(truth).force).max()
+    assert before > 0.01
+    tolerance = 0.15 * before if name == "fingertip_mass" else 0.05 * before  # accelerations are differences
+    np.testing.assert_allclose(out.force, world_of(truth).force, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("joint_offset", {"q11": 0.01, "q12": -0.005, "q21": 0.0, "q22": 0.02}),
+        ("link_length", {"scale": 0.02}),
+    ],
+)
+def test_kinematic_effects_are_undone_in_tip_positions(name, values):
+    truth, effect = performance(), catalogue()[name]
+    recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
+    out = effect.correct(as_jax(recorded), {k: jnp.asarray(v) for k, v in values.items()}, 1.0)
+    position, _ = tips(out)
+    np.testing.assert_allclose(position[0], truth.position[::10].reshape(-1, 4), atol=1e-9)
+    assert np.abs(np.asarray(tips(as_jax(recorded))[0])[0] - truth.position[::10].reshape(-1, 4)).max() > 1e-4
+
+
+def test_a_bias_is_added_after_the_gain():
+    truth = performance()
+    gain, bias = catalogue()["force_gain"], catalogue()["force_bias"]
+    values = dict.fromkeys(("fx1", "fy1", "fx2", "fy2"), 0.1)
+    recorded = bias.apply(gain.apply(truth, {"gain": 0.5}, None), values, None)
+    np.testing.assert_allclose(flat(recorded), 1.5 * flat(truth) + 0.1)
+    assert bias.stage < gain.stage  # what is nearest to the recorded number is taken out first
+    world = as_jax(world_of(recorded))
+    for effect, v in ((bias, values), (gain, {"gain": 0.5})):
+        world = effect.correct(world, {k: jnp.asarray(x) for k, x in v.items()}, 1.0)
+    np.testing.assert_allclose(world.force, world_of(truth).force, atol=1e-12)
+
+
+def test_quantised_forces_lie_on_the_lattice():
+    force = catalogue()["quantisation"].finish(np.array([0.013, -0.049, 1.234]), {"step": 0.02})
+    np.testing.assert_allclose(force, [0.02, -0.04, 1.24])

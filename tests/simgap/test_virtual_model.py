@@ -1,0 +1,136 @@
+"""The virtual model by steps, driven by a recording, and its smoothed motions."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from simgap_scenes import HAND, STACK
+
+from hmmseg.decompose import subtasks
+from hmmseg.rig import read_rig
+from hmmseg.task import read_task
+from hmmseg.trial import read_trial
+from simgap.properties import PAPER_BLOCKS, read_properties
+from simgap.replay import replay, residual_summary
+from simgap.scene import RIGID_PAD, physics, substeps_for
+from simgap.simulate import simulate_trial
+from simgap.smoothing import smooth
+from simgap.virtual_model import VirtualModel, rollout, standing
+
+STATES = [s.state for s in subtasks(STACK)]
+
+
+@pytest.fixture(scope="module")
+def performed():
+    return simulate_trial(STACK, HAND, PAPER_BLOCKS, seed=7)
+
+
+def places(done):
+    return {name: float(done.motion.blocks[0, k, 0]) for k, name in enumerate(STACK.objects)}
+
+
+def test_the_true_motion_replayed_gives_the_true_forces(performed):
+    constants = physics(HAND, [PAPER_BLOCKS[name] for name in STACK.objects])
+    motion = performed.motion
+    again = rollout(constants, standing(constants, STACK, places(performed)), jnp.asarray(motion.position),
+                    jnp.asarray(motion.velocity), 1e-3, substeps_for(constants, 1e-3))  # fmt: skip
+    assert np.sqrt(np.mean((again.force - motion.force) ** 2)) < 2e-3
+    assert abs(again.blocks - motion.blocks).max() < 5e-5
+
+
+def test_steps_agree_with_the_rollout_and_reset_starts_over(performed):
+    model = VirtualModel(HAND, STACK, PAPER_BLOCKS, places(performed))
+    span = slice(1500, 2100)  # the first grasp
+    position, velocity = performed.motion.position[span], performed.motion.velocity[span]
+    forces = np.stack([model.step(p, v, 1e-3) for p, v in zip(position, velocity, strict=True)])
+    constants = model.physics
+    whole = rollout(constants, standing(constants, STACK, places(performed)), jnp.asarray(position),
+                    jnp.asarray(velocity), 1e-3, substeps_for(constants, 1e-3))  # fmt: skip
+    np.testing.assert_allclose(forces, whole.force, atol=1e-9)
+    assert abs(forces).max() > 1.0
+    np.testing.assert_allclose(model.block_positions(), whole.blocks[-1], atol=1e-12)
+    model.reset()
+    np.testing.assert_array_equal(model.step(position[0], velocity[0], 1e-3), forces[0])
+
+
+def test_the_period_may_change_from_step_to_step():
+    model = VirtualModel(HAND, STACK, PAPER_BLOCKS, {"block1": 0.12, "block2": 0.12})
+    still = [[0.10, 0.02], [0.14, 0.02]]
+    for dt in (1e-3, 2.5e-4, 2e-3):
+        np.testing.assert_allclose(model.step(still, np.zeros((2, 2)), dt), 0.0, atol=1e-12)
+
+
+def test_a_step_refuses_what_is_no_motion():
+    model = VirtualModel(HAND, STACK, PAPER_BLOCKS, {"block1": 0.12, "block2": 0.12})
+    with pytest.raises(ValueError, match="finite"):
+        model.step([[np.nan, 0], [0, 0]], np.zeros((2, 2)), 1e-3)
+    with pytest.raises(ValueError, match="dt > 0"):
+        model.step(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)
+
+
+def test_rigid_fingertips_get_a_stiff_pad_and_smaller_steps():
+    rigid = physics(HAND.model_copy(update={"fingertip": type(HAND.fingertip)()}), [PAPER_BLOCKS["block1"]])
+    assert float(rigid.pad_normal[0]) == RIGID_PAD
+    assert substeps_for(rigid, 1e-3) > substeps_for(physics(HAND, [PAPER_BLOCKS["block1"]]), 1e-3)
+
+
+def test_replay_of_a_simulated_trial_leaves_the_sensors_noise(performed):
+    result = replay(performed.trial, STACK, HAND, PAPER_BLOCKS, boundaries=performed.boundaries)
+    rest = residual_summary(result, performed.boundaries, STATES)
+    assert rest["free-motion"] < 1.15
+    assert rest["hold-above-ground"] < 1.5
+    end = result.motion.blocks[-1]
+    np.testing.assert_allclose(end, performed.motion.blocks[-1], atol=2e-3)
+
+
+@pytest.mark.parametrize("trial", [1, 4])
+def test_replay_of_a_healthy_recording_leaves_little_more_than_the_sensors_noise(shared, trial):
+    folder = shared / "recordings/paper_blocks"
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    truth = json.loads((folder / f"truth/trial_{trial:02d}.json").read_text())["boundaries"]
+    recording = read_trial(folder / f"trial_{trial:02d}.csv", rig)
+    result = replay(recording, task, rig, read_properties(folder / "actual.toml", task), boundaries=truth)
+    rest = residual_summary(result, truth, STATES)
+    assert rest["free-motion"] < 1.5
+    assert rest["hold-above-ground"] < 1.5
+
+
+def test_forces_sharpen_the_motion_in_a_grip(performed):
+    errors = []
+    for infer in (False, True):
+        result = replay(performed.trial, STACK, HAND, PAPER_BLOCKS, boundaries=performed.boundaries,
+                        infer_grip=infer)  # fmt: skip
+        held = result.signals.grip > 1.0
+        errors.append(
+            np.sqrt(np.mean((result.residual[held][:, 0, 0] - result.residual[held][:, 1, 0]) ** 2))
+        )
+    assert errors[1] < errors[0]
+
+
+def test_smoothing_keeps_a_parabola_and_averages_a_rest():
+    t = np.arange(0, 4, 0.05)
+    truth = np.stack([0.1 + 0.02 * t - 0.03 * t**2, np.full(t.size, 0.05)], 1)
+    speed = np.stack([0.02 - 0.06 * t, np.zeros(t.size)], 1)
+    sd = np.full((t.size, 2), 2e-5)
+    exact = smooth(t, truth, speed, sd, 100 * sd)
+    np.testing.assert_allclose(exact.position, truth, atol=1e-9)
+    np.testing.assert_allclose(
+        exact.at(np.array([1.234]))[0][0], [0.1 + 0.02 * 1.234 - 0.03 * 1.234**2, 0.05], atol=1e-9
+    )
+    rng = np.random.default_rng(0)
+    noise = [scale * rng.standard_normal(sd.shape) for scale in (2e-5, 2e-3)]
+    noisy = smooth(t, truth + noise[0], speed + noise[1], sd, 100 * sd)
+    assert np.sqrt(np.mean((noisy.position - truth) ** 2)) < 1e-5
+    assert 0.5 < np.std((noisy.position - truth) / noisy.sd) < 2.0
+
+
+def test_smoothing_bridges_missing_samples():
+    t = np.arange(0, 2, 0.05)
+    truth = np.stack([0.02 * t], 1)
+    holes = truth.copy()
+    holes[10:13] = np.nan
+    speed, sd = np.where(np.isnan(holes), np.nan, 0.02), np.full(truth.shape, 2e-5)
+    path = smooth(t, holes, speed, sd, 100 * sd)
+    np.testing.assert_allclose(path.position, truth, atol=1e-6)
+    assert path.sd[11, 0] > path.sd[5, 0] / 2
