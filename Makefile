@@ -3,10 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help setup demo test lint typecheck tests slow results paper sweeps
+.PHONY: help setup demo test lint typecheck tests slow results paper sweeps check-gap
 
 help:  ## show this list
-	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
 
 setup: $(INSTALLED)  ## make .venv with the project and its tools in it
 
@@ -38,6 +38,7 @@ results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills th
 	$(BIN)/python -m experiments.score_recordings recordings
 	$(BIN)/python -m experiments.calibration recordings
 	$(BIN)/python -m experiments.ablation
+	$(BIN)/python -m experiments.misfits recordings
 	$(BIN)/python -m experiments.benchmarks.moves
 	$(BIN)/python -m experiments.benchmarks.identify
 	$(BIN)/python -m experiments.write_tables
@@ -51,3 +52,10 @@ paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills doc
 sweeps: $(INSTALLED)  ## robustness sweeps in full (half an hour on 2 cores), resumable; tables and figures
 	$(BIN)/python -m experiments.sweeps --workers 2
 	for figure in plane lines coverage; do $(BIN)/python -m paper_figs.sweep_$$figure || exit 1; done
+
+CHECKED := build/check_gap
+SEALED := experiments/blind_check/sealed_small
+check-gap: $(INSTALLED)  ## diagnose a small sealed set of another simulator's recordings and score it
+	rm -rf $(CHECKED)
+	$(BIN)/python -m experiments.blind_check diagnose --cases $(SEALED)/cases --out $(CHECKED)
+	$(BIN)/python -m experiments.blind_check score --sealed $(SEALED) --results $(CHECKED) --json $(CHECKED)/score.json

@@ -1,4 +1,4 @@
-"""`hmmseg demo`: identify the blocks of recordings that come with the package, figures included."""
+"""`hmmseg demo`: identify and diagnose recordings that come with the package, figures included."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from commands import diagnose, identify
 from commands.console import JsonOption, Output, QuietOption, SeedOption
-from commands.identify import Method, run
+from hmmseg.task import BlockTask, read_task
 
 DATA = Path(__file__).parent / "demo_data"
 
@@ -17,10 +18,20 @@ DemoFigures = Annotated[Path, typer.Option("--figures", metavar="DIR", help="Fol
 
 def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: SeedOption = 0,
          quiet: QuietOption = False) -> None:  # fmt: skip
-    """Identify two blocks from recordings that come with the package; figures and a page in demo/."""
-    page = figures / "report.html"
+    """Identify two blocks, then find out why rigid fingertips would measure them too narrow; see demo/."""
+    from hmmseg.rig import read_rig
+
+    page, finding = figures / "report.html", figures / "diagnosis.html"
     figures.mkdir(parents=True, exist_ok=True)
     with Output("demo", json=json, figures=figures, report=page, seed=seed, quiet=quiet) as out:
-        trials = sorted(DATA.glob("trial_*.csv"))
-        run(out, trials, DATA / "task.toml", DATA / "rig.toml", Method.BAYES, DATA / "actual.toml")
-        out.print(f"figures are in {figures}, all of it on one page in {page}")
+        trials, actual = sorted(DATA.glob("trial_*.csv")), DATA / "actual.toml"
+        body = identify.run(out, trials, DATA / "task.toml", DATA / "rig.toml", identify.Method.BAYES, actual)
+        task, rig = read_task(DATA / "task.toml"), read_rig(DATA / "rig.toml")
+        assert isinstance(task, BlockTask)
+        rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
+        out.print("\nThe same recordings, the fingertips thought rigid as the paper has them:")
+        out.report = finding
+        paper = rig.model_copy(update={"fingertip": rigid})
+        body["diagnosis"] = diagnose.run(out, trials, task, paper, None, [])
+        out.print(f"figures are in {figures}; the findings are told in {page} and {finding}")
+        out.finish(body)

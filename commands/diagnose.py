@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,13 +16,13 @@ from commands.console import (
     Output,
     QuietOption,
     ReportOption,
-    RigOption,
     SeedOption,
     TaskOption,
     TrialsArgument,
     distinct_trials,
 )
 from hmmseg.errors import InputError
+from hmmseg.rig import Rig
 from hmmseg.task import BlockTask, read_task
 
 EffectOption = Annotated[
@@ -29,14 +31,46 @@ EffectOption = Annotated[
         "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
     ),
 ]
+RigFile = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="R", help="Nominal hand (TOML); a plain ordered task needs none."),
+]
+AgainstOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--against",
+        metavar="SIM",
+        help="Simulated trials to compare with instead of the virtual model, up to the next option. "
+        "A plain ordered task needs them.",
+    ),
+]
+ModelFile = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit."),
+]
+
+
+def spread_against(args: list[str]) -> list[str]:
+    """Arguments with `--against A B` written `--against A --against B`, as the parser takes one a time."""
+    out: list[str] = []
+    taking = False
+    for arg in args:
+        if arg.startswith("-"):
+            taking = arg == "--against"
+        elif taking and out[-1] != "--against":
+            out.append("--against")
+        out.append(arg)
+    return out
 
 
 def diagnose(
     trials: TrialsArgument,
     task: TaskOption,
-    rig: RigOption,
+    rig: RigFile = None,
     actual: ActualOption = None,
     effect: EffectOption = None,
+    against: AgainstOption = None,
+    model: ModelFile = None,
     json: JsonOption = None,
     figures: FiguresOption = None,
     report: ReportOption = None,
@@ -47,25 +81,84 @@ def diagnose(
     with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
         description = read_task(task)
+        if against:
+            _against(out, paths, against, description, rig, actual, effect or [], model)
+            return
         if not isinstance(description, BlockTask):
-            raise InputError(str(task), "a plain ordered task has no virtual model", "objects and moves")
-        from estimation.actual import read_actual
+            raise InputError(str(task), "a plain ordered task has no virtual model", "--against SIM")
+        if model is not None:
+            raise InputError(f"--model {model}", "goes only with a plain ordered task")
+        if rig is None:
+            raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
         from hmmseg.rig import read_rig
-        from hmmseg.trial import read_trial
-        from simgap.effects import effect_named
-        from simgap.gap.diagnose import diagnose as run
 
-        hand = read_rig(rig)
-        measured = None if actual is None else read_actual(actual, description.objects)
-        forced = [effect_named(name).name for name in dict.fromkeys(effect or [])]
-        recordings = [read_trial(path, hand) for path in paths]
-        with out.progress("diagnosing", total=5) as advance:
-            found = run(recordings, description, hand, measured, forced, seed, lambda text: advance(1))
-        for warning in found.warnings:
-            out.warn(warning)
-        out.print(sentence(found.body), *tables(found.body))
-        _draw(out, found, measured)
-        out.finish(found.body)
+        out.finish(run(out, paths, description, read_rig(rig), actual, effect or []))
+
+
+def run(
+    out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig, actual: Path | None, effect: Sequence[str]
+) -> dict[str, Any]:
+    """Diagnose, put table, figures and page where `out` has them go, and give the document."""
+    from estimation.actual import read_actual
+    from hmmseg.trial import read_trial
+    from simgap.effects import effect_named
+    from simgap.gap.diagnose import STAGES
+    from simgap.gap.diagnose import diagnose as find
+
+    measured = None if actual is None else read_actual(actual, task.objects)
+    forced = [effect_named(name).name for name in dict.fromkeys(effect)]
+    recordings = [read_trial(path, rig) for path in paths]
+    with out.progress("diagnosing", total=STAGES) as advance:
+        found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1))
+    for warning in found.warnings:
+        out.warn(warning)
+    out.print(sentence(found.body), *tables(found.body))
+    _draw(out, found, measured)
+    return found.body
+
+
+def _against(
+    out: Output, paths, against, task, rig_file, actual, effect: list[str], model_file: Path | None
+) -> None:
+    """The generic diagnosis, against given simulated trials."""
+    from hmmseg.trial import read_trial
+    from simgap.generic.diagnose import diagnose as compare
+    from simgap.generic.diagnose import diagnose_blocks
+
+    if actual is not None:
+        raise InputError(f"--actual {actual}", "does not go with --against: no properties are fitted")
+    every = distinct_trials([*paths, *against])
+    with out.progress("diagnosing", total=4) as advance:
+        tell = lambda text: advance(1)  # noqa: E731
+        if isinstance(task, BlockTask):
+            from hmmseg.rig import read_rig
+
+            if rig_file is None:
+                raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
+            if model_file is not None:
+                raise InputError(f"--model {model_file}", "goes only with a plain ordered task")
+            hand = read_rig(rig_file)
+            read = [read_trial(path, hand) for path in every]
+            real, sim = read[: len(paths)], read[len(paths) :]
+            found = diagnose_blocks(real, sim, task, hand, effect, out.seed, tell)
+        else:
+            from hmmseg.sequence_model import load_model
+
+            read = [read_trial(path, task=task) for path in every]
+            learned = None if model_file is None else load_model(model_file, task)
+            found = compare(read[: len(paths)], read[len(paths) :], task, learned, effect, out.seed, tell)
+    for warning in found.warnings:
+        out.warn(warning)
+    out.print(sentence(found.body), *tables(found.body))
+    if out.figures is not None:
+        from commands.figures.gap_generic import draw_all
+
+        draw_all(found, out.figure)
+    if out.report is not None:
+        from commands.gap_report import generic_page
+
+        out.stage(out.report).write_text(generic_page(found, sentence(found.body)), encoding="utf-8")
+    out.finish(found.body)
 
 
 def _draw(out: Output, found, measured) -> None:

@@ -46,13 +46,13 @@ def identify(
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
-        run(out, trials, task, rig, method, actual)
+        out.finish(run(out, trials, task, rig, method, actual))
 
 
 def run(
     out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Method, actual: Path | None
-) -> None:
-    """Identify, and put table, figures, page and JSON where `out` has them go."""
+) -> dict[str, Any]:
+    """Identify, put table, figures and page where `out` has them go, and give the document."""
     paths = distinct_trials(trials)
     description = read_task(task)
     if not isinstance(description, BlockTask):
@@ -85,7 +85,7 @@ def run(
 
         page = identification_page(signals, recordings, segmentations, body, found, measured, out.warnings)
         out.stage(out.report).write_text(page, encoding="utf-8")
-    out.finish(body)
+    return body
 
 
 def _paper(out: Output, signals, recordings, task: BlockTask):

@@ -54,6 +54,7 @@ def _hmmseg(
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code (0 or 2; 130 when interrupted)."""
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
+    args = diagnose.spread_against(args)
     command = typer.main.get_command(app)
     try:
         return command.main(args, prog_name="hmmseg", standalone_mode=False) or 0

@@ -22,7 +22,7 @@ from simgap.properties import random_properties
 from simgap.simulate import simulate_trials
 
 SCENE = Path(__file__).parent / "sweeps"
-SEED = 30_000  # cases are SEED, SEED + 1, ...; their trials 100 times that and on
+SEED = 40_000  # cases are SEED, SEED + 1, ...; their trials 100 times that and on
 
 
 @dataclass(frozen=True)

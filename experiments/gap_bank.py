@@ -33,11 +33,11 @@ from simgap.gap.judge import Calibration
 from simgap.gap.locate import Detection, cells, largest
 from simgap.gap.noise import NoiseModel, learn
 from simgap.gap.spread import spreads
-from simgap.gap.synthetic import draw, performed, recorded
+from simgap.gap.synthetic import performed, recorded
 from simgap.properties import random_properties
 
 TRIALS = 4
-BRUSHED = 1.15  # mean squared residual above which a simulated finger brushed a neighbouring block
+BRUSHED = 1.3  # times the usual mean square: above it a finger brushed a neighbouring block
 
 
 class Case(NamedTuple):
@@ -56,21 +56,6 @@ def healthy_cases(task: BlockTask, rig: Rig, number: int) -> list[Case]:
     return [Case({}, trials[k : k + TRIALS]) for k in range(0, len(trials), TRIALS)]
 
 
-def affected_cases(task: BlockTask, rig: Rig, rounds: int, seed: int = 5) -> list[Case]:
-    """Cases of every chosen effect, parameters drawn about its prior."""
-    rng, out = np.random.default_rng(seed), []
-    for r in range(rounds):
-        for k, (name, effect) in enumerate(catalogue().items()):
-            if not effect.chosen:
-                continue
-            values = {name: draw(name, rng)}
-            blocks = [random_properties(task, 2000 + 100 * r + k)] * TRIALS
-            seeds = [200_000 + 1000 * r + 10 * k + i for i in range(TRIALS)]
-            every = performed(task, rig, blocks, seeds, values)
-            out.append(Case(values, [recorded(s, task, rig, values) for s in every]))
-    return out
-
-
 def frames(cases: Sequence[Case], task: BlockTask, rig: Rig) -> list[Frame]:
     """Aligned frames of the cases."""
     out = []
@@ -83,14 +68,14 @@ def frames(cases: Sequence[Case], task: BlockTask, rig: Rig) -> list[Frame]:
 
 def noise_model(given: Sequence[Frame]) -> tuple[NoiseModel, list[Frame]]:
     """Noise model, and the frames it was learned on: those whose fingers touched nothing else."""
-    samples, clean = [], []
+    samples, size = [], []
     for frame in given:
         task = problem(frame, NoiseModel.plain())
         found = fit(task, [Start((), neutral(task))])[0]
-        if found.square.sum() / (task.whitening.weight > 0).sum() < BRUSHED * 1.1:
-            clean.append(frame)
-            samples.append((frame, raw_residual_at(task, (), found.u)))
-    return learn(samples), clean
+        size.append(found.square.sum() / task.size)
+        samples.append((frame, raw_residual_at(task, (), found.u)))
+    clean = [k for k, value in enumerate(size) if value < BRUSHED * np.median(size)]
+    return learn([samples[k] for k in clean]), [given[k] for k in clean]
 
 
 def detection(given: Sequence[Frame], noise: NoiseModel, catalogued: int) -> tuple[Detection, float]:
@@ -103,7 +88,7 @@ def detection(given: Sequence[Frame], noise: NoiseModel, catalogued: int) -> tup
         task = problem(frame, noise)
         found = fit(task, [Start((), neutral(task))])[0]
         rows.append(list(largest(cells(task, residual_at(task, (), found.u))).values()))
-        floors.append(found.square.sum() / (task.whitening.weight > 0).sum())
+        floors.append(found.square.sum() / task.size)
         if k < catalogued:
             names = [n for n, e in catalogue().items() if e.chosen]
             fits = best_fits(task, [(n,) for n in deterministic(names)], found)

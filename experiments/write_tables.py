@@ -7,13 +7,15 @@ Text between <!-- name --> and <!-- /name --> is replaced; what has no result ye
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
+from experiments.table_misfits import misfits
+from experiments.table_real import real
+from experiments.table_text import covered, load, markdown, milliseconds, percent
+
 ROOT = Path(__file__).parents[1]
-RESULTS = Path(__file__).parent / "results"
 PROPERTIES = ("weight", "width", "height")
 PAPER = {"weight": "3 %", "width": "7 %", "height": "10 %"}
 TARGET = {"weight": "<= 0.5 %", "width": "<= 0.1 %", "height": "<= 0.2 %"}
@@ -23,34 +25,6 @@ SETS = {
     "recordings": "Stand-in recordings, healthy",
     "systematic": "Hands that deviate as [systematic] says",
 }
-
-
-def load(name: str) -> dict | None:
-    """A result by its file's stem, None where it was not written yet."""
-    path = RESULTS / f"{name}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table with its first column to the left, the others to the right."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def percent(value: float, digits: int = 1) -> str:
-    """A share as a percentage."""
-    return f"{100 * value:.{digits}f} %"
-
-
-def covered(entry: dict, name: str) -> str:
-    """A coverage with its standard error over cases."""
-    error = entry[f"{name}_se"]
-    return f"{100 * entry[name]:.1f}" + ("" if error is None else f" ± {100 * error:.1f}") + " %"
-
-
-def milliseconds(value: float) -> str:
-    """Seconds as ms."""
-    return f"{1e3 * value:.1f} ms"
 
 
 def results() -> str | None:
@@ -179,9 +153,11 @@ def moves() -> str | None:
 
 TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("README.md", "results", results_and_rivals),
+    ("README.md", "real", real),
     ("docs/model.md", "ablation", ablation),
     ("docs/calibration.md", "calibration", calibration),
     ("docs/calibration.md", "moves", moves),
+    ("docs/calibration.md", "misfits", misfits),
 )
 
 

@@ -10,7 +10,8 @@ positions do), and its crossing time has the density of Rice's formula,
     p(t) ~ N(0; g(t), s(t)^2) E[max(dg/dt, 0)],
 
 s being the propagated sensor noise and the interpolation's own uncertainty (Rice 1944;
-docs/model.md). Touches stop the motion; they have a likelihood of their own.
+docs/model.md). Touches stop the motion: they come somewhere on the way of a minimum-jerk motion
+(Flash and Hogan 1985) whose start and duration both fingers share.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ import numpy as np
 from scipy.stats import norm
 
 POINTS = 41  # nodes per sample interval
-BEND = 0.025  # bend that the cubic misses, as a share of interval x change of velocity
-UNSEEN = 0.25  # the same, as a share of the way that the velocities at both ends do not account for
-APPROACH = 0.125  # s within which the approach to an impact may double or lose its speed
-ONSET = 0.0015  # s; a pad's force leads its compression by its viscosity, a few ms in foam
+BEND = 0.015  # bend that the cubic misses, as a share of interval x change of velocity
+UNSEEN = 0.15  # the same, as a share of the way that the velocities at both ends do not account for
+ONSET = 0.001  # s; a pad's force leads its compression by its viscosity, a few ms in foam
 LAUNCH = 0.1  # spread of the distance covered after a launch, over gain of speed x time
-STOP, STOPS = (0.02, 1.0), 10  # time constants of the stop after an impact, over the interval
+MOTION, MOTIONS = (0.05, 1.0), 8  # s; duration of the motion that an impact ends: log-uniform
+STARTS = 24  # nodes over the time at which that motion started
+SHAPE = 0.05  # how far its speed may be off the minimum-jerk profile, as a share of it
+STOP, STOPS = (0.002, 0.05), 10  # s; time constant of the stop after an impact: log-uniform
 UNIFORM = 0.02  # weight of a crossing anywhere in the interval, against what g leaves out
 
 
@@ -89,15 +92,19 @@ def crossing_density(crossings: list[Crossing], width: float) -> np.ndarray:
     flat = np.full(POINTS, 1.0 / POINTS)
     if not crossings:
         return flat
-    parts = [_single_density(c, width) for c in crossings]
-    cumulative = np.prod([np.cumsum(p) for p in parts], axis=0)
-    last = np.diff(cumulative, prepend=0.0)
+    if all(c.kind == "impact" for c in crossings):
+        last = np.diff(_last_impact(crossings, width), prepend=0.0)
+    else:
+        parts = [_single_density(c, width) for c in crossings]
+        last = np.diff(np.prod([np.cumsum(p) for p in parts], axis=0), prepend=0.0)
     return (1 - UNIFORM) * last / last.sum() + UNIFORM * flat
 
 
 def _single_density(c: Crossing, h: float) -> np.ndarray:
+    if c.kind == "impact":
+        return np.diff(_last_impact([c], h), prepend=0.0)
     u = (np.arange(POINTS) + 0.5) / POINTS
-    log_density = {"smooth": _log_smooth, "impact": _log_impact, "launch": _log_launch}[c.kind](c, h, u)
+    log_density = (_log_smooth if c.kind == "smooth" else _log_launch)(c, h, u)
     density = np.exp(log_density - log_density.max())
     return density / density.sum()
 
@@ -116,27 +123,67 @@ def _log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     return norm.logpdf(value, 0.0, np.sqrt(variance)) + np.log(rise * norm.cdf(slope / rise * 2))
 
 
-def _log_impact(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
-    """Log likelihood of an impact at u: nearly uniform motion up to it, a quick stop after it.
+def _last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
+    """Probability (POINTS,) that every finger has hit by each node of an interval of h s.
 
-    Up to the impact the finger covers -left at v_left, give or take an acceleration of its speed
-    over APPROACH; after it the velocity decays to v_right with a time constant that is
-    unknown (log-uniform over STOP, in units of h), which makes the compression `right`.
+    Fingers move as one: duration and start of the motion are marginalised for all of them
+    together, each finger's distance, noise and stop for itself.
+    """
+    u = (np.arange(POINTS) + 0.5) / POINTS
+    duration = np.geomspace(*MOTION, MOTIONS)[:, None, None]
+    starts = (np.arange(STARTS) + 0.5) / STARTS
+    age = starts[:, None] * (duration + h) - h  # since its start, at the first sample; uniform
+    log_weight, hit = np.log(duration + h)[..., 0] + np.zeros(STARTS), np.ones(1)
+    for c in impacts:
+        log_density = _log_impact(c, h, u, duration, age / duration)
+        peak = log_density.max(axis=-1, keepdims=True)
+        density = np.exp(log_density - peak)
+        total = density.sum(axis=-1)
+        log_weight = log_weight + peak[..., 0] + np.log(total)
+        hit = hit * np.cumsum(density, axis=-1) / total[..., None]
+    weight = np.exp(log_weight - log_weight.max())
+    return (weight[..., None] * hit).sum(axis=(0, 1)) / weight.sum()
+
+
+def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Log likelihood (..., POINTS) of an impact at u, given the motion that it ends.
+
+    A minimum-jerk motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample.
+    Its distance is unknown (log-uniform); gap and velocity of the first sample tell it. The face
+    that it hits is as likely in one place on its way as in another. After the hit the velocity
+    decays to v_right with an unknown time constant, which makes the compression `right`.
     """
     before, after = u * h, (1 - u) * h
-    speed = max(c.v_left, -c.left / h, c.sd_v)
-    # A motion that starts within the interval must speed up to get there, and get there before its end.
-    needed = 2 * max(-c.left - max(c.v_left, 0.0) * h, 0.0) / h**2
-    acceleration = np.hypot(speed / APPROACH, needed)
-    covered = c.v_left * before + needed * before**2
-    sd_before = np.sqrt(c.sd_left**2 + (c.sd_v * before) ** 2 + (acceleration * before**2 / 2) ** 2)
-    log_before = norm.logpdf(-c.left, covered, sd_before)
-    stop = h * np.geomspace(*STOP, STOPS)[:, None]
+    at_hit = phase + before / duration
+    way = np.maximum(_minimum_jerk(at_hit) - _minimum_jerk(phase), 1e-9)
+    rate, rate_at_hit = _minimum_jerk_slope(phase) / duration, _minimum_jerk_slope(at_hit) / duration
+    gap, sd_v = -c.left, np.hypot(c.sd_v, SHAPE * max(c.v_left, -c.left / h))
+    # gap ~ N(distance way, sd_left), v_left ~ N(distance rate, sd_v); distance integrated out.
+    variance = (way * sd_v) ** 2 + (rate * c.sd_left) ** 2
+    distance = np.maximum((way * gap * sd_v**2 + rate * c.v_left * c.sd_left**2) / variance, c.sd_left)
+    log_before = _log_normal(gap * rate - c.v_left * way, 0.0, np.sqrt(variance)) - np.log(distance)
+    speed = np.maximum(distance * rate_at_hit, c.sd_v)
+    stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
     reach = stop * -np.expm1(-after / stop)
     mean = c.v_right * (after - reach) + speed * reach
-    sd_after = np.sqrt(c.sd_right**2 + (c.sd_v * after) ** 2 + (acceleration * before * reach) ** 2)
-    log_after = norm.logpdf(c.right, mean, sd_after)
-    return log_before + np.logaddexp.reduce(log_after, axis=0) + np.log(speed)
+    sd_after = np.sqrt(c.sd_right**2 + (c.sd_v * after) ** 2 + (2 * SHAPE * speed * reach) ** 2)
+    log_after = np.logaddexp.reduce(_log_normal(c.right, mean, sd_after), axis=0)
+    return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + log_after + np.log(speed)
+
+
+def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:
+    """Log density of a normal distribution but for a constant; scipy's takes three times as long."""
+    return -0.5 * ((x - mean) / sd) ** 2 - np.log(sd)
+
+
+def _minimum_jerk(phase: np.ndarray | float) -> np.ndarray | float:
+    s = np.clip(phase, 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def _minimum_jerk_slope(phase: np.ndarray | float) -> np.ndarray | float:
+    s = np.clip(phase, 0.0, 1.0)
+    return 30 * s**2 * (1 - s) ** 2
 
 
 def _log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:

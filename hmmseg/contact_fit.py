@@ -185,7 +185,9 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
             start = old.levels[i].get(k) if old.levels else None
             start = _weighted_median(resting, gamma[:, k]) if start is None else start
             found[k] = _location(resting, gamma[:, k], spread, start)
-            velocity.append(f.vy), level.append(resting - found[k]), weights.append(gamma[:, k])
+            velocity.append(f.vy)
+            level.append(resting - found[k])
+            weights.append(gamma[:, k])
         levels.append(found)
     if not weights:  # nothing rests on the ground where its height is known
         return old.scale["velocity"], old.scale["level"], tuple(levels)

@@ -49,6 +49,11 @@ def main() -> None:
                 contour_kwargs={"linewidths": 0.9},
             )
         axes = np.array(figure.axes).reshape(len(names), len(names))
+        for ax in axes[1:, 0]:  # labels near a corner would meet those of the panel beside
+            low, high = ax.get_ylim()
+            ticks = [tick for tick in ax.get_yticks() if low < tick < high]
+            inner = [0.1 < (tick - low) / (high - low) < 0.9 for tick in ticks]
+            ax.set_yticks(ticks, [f"{t:.3f}" if shown else "" for t, shown in zip(ticks, inner, strict=True)])
         for i, vertical in enumerate(truths):
             for row in range(i, len(names)):
                 axes[row, i].axvline(vertical, color=RED, lw=0.7)

@@ -14,7 +14,7 @@ def main() -> None:
     virtual = found["virtual"]
     held = np.any([carry["inside"] for carry in virtual["carries"]], axis=0)
     real = found["recording"]["carries"][-1]["weight"]
-    with canvas(target("fig13"), height=2.4) as figure:
+    with canvas(target("fig13"), height=2.6) as figure:
         ax = figure.subplots()
         ax.axhline(0, color=GREY, lw=0.5)
         ax.plot(virtual["t"], virtual["fy"], color=GREY, lw=0.9, ls=(0, (3, 1.5)), label="net vertical force")
@@ -43,7 +43,7 @@ def main() -> None:
                 fontsize=7.5,
             )
         ax.set_xlim(0, 10)
-        ax.set_ylim(-1.9, 1)
+        ax.set_ylim(-2.4, 1)
         ax.set_xlabel("Time [s]")
         ax.set_ylabel("$f_{y1} + f_{y2}$ [N]")
         ax.legend(loc="lower center", ncols=3)

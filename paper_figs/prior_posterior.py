@@ -26,9 +26,9 @@ def draw(ax: Axes, found: dict[str, Any], k: int) -> None:
     draws = {which: factor * np.array(found[which]["draws"])[:, k] for which, *_ in POSTERIORS}
     x = factor * np.exp(mean + sd * np.linspace(-PRIOR_SPREAD, PRIOR_SPREAD, 300))
     ax.fill_between(x, np.exp(-0.5 * ((np.log(x / factor) - mean) / sd) ** 2), color=GREY, alpha=0.5, lw=0)
-    ax.plot([draws["all"].mean()] * 2, [0, 1.1], color=BLUE, lw=1.0)
+    ax.plot([draws["all"].mean()] * 2, [0, 1.0], color=BLUE, lw=1.0)
     ax.set_xscale("log")
-    ax.set_ylim(0, 2.6)
+    ax.set_ylim(0, 2.9)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
     ax.set_xlabel(f"{block} {key} [{unit}]")

@@ -62,9 +62,9 @@ def draw_both(ax: Axes, found: dict[str, Any]) -> None:
             ax.plot(x + shift, 100 * covered, "o", ms=3, color=colour, label=label if x == 0 else None)
     ax.axhline(95, color=INK, lw=0.6, ls=":")
     ax.set_xticks(range(len(SWEEPS)), list(SWEEPS))
-    ax.set_ylim(80, 101)
+    ax.set_ylim(70, 101)
     ax.set_ylabel("properties covered\nby 95 % intervals [%]")
-    ax.legend(loc="lower left")
+    ax.legend(loc="lower left", ncols=2)
 
 
 def proportion_interval(share: float, number: int, z: float = 1.96) -> tuple[float, float]:

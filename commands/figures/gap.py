@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from hmmseg.drawing import BLUE, GREY, ORANGE, RED, canvas
 from simgap.effects.base import FORCES
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.frame import CHANNELS
+
+if TYPE_CHECKING:
+    from simgap.generic.diagnose import GenericDiagnosis
 
 LABELS = {
     "x": "x [cm]",
@@ -139,7 +143,7 @@ def draw_before_after(found: Diagnosis, path: Path) -> None:
         axes.legend()
 
 
-def draw_probabilities(found: Diagnosis, path: Path) -> None:
+def draw_probabilities(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
     """The probabilities of the likeliest explanations."""
     rows = sorted(found.body["probabilities"].items(), key=lambda item: -item[1])[:8][::-1]
     with canvas(path, width=5.0, height=2.4) as figure:

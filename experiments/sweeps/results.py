@@ -77,6 +77,7 @@ def _measures(table: dict[str, np.ndarray]) -> dict[str, Any]:
         "boundary_median": _interval(size, lambda a: _quantile(a, 0.5)),
         "boundary_95": _interval(size, lambda a: _quantile(a, 0.95)),
         "boundaries_found": _interval(np.isfinite(size).astype(float), _mean),
+        "complete": _interval(np.isfinite(size).all(axis=1).astype(float), _mean),
         "accuracy": _interval(table["accuracy"], _mean),
         **_properties(table["property"]),
     }

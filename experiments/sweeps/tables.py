@@ -127,8 +127,10 @@ def _joined(entry: dict[str, Any], keys: Sequence[str]) -> str:
 
 
 def _coverage(found: dict[str, Any], sweep: str) -> str:
-    keys = ("coverage_90", "coverage_95", *(f"coverage_95_{p}" for p in ("weight", "width", "height")))
-    header = ["coverage by ours [%]", "boundaries, 90 %", "properties, 95 %", "weight", "width", "height"]
+    keys = ("coverage_90", "coverage_95", *(f"coverage_95_{p}" for p in ("weight", "width", "height")),
+            "complete")  # fmt: skip
+    header = ["coverage by ours [%]", "boundaries, 90 %", "properties, 95 %", "weight", "width", "height",
+              "trials that fit"]  # fmt: skip
     rows = []
     for row in found["sweeps"][sweep]:
         ours = found["cells"][row["cell"]]["methods"]["ours"]

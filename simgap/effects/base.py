@@ -30,7 +30,8 @@ class World(NamedTuple):
     the pads' delayed part. `tilt` [rad] and `give_support` [m/N] of the support. `inertia`: factor
     of the mass times acceleration. `couple` [m]: how far the mass lies right of the middle.
     `loudness`: recorded noise over the noise of corrected forces. `slip` (T, N): whether (0 to 1) pads
-    slide on the block.
+    slide on the block; `modes` (4,): 1 where a candidate delays or smooths forces, lets pads creep or slide
+    (LATE, SMOOTH, CREEPING, SLIDING), so that equations without it are not evaluated.
     `free`, `ground`, `carry` (T, N): which state each sample is in (1 or 0); `events` (T, 4 M) [s]:
     touch, leave, meet, part of every move.
     """
@@ -56,11 +57,15 @@ class World(NamedTuple):
     couple: Array
     loudness: Array
     slip: Array
+    modes: Array
     free: Array
     ground: Array
     carry: Array
     move: Array
     events: Array
+
+
+LATE, SMOOTH, CREEPING, SLIDING = range(4)
 
 
 class Performance(NamedTuple):
@@ -164,6 +169,11 @@ def tips(world: World) -> tuple[Array, Array]:
     velocity = paired(jx * world.rates, jy * world.rates)
     there = world.jointed > 0.5
     return jnp.where(there, position, world.joints), jnp.where(there, velocity, world.rates)
+
+
+def with_mode(world: World, mode: int, on: Array) -> World:
+    """The world with one of `modes` switched on where `on` is 1."""
+    return world._replace(modes=jnp.asarray(world.modes).at[mode].add(on))
 
 
 def gradient(t: Array, values: Array) -> Array:

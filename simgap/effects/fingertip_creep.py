@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from simgap.effects.base import CONTACT, Effect, Parameter, Performance, World
+from simgap.effects.base import CONTACT, CREEPING, Effect, Parameter, Performance, World, with_mode
 
 
 def _correct(world: World, values, on) -> World:
     ratio = values["ratio"]
-    return world._replace(
+    return with_mode(world, CREEPING, on)._replace(
         creep=world.creep + on * ratio / (1 + ratio), creep_time=values["time_constant"] * (1 + ratio)
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from simgap.effects.base import FILTER, Effect, Parameter, Performance, flat, with_force
+from simgap.effects.base import FILTER, LATE, Effect, Parameter, Performance, flat, with_force, with_mode
 
 
 def _apply(performance: Performance, values, rng) -> Performance:
@@ -20,6 +20,6 @@ EFFECT = Effect(
     mistaken_for=("force_lowpass",),
     parameters=(Parameter("delay", "s", 0.1, starts=(0.03, 0.08, 0.15, 0.25), low=0.0, high=0.4),),
     stage=FILTER,
-    correct=lambda w, v, on: w._replace(delay=w.delay + v["delay"]),
+    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + v["delay"]),
     apply=_apply,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from simgap.effects.base import FILTER, Effect, Parameter, Performance, flat, with_force
+from simgap.effects.base import FILTER, SMOOTH, Effect, Parameter, Performance, flat, with_force, with_mode
 
 
 def _apply(performance: Performance, values, rng) -> Performance:
@@ -23,6 +23,6 @@ EFFECT = Effect(
     mistaken_for=("force_lag",),
     parameters=(Parameter("time_constant", "s", 0.08, starts=(0.02, 0.06, 0.12, 0.2), low=0.0, high=0.5),),
     stage=FILTER,
-    correct=lambda w, v, on: w._replace(smoothing=w.smoothing + v["time_constant"]),
+    correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(smoothing=w.smoothing + v["time_constant"]),
     apply=_apply,
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from simgap.effects.base import CONTACT, Effect, Parameter, World
+from simgap.effects.base import CONTACT, SLIDING, Effect, Parameter, World, with_mode
 
 LOADED = 0.8  # N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
 
@@ -21,7 +21,9 @@ def _correct(world: World, values, on) -> World:
     ratio = shear / jnp.maximum(push, 0.5 * LOADED)
     sliding = jax.nn.sigmoid((ratio / values["mu"] - 0.96) / 0.02).max(axis=-1)
     sliding = sliding * jax.nn.sigmoid((push.min(axis=-1) - LOADED) / 0.05)
-    return world._replace(slip=world.slip + on * sliding * (world.ground + world.carry))
+    return with_mode(world, SLIDING, on)._replace(
+        slip=world.slip + on * sliding * (world.ground + world.carry)
+    )
 
 
 EFFECT = Effect(

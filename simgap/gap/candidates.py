@@ -59,7 +59,7 @@ def best_fits(
         jobs += [(k, s) for s in starts(given, effects, base.u, kept)]
     many = {k for k, _ in jobs if sum(j == k for j, _ in jobs) > 1}
     screened = fit(given, [s for k, s in jobs if k in many], SCREEN) if many else []
-    best: dict[int, Start] = {k: s for k, s in jobs if k not in many}
+    best: dict[int, Start] = dict(reversed(jobs))  # the first start of each, until a better one is known
     cost: dict[int, float] = {}
     for (k, _), found in zip([job for job in jobs if job[0] in many], screened, strict=True):
         if found.cost < cost.get(k, np.inf):

@@ -16,9 +16,10 @@ from hmmseg.errors import InputError
 from hmmseg.segmentation import align_trials
 from hmmseg.signals import task_space
 from simgap.gap.bank import Bank
-from simgap.gap.candidates import best_fits
+from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Problem, Start, fit, neutral, problem
 from simgap.gap.frame import build
+from simgap.gap.spread import spreads
 from simgap.gap.synthetic import performed, recorded
 from simgap.operator import OperatorSettings
 from simgap.properties import Block, Blocks
@@ -114,5 +115,9 @@ def _gain(
         }
     asked = problem(build(trials, aligned, rig), bank.noise, actual)
     healthy = fit(asked, [Start((), neutral(asked))])[0]
-    cause, *others = best_fits(asked, [(n,) for n in (*truth, *partners)], healthy)
-    return min(f.cost for f in others) - cause.cost
+    names = [*truth, *partners]
+    shifting = deterministic(names)
+    cost = {f.effects[0]: f.cost for f in best_fits(asked, [(n,) for n in shifting], healthy)}
+    cost |= {s.effect: healthy.cost - s.evidence for s in spreads(asked, healthy) if s.effect in names}
+    cause, *others = (cost[n] for n in names)
+    return min(others) - cause

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import jax
@@ -13,10 +13,10 @@ import numpy as np
 
 from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
 from simgap.effects import catalogue
-from simgap.effects.base import Effect, World
+from simgap.effects.base import Effect, World, tips
 from simgap.gap.frame import Arrays, Frame
 from simgap.gap.noise import NoiseModel, Whitening, whiten, whitening
-from simgap.gap.residuals import residuals
+from simgap.gap.residuals import residuals, undelayed
 
 SMALL, LARGE = 8, 26  # columns of effects (beyond the properties), two compiled shapes
 STEPS = 12
@@ -61,6 +61,11 @@ class Problem:
         """Number of property columns."""
         return self.centre.size
 
+    @property
+    def size(self) -> int:
+        """Number of residuals."""
+        return int((self.whitening.weight > 0).sum())
+
 
 @dataclass(frozen=True)
 class Start:
@@ -94,8 +99,6 @@ def problem(frame: Frame, noise: NoiseModel, actual: dict | None = None) -> Prob
     valid = (a.there[..., 6] > 0) & (a.phase[..., 2] > 0)
     centre, spread = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
     net = w.force[..., 1] + w.force[..., 3]
-    from simgap.effects.base import tips
-
     position, _ = tips(jax.tree.map(jnp.asarray, w))
     distance = np.asarray(position[..., 2] - position[..., 0])
     distance = distance + w.force[..., 0] * w.give_normal[0] - w.force[..., 2] * w.give_normal[1]
@@ -112,11 +115,27 @@ def problem(frame: Frame, noise: NoiseModel, actual: dict | None = None) -> Prob
     return Problem(frame, whitening(frame, noise), centre, spread)
 
 
+def without(given: Problem, samples: np.ndarray) -> Problem:
+    """The problem with some residuals (T, N, C) taken to be missing."""
+    arrays, weight = given.frame.arrays, given.whitening.weight
+    there = np.where(samples, 0.0, arrays.there)
+    frame = replace(given.frame, arrays=arrays._replace(there=there))
+    return replace(
+        given, frame=frame, whitening=given.whitening._replace(weight=np.where(samples, 0, weight))
+    )
+
+
 def corrected(world: World, u: jax.Array, on: jax.Array, num_properties: int) -> World:
     """The world with every effect of coordinates u (all columns) taken out; `on` (num_slots,)."""
+    world = jax.tree.map(lambda z: jnp.asarray(z, float), world)
     for k, slot in enumerate(slots(num_properties)[0]):
         values = {p.name: p.value(u[slot.start + j]) for j, p in enumerate(slot.effect.parameters)}
-        world = slot.effect.correct(world, values, on[k])  # type: ignore[misc]
+
+        def taken_out(values=values, effect=slot.effect, k=k, world=world) -> World:
+            changed = effect.correct(world, values, on[k])  # type: ignore[misc]
+            return jax.tree.map(lambda new, old: jnp.broadcast_to(new, old.shape), changed, world)
+
+        world = jax.lax.cond(on[k] > 0, taken_out, lambda world=world: world)
     return world
 
 
@@ -156,6 +175,13 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
     return np.asarray(
         _residual(*_constants(given), jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects)))
     )
+
+
+def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
+    """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
+    world = corrected(_constants(given)[0], jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects)),
+                      given.num_properties)  # fmt: skip
+    return world._replace(force=undelayed(world))
 
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:

@@ -9,18 +9,20 @@ from typing import NamedTuple
 import numpy as np
 
 from hmmseg.decompose import ABOVE_GROUND, FREE, Subtask, height_equations
-from hmmseg.features import noise_sd
 from hmmseg.rig import Rig
 from hmmseg.segmentation import AlignedTrials
-from hmmseg.signals import Signals, task_space
+from hmmseg.signals import task_space
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
 from simgap.effects.base import FORCES, World
+from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 PHASES = ("free", "pickup", "carry", "place", "slide")
 MAX_RATE = 30.0  # Hz; finer samples are averaged first
-TRIALS, SAMPLES = 4, 64  # arrays are padded to multiples, so that few programs are compiled
+TOUCHING = 5.0  # sds of a force by which a touch shows
+FIRST_TOUCH = 0.2  # s; one finger touches no earlier before the other, nor lets go later
+TRIALS = 4  # arrays are padded to multiples of it, so that few programs are compiled
 
 
 class Arrays(NamedTuple):
@@ -28,7 +30,8 @@ class Arrays(NamedTuple):
 
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): its sensor noise
     in units of the channel; `kind` (T, N): 2 * phase, + 1 beside a contact change; `subtask` (T, N);
-    `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot.
+    `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
+    `sample` (T, C): noise of one sample of a channel itself.
     """
 
     there: np.ndarray
@@ -39,6 +42,7 @@ class Arrays(NamedTuple):
     objects: np.ndarray
     rises: np.ndarray
     phase: np.ndarray
+    sample: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
     if not chosen:
         raise ValueError("no trial fits its task")
     rows = [_row(trial, np.array([b.quantile(0.5) for b in a.boundaries]), steps, rig) for trial, a in chosen]
-    length = -(-max(r["t"].size for r in rows) // SAMPLES) * SAMPLES
+    length = padded_length(max(r["t"].size for r in rows))
     count = -(-len(rows) // TRIALS) * TRIALS
     stack = {key: _stacked([r[key] for r in rows], length, count) for key in rows[0] if key != "events"}
     events = np.stack([r["events"] for r in rows])
@@ -90,6 +94,9 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
     for r in range(count):
         end = rows[r]["t"].size if r < len(rows) else 0
         stack["there"][r, end:] = 0.0  # padding says nothing
+        t = stack["t"][r]  # time goes on evenly, for the sampling interval is read off it
+        last, step = (end, np.median(np.diff(t[:end]))) if end else (1, np.median(np.diff(rows[-1]["t"])))
+        t[last:] = t[last - 1] + step * np.arange(1, t.size - last + 1)
     moves = len(task.performed)
     objects, rises = np.zeros((moves, len(task.objects))), np.zeros((moves, len(task.objects)))
     for m, move in enumerate(task.performed):
@@ -107,6 +114,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         objects,
         rises,
         stack["phase"],
+        stack["sample"][:, 0],
     )
     lengths = tuple(r["t"].size for r in rows)
     return Frame(
@@ -118,6 +126,11 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         arrays,
         lengths,
     )
+
+
+def padded_length(samples: int) -> int:
+    """Samples to pad to: 240, 480, 960, .. (ten seconds at 20 Hz fit the first)."""
+    return 240 * 2 ** max(0, int(np.ceil(np.log2(samples / 240))))
 
 
 def _stacked(rows: list[np.ndarray], length: int, count: int) -> np.ndarray:
@@ -143,6 +156,11 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
         rates = np.stack([signals.vx1, signals.vy1, signals.vx2, signals.vy2], 1)
     there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
+    sample = sample_noise(signals, rig, group)
+    sd = residual_noise(signals, sample, rig, step)
+    sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, boundaries))
+    lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
+    there[lone, CHANNELS.index("fx") :] = 0.0
     return {
         "t": t,
         "joints": joints,
@@ -150,12 +168,32 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
         "force": force,
         "events": boundaries,
         "there": there,
-        "sd": _noise(signals, rig, step, group),
+        "sd": sd,
+        "sample": np.tile(channel_noise(sample), (t.size, 1)),
         "kind": (2 * phase + edge).astype(float),
         "subtask": subtask.astype(float),
         "move": _moves(t, boundaries, steps, subtask).astype(float),
         "phase": np.eye(len(PHASES))[phase],
     }
+
+
+def _one_finger(
+    t: np.ndarray, force: np.ndarray, subtask: np.ndarray, free: np.ndarray, boundaries: np.ndarray, sd: float
+) -> np.ndarray:
+    """Samples (N,) of free motion beside a grip at which one finger touches already or still.
+
+    Such a touch is a contact that the task does not list and no gap. One finger presses inwards, compared
+    with its own median in that free motion, and the other does not; `sd` is a force's noise [N].
+    """
+    out = np.zeros(t.size, bool)
+    for s in np.unique(subtask[free]):
+        mine = np.flatnonzero(subtask == s)
+        change = force[mine] - np.median(force[mine], axis=0)
+        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > TOUCHING * sd
+        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < TOUCHING * sd
+        near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
+        out[mine] = near & ((inwards[:, 0] & quiet[:, 1]) | (inwards[:, 1] & quiet[:, 0]))
+    return out
 
 
 def _phase(step: Subtask) -> int:
@@ -219,38 +257,6 @@ def _there(
     return np.stack([columns[c] for c in CHANNELS], 1).astype(float)
 
 
-def _noise(s: Signals, rig: Rig, step: float, group: int) -> np.ndarray:
-    """Standard deviation (N, C) of each channel's residual from the sensors' noise alone."""
-    root, pad = np.sqrt(group), rig.fingertip
-
-    def known(stated: np.ndarray | float, values: np.ndarray, factor: float) -> np.ndarray:
-        learned = noise_sd(values) * factor * root
-        return (
-            np.where(np.isfinite(stated), stated, max(learned if np.isfinite(learned) else 0.0, 1e-9)) / root
-        )
-
-    n = s.t.size
-    x, y = known(s.sd_x, s.x, np.sqrt(2.0)), known(s.sd_y, s.y, np.sqrt(2.0))
-    vx, vy = known(s.sd_vx, s.vx, np.sqrt(2.0)), known(s.sd_vy, s.vy, np.sqrt(2.0))
-    f = known(np.full(n, s.sd_force), s.fy, 1 / np.sqrt(2.0))
-    gn, gs = f / pad.normal_stiffness, f / pad.shear_stiffness
-    return np.stack(
-        [
-            np.hypot(x, gn) / np.sqrt(2),
-            np.hypot(y, gs) / np.sqrt(2),
-            np.sqrt(2) * np.hypot(x, gn),
-            np.sqrt(2) * np.hypot(y, gs),
-            np.hypot(0.5 * vx, 0.5 * x / step),
-            np.hypot(0.5 * vy, 0.5 * y / step),
-            np.sqrt(2) * f,
-            np.sqrt(2) * f,
-            f / np.sqrt(2),
-            f / np.sqrt(2),
-        ],
-        1,
-    )
-
-
 def _world(stack: dict[str, np.ndarray], events: np.ndarray, onehot: np.ndarray, rig: Rig) -> World:
     pad, zero = rig.fingertip, np.zeros(())
     base, length = np.zeros(4), np.zeros(4)
@@ -281,6 +287,7 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, onehot: np.ndarray,
         couple=zero,
         loudness=np.ones(()),
         slip=np.zeros_like(carry),
+        modes=np.zeros(4),
         free=phase[..., 0],
         ground=phase[..., 1] + phase[..., 3] + phase[..., 4],
         carry=carry,

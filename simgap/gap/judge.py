@@ -8,8 +8,8 @@ the verdict "unknown" only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import logsumexp
@@ -19,6 +19,8 @@ from simgap.gap.fit import Fitted, Problem
 
 LOCAL_COST = 5.0  # nats for each free amount of an effect (a slide per grip): a millimetre against its noise
 
+DEFAULT_MISFIT = 0.03  # of an effect that the bank never had
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -26,7 +28,8 @@ class Calibration:
 
     `temperature`: floor of the evidence's temperature; `prior`: log prior of a candidate against none;
     `floor`: healthy mean square of whitened residuals; `unknown_at`, `unknown_width`: share of the gap
-    left by the best candidate at which "unknown" is as likely, and its logistic width in log share.
+    left by the best candidate at which "unknown" is as likely, and its logistic width in log share;
+    `misfit`: by effect, how far its parameters were off on the bank beyond their own sd, as a share.
     """
 
     temperature: float = 1.5
@@ -34,11 +37,16 @@ class Calibration:
     floor: float = 0.95
     unknown_at: float = 0.3
     unknown_width: float = 0.25
+    misfit: dict[str, float] = field(default_factory=dict)
+
+    def inflated(self, effect: str, sd: float, value: float) -> float:
+        """Standard deviation of a parameter with what the effect's form is off by."""
+        return float(np.hypot(sd, self.misfit.get(effect, DEFAULT_MISFIT) * value))
 
 
 def log_evidence(given: Problem, found: Fitted, healthy: Fitted, temperature: float = 1.0) -> float:
     """Log evidence [nats] of a candidate over none, coordinates standard normal beforehand."""
-    grips = found.hessian.shape[0] * 0 + given.frame.num_trials * len(given.frame.task.performed)
+    grips = given.frame.num_trials * len(given.frame.task.performed)
     free = sum(catalogue()[name].local for name in found.effects) * grips
     gain = (healthy.cost - found.cost) / temperature
     return float(
@@ -82,7 +90,7 @@ def heldout(found: Fitted, labels: np.ndarray, num_trials: int) -> np.ndarray:
 
 
 def probabilities(
-    evidence: dict[str, float], left: float, significant: float, c: Calibration
+    evidence: Mapping[str, float], left: float, significant: float, c: Calibration
 ) -> dict[str, float]:
     """Probabilities of none, unknown and every candidate; sums to 1.
 

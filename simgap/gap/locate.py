@@ -9,6 +9,7 @@ import numpy as np
 from scipy.fft import dct
 from scipy.stats import gumbel_r
 
+from hmmseg.decompose import Subtask
 from simgap.gap.fit import Problem
 from simgap.gap.frame import CHANNELS
 
@@ -110,3 +111,8 @@ class Detection:
 def largest(found: list[Cell]) -> dict[str, float]:
     """The largest scores of `cells`."""
     return {"cell": max(c.z for c in found), "pooled": float(pooled(found).max())}
+
+
+def subtask_name(step: Subtask) -> str:
+    """A subtask as the interface names it, as `carry block1`."""
+    return step.name if step.object is None else f"{step.name} {step.object}"

@@ -8,13 +8,16 @@ are checked against positions. None of them multiplies position noise by a stiff
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
-from simgap.effects.base import World, gradient, tips
-from simgap.gap.frame import Arrays
+from simgap.effects.base import CREEPING, LATE, SLIDING, SMOOTH, World, gradient, tips
+from simgap.gap.frame import CHANNELS, Arrays
 
 TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
+SURE = 4.0  # sds of the distance by which fingers must be nearer than the block is wide to touch it
 HELD = 0.1  # N; a grip below this holds nothing
 
 
@@ -33,11 +36,15 @@ def residuals(world: World, arrays: Arrays, properties: jax.Array) -> jax.Array:
     (n1, n2), (s1, s2) = world.give_normal, world.give_shear
 
     gap, squeeze = x2 - x1 - width, fx1 * n1 - fx2 * n2
-    touching = TOUCH * jax.nn.softplus(-gap / TOUCH)
+    # Pads that have crept come back late: fingers may be nearer for a while without pressing.
+    late = (pads - force)[..., 0] * n1 - (pads - force)[..., 2] * n2
+    # A distance known to so much says nothing of a lighter touch: its noise would come out as force.
+    unsure = SURE * arrays.sd[..., CHANNELS.index("distance")]
+    touching = TOUCH * jax.nn.softplus(-(gap + late + unsure * world.free) / TOUCH)
     held = world.ground + world.carry
     firm = jax.nn.sigmoid((0.5 * (force[..., 0] - force[..., 2]) / HELD - 1) * 4)
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
-    distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - touching)
+    distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = jnp.asarray(arrays.phase[..., 3])
     offset = y2 - y1 - (fy2 * s2 - fy1 * s1)
     x = (x1 + x2) / 2 - (fx1 * n1 + fx2 * n2) / 2
@@ -46,9 +53,9 @@ def residuals(world: World, arrays: Arrays, properties: jax.Array) -> jax.Array:
     y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
     still = firm * (arrays.phase[..., 1] + place)
     onground = firm * world.ground
-    offset = _centred(offset, arrays, firm * held, None, world.slip)
-    x = _centred(x, arrays, still, place, None)
-    y = _centred(y, arrays, onground, None, world.slip)
+    offset = _centred(offset, arrays, firm * held * _known(arrays, "offset"), None, world)
+    x = _centred(x, arrays, still * _known(arrays, "x"), place, None)
+    y = _centred(y, arrays, onground * _known(arrays, "y"), None, world)
 
     acceleration = gradient(world.t, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
@@ -103,13 +110,19 @@ def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
 
 def undelayed(world: World) -> jax.Array:
     """Forces (T, N, 4) before delay and low-pass."""
-    force = shifted(world.force, world.delay / _step(world))
-    return force + world.smoothing * gradient(world.t, force)
+    force = _when(world, LATE, lambda f: shifted(f, world.delay / _step(world)), world.force)
+    return _when(world, SMOOTH, lambda f: f + world.smoothing * gradient(world.t, f), force)
 
 
 def _filtered(world: World, force: jax.Array) -> jax.Array:
     """Forces (T, N, C) after low-pass (exact between samples for straight lines) and delay."""
-    return shifted(_lowpass(force, world.smoothing, _step(world)), -world.delay / _step(world))
+    smooth = _when(world, SMOOTH, lambda f: _lowpass(f, world.smoothing, _step(world)), force)
+    return _when(world, LATE, lambda f: shifted(f, -world.delay / _step(world)), smooth)
+
+
+def _when(world: World, mode: int, change: Callable[[jax.Array], jax.Array], values: jax.Array) -> jax.Array:
+    """Changed values where a candidate has the mode; else the change is not even evaluated."""
+    return jax.lax.cond(jnp.asarray(world.modes)[mode] > 0, change, lambda v: v, values)
 
 
 def _lowpass(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
@@ -130,16 +143,27 @@ def _lowpass(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
 
 def _relaxed(world: World, force: jax.Array) -> jax.Array:
     """Forces (T, N, 4) that would give the pads' displacement at once, for pads that creep."""
-    late = _lowpass(force, world.creep_time, _step(world))
-    return force + world.creep * (late - force)
+
+    def crept(f: jax.Array) -> jax.Array:
+        return f + world.creep * (_lowpass(f, world.creep_time, _step(world)) - f)
+
+    return _when(world, CREEPING, crept, force)
+
+
+def _known(arrays: Arrays, channel: str) -> jax.Array:
+    return jnp.asarray(arrays.there[..., CHANNELS.index(channel)])
 
 
 def _centred(
-    values: jax.Array, arrays: Arrays, weight: jax.Array, place: jax.Array | None, slip: jax.Array | None
+    values: jax.Array,
+    arrays: Arrays,
+    weight: jax.Array,
+    place: jax.Array | None,
+    sliding: World | None,
 ) -> jax.Array:
-    """Values less their weighted mean in every grip (pickup and place apart if `place` is given).
+    """Values (T, N) less their weighted mean in every grip (pickup and place apart if `place` is given).
 
-    A slide's progress is regressed out alike: its amount is free in every grip.
+    The progress of a slide in `sliding` is regressed out alike: its amount is free in every grip.
     """
     parts = (
         [arrays.onehot]
@@ -151,14 +175,19 @@ def _centred(
         members = part * weight[..., None]
         members = members / jnp.maximum(members.sum(1, keepdims=True), 1e-9)
         out = out - jnp.einsum("tnm,tm->tn", part, jnp.einsum("tnm,tn->tm", members, values))
-    if slip is not None:
-        members = arrays.onehot * weight[..., None]
-        steps = jnp.cumsum(slip[..., None] * arrays.onehot, axis=1)
-        total = (slip[..., None] * arrays.onehot).sum(1, keepdims=True)
-        progress = steps / (total + 0.05) * jnp.clip(total / 2, 0.0, 1.0) ** 2  # one bad sample is no slide
-        mean = (members * progress).sum(1, keepdims=True) / jnp.maximum(members.sum(1, keepdims=True), 1e-9)
-        progress = (progress - mean) * arrays.onehot
-        amount = jnp.einsum("tnm,tnm,tn->tm", members, progress, out)
-        amount = amount / (jnp.einsum("tnm,tnm,tnm->tm", members, progress, progress) + 1e-2)
-        out = out - jnp.einsum("tnm,tm->tn", progress, amount)
+    if sliding is not None:
+        out = _when(sliding, SLIDING, lambda v: _less_slide(v, arrays, weight, sliding.slip), out)
     return out * weight
+
+
+def _less_slide(values: jax.Array, arrays: Arrays, weight: jax.Array, slip: jax.Array) -> jax.Array:
+    """Values (T, N) with the best amount of sliding taken out of every grip."""
+    members = arrays.onehot * weight[..., None]
+    steps = jnp.cumsum(slip[..., None] * arrays.onehot, axis=1)
+    total = (slip[..., None] * arrays.onehot).sum(1, keepdims=True)
+    progress = steps / (total + 0.05) * jnp.clip(total / 2, 0.0, 1.0) ** 2  # one bad sample is no slide
+    mean = (members * progress).sum(1, keepdims=True) / jnp.maximum(members.sum(1, keepdims=True), 1e-9)
+    progress = (progress - mean) * arrays.onehot
+    amount = jnp.einsum("tnm,tnm,tn->tm", members, progress, values)
+    amount = amount / (jnp.einsum("tnm,tnm,tnm->tm", members, progress, progress) + 1e-2)
+    return values - jnp.einsum("tnm,tm->tn", progress, amount)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.effects.base import gradient, tips
+from simgap.effects.base import tips
 from simgap.gap.fit import Fitted, Problem, residual_at
 from simgap.gap.frame import CHANNELS
 
@@ -66,7 +66,6 @@ def _rates(given: Problem) -> np.ndarray:
     _, velocity = tips(world)
     step = np.median(np.diff(w.t, axis=1))
     mean_v = np.asarray((velocity[..., :2] + velocity[..., 2:]) / 2)
-    change = np.asarray(gradient(world.t, world.force))
     out = np.zeros_like(given.whitening.weight)
     # Central differences of positions read at wrong times: v times the times' difference over 2 steps.
     for k, c in enumerate(("vx", "vy")):
@@ -74,8 +73,6 @@ def _rates(given: Problem) -> np.ndarray:
     held = frame.arrays.phase[..., 2]
     relative = np.abs(np.asarray(velocity[..., 2] - velocity[..., 0]))
     out[..., CHANNELS.index("distance")] = relative * (1 - held)
-    out[..., CHANNELS.index("fx")] = np.abs(change[..., 0] + change[..., 2]) * held * 0.3
-    out[..., CHANNELS.index("fy")] = np.abs(change[..., 1] + change[..., 3]) * held * 0.3
     return out * given.whitening.weight
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,8 +43,17 @@ def performed(
     return simulate_trials(task, hand, blocks, seeds, operator, around)
 
 
-def recorded(simulated: SimulatedTrial, task: BlockTask, rig: Rig, effects: Values) -> Trial:
-    """What the nominal hand's sensors record of a simulated trial under the given effects."""
+def recorded(
+    simulated: SimulatedTrial,
+    task: BlockTask,
+    rig: Rig,
+    effects: Values,
+    change: Callable[[Performance], Performance] | None = None,
+) -> Trial:
+    """What the nominal hand's sensors record of a simulated trial under the given effects.
+
+    `change` is one more, of the caller's own, that acts on what the sensors would see.
+    """
     rng = np.random.default_rng([simulated.seed, 7])
     motion = simulated.motion
     truth = Performance(
@@ -60,6 +69,7 @@ def recorded(simulated: SimulatedTrial, task: BlockTask, rig: Rig, effects: Valu
     for effect in sorted(chosen, key=lambda e: -e.stage):
         if effect.apply is not None:
             truth = effect.apply(truth, dict(effects[effect.name]), rng)
+    truth = truth if change is None else change(truth)
     t = simulated.trial.t
     times = t + rng.normal(0, effects["clock_jitter"]["sd"], t.size) if "clock_jitter" in effects else t
 

@@ -5,7 +5,10 @@ import pytest
 
 from experiments.bank import Deviations, deviated, nominal, simulated_cases
 from experiments.estimates import Estimates, summarise_estimates
-from experiments.write_tables import covered, fill, markdown
+from experiments.table_misfits import misfits
+from experiments.table_real import real
+from experiments.table_text import covered, markdown
+from experiments.write_tables import fill
 from hmmseg.signals import task_space
 
 
@@ -22,6 +25,43 @@ def test_markdown_and_coverage():
     assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
     assert covered({"c": 0.9, "c_se": 0.0123}, "c") == "90.0 ± 1.2 %"
     assert covered({"c": 0.9, "c_se": None}, "c") == "90.0 %"
+
+
+def snap_results():
+    def of(scale):
+        return {"trials": 14, "median_abs": [scale, 2 * scale], "p95_abs": [3 * scale, 4 * scale],
+                "within_0.3": [1.0, 0.5]}  # fmt: skip
+
+    kind = {"training_mean": [1.5, 1.4], "training_mean_uncropped": [0.003, 0.002]}
+    for channels, scale in (("wrench_and_pose", 0.01), ("wrench", 0.02)):
+        kind[channels] = {"with_labels": of(scale), "without_labels": of(10 * scale)}
+    return {"seeds": 2, "max_crop": 3.0, "kinds": {"real_guarded": kind, "real_pivot": kind}}
+
+
+def test_real_recordings_stand_beside_the_predictor_without_ears(monkeypatch):
+    handover = {"lift_off": {"force": 2.0, "height": 1.98}, "put_down": {"force": 5.0, "height": 5.1}}
+    people = {"clearance": 0.01, "recordings": [{"recording": "P1", **handover}]}
+    found = {"hiro_snap": snap_results(), "kth_handover": people}
+    monkeypatch.setattr("experiments.table_real.load", found.get)
+    table = real() or ""
+    assert "7 guarded, 7 pivoting trials, 2 random crops of up to 3 s" in table
+    assert "| guarded | none: answers the training mean | 1500 ms | 1400 ms |" in table
+    row = "| pivoting | force and torque alone; no labels | 200 ms, 600 ms, 100 % | 400 ms, 800 ms, 50 % |"
+    assert row in table
+    assert "| P1 | +20 ms | -100 ms |" in table
+    monkeypatch.setattr("experiments.table_real.load", {}.get)
+    assert real() is None
+
+
+def test_misfits_say_alarms_and_shares_found(monkeypatch):
+    quiet = {"trials": 50, "false_alarms": 1, "false_alarms_pooled": 0}
+    edit = {"trials": 46, "alone": {"detected": 1.0, "right_subtask": 0.9}, "pooled": None}
+    found = {"recordings": quiet, "simulated": {"tower": {"trials": 24, "false_alarms": 2}},
+             "edits": {"swapped": edit}, "edits_simulated": {"swapped": edit}}  # fmt: skip
+    monkeypatch.setattr("experiments.table_misfits.load", {"misfits": found}.get)
+    table = misfits() or ""
+    assert "| recordings, each alone | 50 | 1 |" in table and "| simulated: tower | 24 | 2 |" in table
+    assert "| block 2 before block 1 | 46 | 100 %, 90 % |  | 100 %, 90 % |" in table
 
 
 def test_coverages_have_clusters_as_their_units():

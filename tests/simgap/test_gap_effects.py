@@ -101,6 +101,7 @@ def world_of(p: Performance) -> World:
         couple=zero,
         loudness=one,
         slip=np.zeros((1, held.size)),
+        modes=np.zeros(4),
         free=1 - held[None],
         ground=(held - carry)[None],
         carry=carry[None],

@@ -1,0 +1,64 @@
+"""The next experiment carried out: where a set was named, record what the diagnosis asks for and diagnose it.
+
+Done after the seal is opened, since the same blocks and effects have to be recorded once more.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from experiments.blind_check.cases import TRIALS, Case, record_case
+from experiments.blind_check.diagnose import diagnose_folder
+from experiments.blind_check.generate import NOMINAL, write_folder
+from experiments.blind_check.hand import load_rig
+from experiments.blind_check.operator import Style
+from experiments.blind_check.scene import Block
+from experiments.blind_check.sealing import unseal
+
+KNOWN = {f.name for f in fields(Style)}
+
+
+def follow(folder: Path, results: Path, progress=None) -> list[dict[str, Any]]:
+    """One entry for every case whose verdict is a set that holds the true cause; written case by case.
+
+    `separated`: the new recordings are given the true cause and no other.
+    """
+    out = []
+    for entry in unseal(folder)["cases"]:
+        found = json.loads((results / f"{entry['case']}.json").read_text(encoding="utf-8"))
+        if found.get("verdict") != "set" or found["next_experiment"] is None:
+            continue
+        if not set(entry["effects"]) <= {*found["causes"], *found["indistinguishable"]}:
+            continue
+        place = results / "follow" / entry["case"]
+        file = place / "diagnosis.json"
+        if not file.exists():
+            _record(entry, found["next_experiment"], place)
+            file.write_text(json.dumps(diagnose_folder(place)) + "\n", encoding="utf-8")
+            if progress is not None:
+                progress(entry["case"])
+        after = json.loads(file.read_text(encoding="utf-8"))
+        right = sorted(after.get("causes", [])) == sorted(entry["effects"])
+        out.append({
+            "case": entry["case"], "true": sorted(entry["effects"]), "do": found["next_experiment"]["do"],
+            "said": after.get("causes", []), "verdict": after.get("verdict", "error"),
+            "separated": right and after.get("verdict") == "named",
+        })  # fmt: skip
+    return out
+
+
+def _record(entry: dict[str, Any], asked: dict[str, Any], place: Path) -> None:
+    """Fresh trials of a sealed case in the style that was asked for."""
+    blocks = {n: Block(**b) for n, b in entry["blocks"].items()}
+    case = Case(entry["case"], entry["seed"], entry["tier"], blocks, entry["effects"], entry["sizes"],
+                entry["measured"], tuple(entry["exclude"]))  # fmt: skip
+    unknown = set(asked["operator"]) - KNOWN
+    if unknown:
+        raise ValueError(f"{entry['case']}: the simulated operator has no setting {sorted(unknown)}")
+    style = {k: (float(v[0]), float(v[1])) for k, v in asked["operator"].items()}
+    if not style:  # nothing to be done otherwise: the blocks are to be measured
+        case = replace(case, measured=True)
+    write_folder(place, case, record_case(case, load_rig(NOMINAL / "rig.toml"), style, first=TRIALS))

@@ -1,0 +1,70 @@
+"""Noise of channels and of residuals [units of the channel], from the rig or learned from a recording."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmmseg.features import noise_sd
+from hmmseg.rig import Rig
+from hmmseg.signals import Signals
+
+MISFIT = 0.03  # share of a force's change between samples that no model of 20 Hz samples can tell
+FADED, FADING = 0.1, 0.5  # the same of what is recorded in free motion, so many seconds from a grip
+NUDGE = 1e-4  # m; fingers that push unequally move a resting block by about as much
+
+
+def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, float]:
+    """Noise of one finger's x, y, vx, vy and force, of means over `group` samples.
+
+    Learned from the recording where the rig does not state it.
+    """
+
+    def known(stated: np.ndarray | float, values: np.ndarray, factor: float) -> float:
+        there = np.atleast_1d(stated)[np.isfinite(np.atleast_1d(stated))]
+        if there.size:
+            return float(np.median(there)) / np.sqrt(group)
+        learned = noise_sd(values) * factor  # of what is averaged already
+        return max(learned if np.isfinite(learned) else 0.0, 1e-9)
+
+    root2 = np.sqrt(2.0)
+    return {
+        "x": known(s.sd_x, s.x, root2), "y": known(s.sd_y, s.y, root2),
+        "vx": known(s.sd_vx, s.vx, root2), "vy": known(s.sd_vy, s.vy, root2),
+        "force": known(s.sd_force, s.fy, 1 / root2),
+    }  # fmt: skip
+
+
+def channel_noise(one: dict[str, float]) -> np.ndarray:
+    """Noise (C,) of one sample of x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
+    root2 = np.sqrt(2.0)
+    x, y, f = one["x"], one["y"], one["force"]
+    return np.array([x / root2, y / root2, root2 * x, root2 * y, one["vx"] / root2, one["vy"] / root2,
+                     root2 * f, root2 * f, f / root2, f / root2])  # fmt: skip
+
+
+def residual_noise(s: Signals, one: dict[str, float], rig: Rig, step: float) -> np.ndarray:
+    """Noise (N, C) of each channel's residual: positions with the pads' yielding taken out, velocities less
+    differences of positions `step` s apart."""
+    pad, root2 = rig.fingertip, np.sqrt(2.0)
+    x, y, vx, vy, f = (one[k] for k in ("x", "y", "vx", "vy", "force"))
+    gn, gs = f / pad.normal_stiffness, f / pad.shear_stiffness
+    row = [
+        np.hypot(np.hypot(x, gn) / root2, NUDGE), np.hypot(y, gs) / root2,
+        root2 * np.hypot(x, gn), root2 * np.hypot(y, gs),
+        np.hypot(0.5 * vx, 0.5 * x / step), np.hypot(0.5 * vy, 0.5 * y / step),
+        root2 * f, root2 * f, f / root2, f / root2,
+    ]  # fmt: skip
+    return np.tile(row, (s.t.size, 1))
+
+
+def misfit(t: np.ndarray, force: np.ndarray, free: np.ndarray, boundaries: np.ndarray) -> np.ndarray:
+    """What no model of coarse samples can tell (N, 4) of net fx, net fy, grip and shear [N].
+
+    A share of the largest change from sample to sample, two samples around; and just after a grip a
+    share of what is still recorded, for it tells of forces between samples.
+    """
+    every = np.concatenate([force[:, :2] + force[:, 2:], (force[:, :2] - force[:, 2:]) / 2], 1)
+    step = np.pad(np.abs(np.diff(every, axis=0)), ((2, 2), (0, 0)))
+    change = np.max([step[k : k + len(force)] for k in range(4)], axis=0)
+    after = free & (np.abs(t[:, None] - boundaries) < FADING).any(axis=1)
+    return np.maximum(MISFIT * change, FADED * np.abs(every) * after[:, None])

@@ -1,0 +1,63 @@
+"""The verdict: probabilities of every explanation, and what these recordings cannot tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from simgap.effects import catalogue
+from simgap.gap import judge
+from simgap.gap.judge import Calibration
+from simgap.gap.search import ALARM, Candidate, Search
+
+TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
+
+
+def likelihoods(
+    evidence: Mapping[str, float], p_value: float, left: float, significant: float, c: Calibration
+) -> dict[str, float]:
+    """Probabilities of none, unknown and every candidate, given whether there is a gap at all.
+
+    With a gap, what names no cause is unknown; without one, all but a little is none.
+    """
+    out = judge.probabilities(evidence, left, significant, c)
+    if p_value < ALARM:
+        none = min(out["none"], p_value)
+        return out | {"none": none, "unknown": out["unknown"] + out["none"] - none}
+    none = 1 - 0.1 * (1 - p_value) ** 4
+    rest = sum(v for k, v in out.items() if k != "none")
+    scaled = {k: v * (1 - none) / max(rest, 1e-12) for k, v in out.items() if k != "none"}
+    return {"none": none if rest > 1e-12 else 1.0, **scaled}
+
+
+def choose(
+    probability: Mapping[str, float], found: Search, gap: bool, forced: bool
+) -> tuple[str, list[str], list[str]]:
+    """Verdict, causes and the effects that cannot be told from them."""
+    best, *others = found.candidates
+    if forced:
+        return "named", sorted(best.effects), []
+    if not gap:
+        return "none", [], []
+    if max(probability["unknown"], probability["none"]) > 0.5:
+        return "unknown", [], []
+    alike = [k for k in others if len(k.effects) == len(best.effects)]
+    near = [k for k in alike if best.evidence - k.evidence < TIE or _as_good(best, k, found.temperature)]
+    partners = sorted({e for k in near for e in k.effects} - set(best.effects))
+    return ("set" if partners else "named"), sorted(best.effects), partners
+
+
+def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:
+    """Whether another candidate of about as many parameters fits as well: a matter of priors alone."""
+    if best.spread is not None or other.spread is not None:
+        return False
+    if any(catalogue()[name].local for name in other.effects):  # free amounts fit anything a little
+        return False
+    more = other.fitted.columns.size - best.fitted.columns.size
+    return more <= 2 and (other.fitted.cost - best.fitted.cost) / temperature < TIE
+
+
+def listed(probability: Mapping[str, float]) -> dict[str, float]:
+    """Those that matter, and `other` for the rest; they sum to 1."""
+    out = {k: v for k, v in probability.items() if k in ("none", "unknown") or v > 1e-3}
+    out["other"] = max(0.0, 1.0 - sum(out.values()))
+    return out

@@ -1,0 +1,240 @@
+"""The generic diagnosis: is there a gap, where, which effects cause it, how far it shrinks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
+
+from hmmseg.errors import InputError, nearest
+from hmmseg.rig import Rig
+from hmmseg.sequence_model import SequenceModel
+from hmmseg.task import BlockTask, SequenceTask
+from hmmseg.trial import Trial
+from simgap.gap.judge import Calibration, joined, probabilities
+from simgap.generic.aligned import Ensembles, align
+from simgap.generic.block_trials import block_ensembles
+from simgap.generic.effects import CANDIDATES, Scene, scene
+from simgap.generic.features import layout, rows, windowed
+from simgap.generic.fit import Block, Fitted, blocks, fit
+from simgap.generic.locate import Located, locate
+from simgap.generic.report import effect_entry, listed_cells
+from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
+from simgap.generic.shrinkage import fraction, heldout, shrinkage, sizes
+
+ALARM = 0.01  # chance that two ensembles alike are called different
+MOST = 6  # effects that may act together
+GAIN = 5.0  # nats that a further effect must add
+WORTH = 0.98  # it must leave no more than this share of the excess square
+TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
+TEMPERATURE = 1.5  # least; covariances come from a few trials
+UNKNOWN = 0.15  # share of the gap left at which it is as likely of another cause
+RINGS = 0.2  # share of the square after an event that an oscillation must explain
+SHORTEST = 16  # samples of a window in which an oscillation is looked for
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class GenericDiagnosis:
+    """Everything found; `body` is the JSON document's. `real` (R, F), `sim` (S, F): features;
+    `chosen`: the verdict's fit, if it names any effects; `leading`: the best explanation all the same."""
+
+    body: dict[str, Any]
+    scene: Scene
+    located: Located
+    real: np.ndarray
+    sim: np.ndarray
+    chosen: Fitted | None
+    leading: Fitted
+    ring: Ring | None
+    warnings: tuple[str, ...]
+
+
+def diagnose(
+    real: Sequence[Trial],
+    sim: Sequence[Trial],
+    task: SequenceTask,
+    model: SequenceModel | None = None,
+    forced: Sequence[str] = (),
+    seed: int = 0,
+    progress: Progress | None = None,
+    boundaries: Mapping[str, np.ndarray] | None = None,
+) -> GenericDiagnosis:
+    """Diagnose real trials against simulated ones of the same plain ordered task.
+
+    `boundaries` [s] by file (one fewer than subtasks) take the place of the HMM; `forced` names effects
+    to be taken instead of choosing. InputError where a kind has no trial that shows the whole task.
+    """
+    tell = progress or (lambda text: None)
+    _check(forced)
+    tell("aligning trials")
+    return diagnosed(align(real, sim, task, model, boundaries, seed), forced, seed, tell)
+
+
+def diagnose_blocks(
+    real: Sequence[Trial],
+    sim: Sequence[Trial],
+    task: BlockTask,
+    rig: Rig,
+    forced: Sequence[str] = (),
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> GenericDiagnosis:
+    """The same of a block task, its channels the task-space ones."""
+    tell = progress or (lambda text: None)
+    _check(forced)
+    tell("aligning trials")
+    return diagnosed(block_ensembles(real, sim, task, rig), forced, seed, tell)
+
+
+def _check(forced: Sequence[str]) -> None:
+    for name in forced:
+        if name not in CANDIDATES:
+            raise InputError(f"effect {name!r}", "needs the virtual model or is unknown",
+                             nearest(name, list(CANDIDATES)))  # fmt: skip
+
+
+def detect(ensembles: Ensembles, seed: int = 0) -> tuple[Located, bool]:
+    """Whether and where there is a gap, and nothing else."""
+    lay = layout(ensembles)
+    located = locate(lay, *rows(lay), seed)
+    return located, located.p_value < ALARM
+
+
+def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Progress) -> GenericDiagnosis:
+    """Diagnose ensembles that are cut already."""
+    lay = layout(ensembles)
+    real, sim = rows(lay)
+    numbers = len(real), len(sim)
+    tell("locating the gap")
+    located = locate(lay, real, sim, seed)
+    ring = _ring(scene(lay), real, sim)
+    given = scene(lay) if ring is None else scene(lay, ring.frequency, ring.damping)
+    parts = blocks(given, real, sim)
+    difference = real.mean(0) - sim.mean(0)
+
+    def fitted(effects: Sequence[str], base: Fitted | None = None) -> Fitted:
+        return fit(given, parts, difference, numbers, effects, base)
+
+    tell("fitting effects")
+    names = [n for n in CANDIDATES if n != "structural_vibration" or ring is not None]
+    if forced:
+        found = [fitted(tuple(dict.fromkeys(forced)))]
+    else:
+        found = [fitted((n,)) for n in names]
+        found += _together(found, names, fitted, located.p_value < ALARM)
+    temperature = _temperature(min(f.square for f in found), difference.size)
+    found.sort(key=lambda f: -f.evidence(temperature))
+    tell("held-out trials")
+    return _conclude(given, parts, located, real, sim, found, ring, temperature, bool(forced), seed)
+
+
+def _temperature(left: float, size: int) -> float:
+    return max(TEMPERATURE, left / size)
+
+
+def _together(singles: list[Fitted], names: list[str], fitted, gap: bool) -> list[Fitted]:
+    """Effects added one by one to the best so far, as long as each is worth it."""
+    out: list[Fitted] = []
+    size = singles[0].shift.size
+    best = max(singles, key=lambda f: f.evidence(TEMPERATURE))
+    while gap and len(best.effects) < MOST:
+        further = [fitted((*best.effects, n), best) for n in names if n not in best.effects]
+        if not further:
+            break
+        temperature = _temperature(min(f.square for f in (best, *further)), size)
+        out += further
+        new = max(further, key=lambda f: f.evidence(temperature))
+        if new.evidence(temperature) < best.evidence(temperature) + GAIN:
+            break
+        if new.square - size > WORTH * (best.square - size):
+            break
+        best = new
+    return out
+
+
+def _ring(given: Scene, real: np.ndarray, sim: np.ndarray) -> Ring | None:
+    """The strongest oscillation after an event in the real trials, where they hold more power."""
+    lay, best, windows = given.layout, 0.0, None
+    for k in range(1, len(lay.ensembles.subtasks)):
+        for c in range(len(lay.ensembles.channels)):
+            recorded = np.array([windowed(lay, cut, c, k) for cut in lay.ensembles.real])
+            simulated = np.array([windowed(lay, cut, c, k) for cut in lay.ensembles.sim])
+            if recorded.shape[1] < SHORTEST or recorded.var(1).mean() < simulated.var(1).mean():
+                continue
+            rest = recorded - simulated.mean(0)  # what the simulation has is no ring
+            here = from_swing(list(rest if rest.var(1).mean() < recorded.var(1).mean() else recorded))
+            _, _, share, square = screen(here, lay.rate)
+            strength = square * here.shape[1] / lay.scale[c] ** 2
+            if share > RINGS and strength > best:
+                best, windows = strength, here
+    found = None if windows is None else fit_ring(windows, lay.rate)
+    return found if found is not None and found.resolved else None
+
+
+def _conclude(
+    given: Scene, parts: list[Block], located: Located, real: np.ndarray, sim: np.ndarray,
+    found: list[Fitted], ring: Ring | None, temperature: float, forced: bool, seed: int,
+) -> GenericDiagnosis:  # fmt: skip
+    """Verdict, probabilities, place, shrinkage and parameters from the fitted candidates."""
+    lay, best = given.layout, found[0]
+    counts = np.bincount(lay.cell)
+    held = {f.effects: heldout(given, parts, real, sim, f) for f in found[:8]}
+    # Judged where there is a gap: elsewhere a small excess would drown in the floor's own scatter.
+    apart = counts * (located.z > min(located.threshold, located.z.max() - 1e-9))
+    before, after, _, floor = sizes(held[best.effects], apart)
+    left = 1 - fraction(before, after, floor)
+    left = float(np.clip(left, 0, 1)) if np.isfinite(left) else 0.0
+    rest = locate(lay, real - best.shift, sim, seed).p_value
+    significant = float(expit(2 * (np.log10(ALARM) - np.log10(max(rest, 1e-30)))))
+    evidence = {joined(f.effects): f.evidence(temperature) for f in found}
+    probability = probabilities(evidence, left, significant, Calibration(unknown_at=UNKNOWN))
+    p, gap = located.p_value, located.p_value < ALARM
+    if gap:
+        excess = max(probability["none"] - p, 0.0)
+        probability["none"] -= excess
+        probability["unknown"] += excess
+    else:
+        none = 1 - 0.1 * (1 - p) ** 4  # what the threshold calls alike is alike, more or less surely
+        rest_of = 1 - probability["none"]
+        probability = {k: v * (1 - none) / max(rest_of, 1e-12) for k, v in probability.items() if k != "none"}
+        probability["none"] = 1 - sum(probability.values())
+    partners: list[str] = []
+    if forced:
+        verdict = "named"
+    elif not gap:
+        verdict = "none"
+    elif probability["unknown"] > 0.5:
+        verdict = "unknown"
+    else:
+        near = [f for f in found[1:] if len(f.effects) == len(best.effects)
+                and evidence[joined(best.effects)] - evidence[joined(f.effects)] < TIE]  # fmt: skip
+        partners = sorted({e for f in near for e in f.effects} - set(best.effects))
+        verdict = "set" if partners else "named"
+    chosen = best if verdict in ("named", "set") else None
+    warnings = [*lay.ensembles.warnings]
+    if not located.exchanged:
+        warnings.append("too few trials to exchange: p rests on the F distribution and Bonferroni's bound")
+    if len(real) == 1:
+        warnings.append("one trial: held out by subtasks, which is weaker than by trials")
+    shrunk, trials = shrinkage(given, held[best.effects], seed), len(real) + len(sim)
+    shown = {k: v for k, v in probability.items() if k in ("none", "unknown") or v > 1e-3}
+    body = {
+        "verdict": verdict,
+        "causes": list(best.effects) if chosen is not None else [],
+        "indistinguishable": partners,
+        "probabilities": {**shown, "other": max(0.0, 1 - sum(shown.values()))},
+        "detection": {"p_value": p, "statistic": float(located.z.max())},
+        "where": listed_cells(lay, located, real, sim) if gap else [],
+        "effects": {
+            joined(f.effects): effect_entry(given, f, ring, temperature, held[f.effects].score, trials)
+            for f in found[:8]
+        },
+        "shrinkage": None if chosen is None else shrunk,
+        "best_explanation": {"effects": list(best.effects), "shrinkage": shrunk} if gap else None,
+        "next_experiment": None,
+    }  # fmt: skip
+    return GenericDiagnosis(body, given, located, real, sim, chosen, best, ring, tuple(warnings))

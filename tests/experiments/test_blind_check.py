@@ -1,0 +1,237 @@
+"""The blind check: its simulator obeys physics, its seal holds, its scorer counts rightly."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+mujoco = pytest.importorskip("mujoco", reason="the blind check's simulator needs the extra `check`")
+
+from experiments.blind_check import cases as sets  # noqa: E402
+from experiments.blind_check.effects import CATALOGUE  # noqa: E402
+from experiments.blind_check.generate import NOMINAL, generate  # noqa: E402
+from experiments.blind_check.hand import angles, load_rig, rates, tips  # noqa: E402
+from experiments.blind_check.operator import Style, plan  # noqa: E402
+from experiments.blind_check.perform import perform  # noqa: E402
+from experiments.blind_check.scene import STEP, Block, Servo, World, mjcf  # noqa: E402
+from experiments.blind_check.score import figures, judge_case  # noqa: E402
+from experiments.blind_check.sealing import BrokenSeal, unseal  # noqa: E402
+from experiments.blind_check.signals import Sampling, sample, sense  # noqa: E402
+from simgap.effects import catalogue  # noqa: E402
+
+RIG = load_rig(NOMINAL / "rig.toml")
+BLOCKS = {"block1": Block(0.5, 0.017, 0.017, 0.6), "block2": Block(0.35, 0.026, 0.014, 0.6)}
+HEALTHY = World(RIG.normal_stiffness, RIG.shear_stiffness)
+SERVO = Servo(0.12, 800.0, 19.0)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """A healthy trial."""
+    return perform(plan(BLOCKS, HEALTHY, Style(), np.random.default_rng(4)), BLOCKS, HEALTHY)
+
+
+def run(world: World, centres: dict[str, tuple[float, float]], seconds: float, command=(0.0, 0.2, 0.3, 0.2)):
+    """A block world left alone, its fingers far away: the model, its data and heights at every step."""
+    model = mujoco.MjModel.from_xml_string(mjcf(BLOCKS, centres, command, world, (SERVO, SERVO)))
+    data = mujoco.MjData(model)
+    data.qpos[[model.joint(n).qposadr[0] for n in ("x1", "z1", "x2", "z2")]] = command
+    data.ctrl[:4] = command
+    heights = []
+    for _ in range(round(seconds / STEP)):
+        mujoco.mj_step(model, data)
+        heights.append(data.joint("z_block1").qpos[0])
+    return model, data, np.array(heights)
+
+
+def test_a_block_falls_freely():
+    _, _, z = run(HEALTHY, {"block1": (0.1, 0.15), "block2": (0.2, 0.007)}, 0.1)
+    t = np.arange(1, len(z) + 1) * STEP
+    # Semi-implicit Euler falls by g t (t + step) / 2.
+    np.testing.assert_allclose(z, -RIG.gravity * t * (t + STEP) / 2, atol=1e-9)
+
+
+def test_a_table_yields_by_the_load_and_tilts_about_its_pivot():
+    rest = {"block1": (0.115, 0.014 + 0.0085), "block2": (0.115, 0.007)}
+    _, _, z = run(replace(HEALTHY, table_stiffness=1000.0), rest, 0.8)
+    assert z[-1] == pytest.approx(-(0.5 + 0.35) / 1000.0, rel=0.01)
+    _, data, z = run(replace(HEALTHY, tilt=0.03), {"block1": (0.165, 0.0102), "block2": (0.115, 0.007)}, 0.5)
+    assert 0.0102 + z[-1] == pytest.approx(0.0085 + 0.03 * 0.05, abs=3e-5)
+    assert abs(data.joint("x_block1").qpos[0]) < 2e-5  # friction holds it
+
+
+def test_fingers_carry_the_weight_and_nothing_in_free_motion(motion):
+    touch, leave, meet, part = motion.boundaries[:4]
+    air = (motion.t > leave + 0.05) & (motion.t < meet - 0.02)
+    net = motion.force[air, 1] + motion.force[air, 3]
+    a = np.gradient(np.gradient(motion.centres[:, 0, 1], motion.t), motion.t)[air]
+    np.testing.assert_allclose(net, 0.5 * (1 + a / RIG.gravity), atol=0.01)
+    free = (motion.t < touch - 0.02) | ((motion.t > part + 0.1) & (motion.t < motion.boundaries[4] - 0.02))
+    assert np.abs(motion.force[free]).max() < 1e-4
+
+
+def test_pads_are_linear_and_do_not_slip(motion):
+    touch, _, _, part = motion.boundaries[:4]
+    held = (motion.t > touch + 0.1) & (motion.t < part - 0.1)
+    p, f = motion.position[held], motion.force[held]
+    distance = p[:, 2] - p[:, 0] + (f[:, 0] - f[:, 2]) / RIG.normal_stiffness
+    np.testing.assert_allclose(distance, BLOCKS["block1"].width, atol=5e-6)
+    offset = p[:, 3] - p[:, 1] - (f[:, 3] - f[:, 1]) / RIG.shear_stiffness
+    assert np.ptp(offset) < 8e-6
+
+
+def test_angles_and_tips_are_inverse(motion):
+    q = angles(RIG, motion.position)
+    np.testing.assert_allclose(tips(RIG, q), motion.position, atol=1e-12)
+    turned = np.gradient(q, motion.t, axis=0)[100:-100]
+    np.testing.assert_allclose(rates(RIG, q, motion.velocity)[100:-100], turned, atol=0.02)
+    longer = angles(RIG, motion.position, 0.02)
+    assert np.abs(tips(RIG, longer) - motion.position).max() > 1e-3
+
+
+def test_noise_has_the_rigs_size(motion):
+    signals = sense(motion, RIG, [], np.random.default_rng(0))
+    _, noisy = sample(signals, Sampling(), np.random.default_rng(1))
+    _, quiet = sample(signals, Sampling(), np.random.default_rng(1), noisy=False)
+    for name, sd in (("q11", RIG.angle_noise), ("dq22", RIG.velocity_noise), ("fy1", RIG.force_noise)):
+        assert np.std(noisy[name] - quiet[name]) == pytest.approx(sd, rel=0.2)
+
+
+def test_sensing_effects_are_what_the_contract_says(motion):
+    def force(name: str, values: dict) -> np.ndarray:
+        change = CATALOGUE[name].change(values)
+        return sense(motion, RIG, change.stages, np.random.default_rng(0)).force
+
+    f, t = motion.force, motion.t
+    np.testing.assert_allclose(force("force_gain", {"gain": 0.1}), 1.1 * f)
+    turned = force("sensor_rotation", {"angle1": 0.1, "angle2": -0.2})
+    np.testing.assert_allclose(turned[:, 1], np.sin(0.1) * f[:, 0] + np.cos(0.1) * f[:, 1], atol=1e-12)
+    late = force("force_lag", {"delay": 0.2})
+    np.testing.assert_allclose(late[200:], f[:-200], atol=1e-6)
+    slow = force("force_lowpass", {"time_constant": 0.1})[:, 0]
+    residual = 0.1 * np.gradient(slow, t) + slow - f[:, 0]
+    assert np.abs(residual).mean() < 0.02
+    start = force("cable_force", {"stiffness": 2.0, "x0": 0.1, "y0": 0.0})[0]
+    np.testing.assert_allclose(start - f[0], 2.0 * (motion.position[0] - [0.1, 0, 0.1, 0]), atol=1e-9)
+    drift = force("force_drift", {"fx1": 0.02, "fy1": 0.0, "fx2": 0.0, "fy2": 0.0})[:, 0] - f[:, 0]
+    assert drift[-1] == pytest.approx(0.02 * t[-1], rel=1e-6)
+
+
+def test_an_off_centre_mass_makes_the_shear_unequal():
+    rng = lambda: np.random.default_rng(4)  # noqa: E731
+    moved = replace(HEALTHY, mass_offset=0.003)
+    a = perform(plan(BLOCKS, HEALTHY, Style(), rng()), BLOCKS, HEALTHY)
+    b = perform(plan(BLOCKS, moved, Style(), rng()), BLOCKS, moved)
+    leave, meet = a.boundaries[1:3]
+    air = (a.t > leave + 0.2) & (a.t < meet - 0.1)
+    n = min(len(a.t), len(b.t))
+    more = (b.force[:n] - a.force[:n])[air[:n]].mean(0)
+    couple = 0.5 * 0.003 / 0.017
+    np.testing.assert_allclose(more[[1, 3]], [-couple, couple], rtol=0.1)
+
+
+def test_every_contract_effect_is_there():
+    known = {n for n, e in catalogue().items() if e.chosen}
+    assert set(CATALOGUE) == known
+    for name, made in CATALOGUE.items():
+        values = made.draw(np.random.default_rng(0), 0.5)
+        assert values and all(np.isfinite(list(values.values()))), name
+
+
+def test_sets_are_drawn_alike_and_keep_their_shares():
+    assert sets.draw_cases(30, 3) == sets.draw_cases(30, 3)
+    assert sets.draw_cases(30, 3) != sets.draw_cases(30, 4)
+    drawn = [c.tier for c in sets.draw_cases(300, 3)]
+    assert {t: drawn.count(t) for t in sets.TIERS} == sets.TIERS
+
+
+def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sets, "TRIALS", 1)
+    found = generate(2, 7, tmp_path)
+    again = generate(2, 7, tmp_path / "again")
+    assert found != again  # salted anew
+    a, b = unseal(tmp_path), unseal(tmp_path / "again")
+    assert a == b
+    first = tmp_path / "cases" / "case_0000"
+    csv = (first / "trial_01.csv").read_text()
+    assert csv == (tmp_path / "again" / "cases" / "case_0000" / "trial_01.csv").read_text()
+    assert json.loads((tmp_path / "seal.json").read_text())["sha256"] == found
+    allowed = {"rig.toml", "task.toml", "trial_01.csv", "actual.toml", "options.json"}
+    assert {p.name for p in first.iterdir()} <= allowed
+    file = tmp_path / "sealed" / "labels.json"
+    labels = json.loads(file.read_text())
+    labels["cases"][0]["tier"] = "other"
+    file.write_text(json.dumps(labels))
+    with pytest.raises(BrokenSeal, match=found):
+        unseal(tmp_path)
+
+
+def entry(case: str, tier: str, effects: dict, size: float = 0.5, measured: bool = True) -> dict:
+    """A label made by hand: grip and fy shifted while block1 is carried."""
+    row = {c: [0.0] * 9 for c in ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")}
+    if effects:
+        row = row | {"fy": [0.0, 0.0, 5.0, *[0.0] * 6], "grip": [0.0, 0.0, 4.0, *[0.0] * 6]}
+    return {"case": case, "tier": tier, "effects": effects, "sizes": dict.fromkeys(effects, size),
+            "measured": measured, "shift": [row, row]}  # fmt: skip
+
+
+def said(verdict: str, causes: list[str], partners: list[str] = (), **more) -> dict:  # type: ignore[assignment]
+    """A diagnosis made by hand."""
+    name = "+".join(causes) or verdict
+    effects = {name: {"heldout_score": 50.0, "parameters": more.pop("parameters", {})}} if causes else {}
+    body = {
+        "verdict": verdict, "causes": causes, "indistinguishable": list(partners),
+        "probabilities": {name: 0.95, "other": 0.05}, "effects": effects,
+        "where": [{"channel": "fy", "subtask": "carry block1"}, {"channel": "x", "subtask": "place block1"}],
+        "shrinkage": {"fraction": 0.9} if causes else None,
+        "rivals": {"bic": "force_bias", "all_at_once": "none", "cosine": "none"}, "gains": {},
+        "seconds": 10.0,
+    }  # fmt: skip
+    return body | more
+
+
+def test_the_scorer_counts_hand_made_results():
+    interval = {"fy1": {"interval_90": [0.05, 0.15]}, "fx1": {"interval_90": [0.3, 0.4]}}
+    bias = {"force_bias": {"fy1": 0.1, "fx1": 0.1}}
+    rows = [
+        judge_case(entry("a", "healthy", {}), said("none", [])),
+        judge_case(entry("b", "healthy", {}), said("named", ["force_lag"])),
+        judge_case(entry("c", "single", bias), said("named", ["force_bias"], parameters=interval)),
+        judge_case(entry("d", "single", bias), said("set", ["fingertip_mass"], ["force_bias"]),
+                   lambda case, name: {"gain": 40.0, "fraction": 0.6}),
+        judge_case(entry("e", "single", bias, 0.1), said("none", [], gains={"force_bias": 2.0})),
+        judge_case(entry("f", "single", {"force_lag": {"delay": 0.1}}),
+                   said("unknown", [], gains={"force_lag": 30.0})),
+        judge_case(entry("g", "outside", {"mains_hum": {"amplitude": 0.1}}), said("unknown", [])),
+        judge_case(entry("h", "withheld", {"fingertip_mass": {"mass": 0.01}}),
+                   said("named", ["force_bias"], gains={"fingertip_mass": 90.0})),
+        judge_case(entry("i", "withheld", {"force_gain": {"gain": 0.1}}),  # measured: no partner
+                   said("named", ["fingertip_compliance"], gains={"force_gain": 90.0})),
+        judge_case(entry("j", "pair", {"force_bias": {}, "force_lag": {}}),
+                   said("named", ["force_bias", "force_lag"])),
+    ]  # fmt: skip
+    found = figures(rows)
+    table = found["table"]
+    assert table["false_alarms"]["value"] == 0.5
+    assert found["above_floor"] == {"single": 3, "pair": 1}
+    assert table["named_right"]["hits"] == 1 and table["set_right"]["hits"] == 2
+    assert table["known_rejected"]["hits"] == 1
+    assert table["outside_unknown"]["value"] == 1.0
+    assert table["withheld_right"]["value"] == 0.5
+    assert table["pair_exact"]["value"] == 1.0
+    assert table["coverage_90"]["value"] == 0.5
+    assert table["too_small_none"]["value"] == 1.0
+    # c, d and f: one hit, one false, one missed cell each.
+    assert table["location_f1"]["value"] == pytest.approx(0.5)
+    # c: 1; d: 0.9 of 0.6; j: 1. f has no oracle.
+    assert table["shrinkage_over_oracle"]["value"] == pytest.approx(1.0)
+    assert found["rivals"]["bic"]["named_right"]["hits"] == 2
+    assert found["confusion"]["force_bias"] == {"force_bias": 1, "fingertip_mass": 1}
+    top = found["reliability"][0]
+    assert top["said"] == pytest.approx(0.95) and top["right"]["count"] == 9
+    low, high = table["false_alarms"]["interval_95"]
+    assert low == pytest.approx(0.0126, abs=1e-3) and high == pytest.approx(0.9874, abs=1e-3)

@@ -1,0 +1,111 @@
+"""`hmmseg diagnose --against`: document, figures, page and refusals."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from commands.diagnose import spread_against
+from commands.main import main
+from simgap.generic.synthetic import ensemble
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A plain ordered task with real trials that carry a large bias, and simulated ones."""
+    rng = np.random.default_rng(7)
+    for name, effects in (("real", {"force_bias": {"value": 1.0}}), ("sim", None)):
+        trials, _ = ensemble(rng, 5, effects, name=name)
+        for trial in trials:
+            pd.DataFrame({"t": trial.t, **trial.channels}).to_csv(tmp_path / trial.file, index=False)
+    (tmp_path / "task.toml").write_text('sequence = ["approach", "press", "hold"]\n')
+    return tmp_path
+
+
+def arguments(folder, *more, count=5):
+    trials = {kind: [str(folder / f"{kind}_{k:02d}.csv") for k in range(count)] for kind in ("real", "sim")}
+    task = ["--task", str(folder / "task.toml")]
+    return ["diagnose", *trials["real"], *task, "--against", *trials["sim"], *more]
+
+
+def test_values_of_against_reach_up_to_the_next_option():
+    given = ["diagnose", "a", "--against", "b", "c", "--task", "d", "e"]
+    assert spread_against(given) == [
+        "diagnose", "a", "--against", "b", "--against", "c", "--task", "d", "e",
+    ]  # fmt: skip
+    again = ["diagnose", "--against", "b", "--against", "c"]
+    assert spread_against(again) == again
+
+
+def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):
+    args = arguments(folder)
+    assert main(args[: args.index("--against")]) == 2
+    line = capsys.readouterr().err
+    assert "--against SIM" in line and line.count("\n") == 1
+
+
+def test_measured_properties_do_not_go_along(folder, capsys):
+    (folder / "actual.toml").write_text("")
+    assert main(arguments(folder, "--actual", str(folder / "actual.toml"))) == 2
+    assert "does not go with --against" in capsys.readouterr().err
+
+
+def test_an_effect_of_the_virtual_model_is_refused(folder, capsys):
+    assert main(arguments(folder, "--effect", "grip_slip")) == 2
+    assert "needs the virtual model" in capsys.readouterr().err
+
+
+def test_a_trial_given_as_both_is_refused(folder, capsys):
+    args = arguments(folder)
+    assert main([*args, str(folder / "real_00.csv")]) == 2
+    assert "the same trial as" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_bias_is_named_with_figures_and_page(folder):
+    outputs = [
+        "--json",
+        str(folder / "d.json"),
+        "--figures",
+        str(folder / "f"),
+        "--report",
+        str(folder / "p.html"),
+    ]
+    assert main(arguments(folder, *outputs, "--quiet")) == 0
+    document = json.loads((folder / "d.json").read_text())
+    assert document["format"] == "hmmseg.diagnose/1"
+    assert (document["verdict"], document["causes"]) == ("named", ["force_bias"])
+    assert document["effects"]["force_bias"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, abs=0.1)
+    assert document["effects"]["force_bias"]["parameters"]["fa"]["unit"] == "unit of fa"
+    assert {row["channel"] for row in document["where"]} == {"fa"}
+    assert document["shrinkage"]["fraction"] > 0.9
+    assert all(
+        (folder / "f" / f"gap_{n}.png").stat().st_size > 5000 for n in ("where", "signal", "before_after")
+    )
+    page = (folder / "p.html").read_text()
+    assert 'id="verdict"' in page and "force_bias" in page
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+
+
+@pytest.mark.slow
+def test_block_tasks_may_be_compared_with_given_trials(shared, tmp_path):
+    """The stand-in's healthy recordings against themselves with fy1 biased."""
+    folder = shared / "recordings/none_1"
+    files = sorted(folder.glob("trial_*.csv"))[:4]
+    for path in files:
+        table = pd.read_csv(path)
+        table["fy1"] += 0.3
+        table.to_csv(tmp_path / f"biased_{path.name}", index=False)
+    biased = sorted(str(p) for p in tmp_path.glob("biased_*.csv"))
+    out = tmp_path / "d.json"
+    args = ["diagnose", *biased, "--task", str(folder / "task.toml"), "--rig", str(folder / "rig.toml"),
+            "--against", *map(str, files), "--json", str(out), "--quiet"]  # fmt: skip
+    assert main(args) == 0
+    document = json.loads(out.read_text())
+    z = {row["channel"] for row in document["where"]}
+    assert document["detection"]["p_value"] < 0.1
+    assert not z or "fy" in z
