@@ -30,6 +30,7 @@ BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for eac
 REALIGNED = 2  # times at most
 REFINED = 6  # candidates fitted again after boundaries moved
 WORTH = 0.6  # a pair must leave no more than this share of what its better half leaves
+MORE = 0.07  # and must gain this share of its evidence over that half, more than a model's form is off by
 ENOUGH = 0.03  # a single that leaves less of the gap needs no partner: no model is exact to the last per cent
 WILD, BUMPS = 5.0, 0.015  # sd; share of samples that may be wilder and be left out
 WORTHY = 50.0  # nats at T = 1 by which the leading candidate must win for boundaries to be taken anew
@@ -120,10 +121,12 @@ def search(
         single, rest = left(given, found[0], healthy, bank)
         flexible = any(catalogue()[name].local for name in found[0].effects)  # free amounts fit others' gaps
         if rest > 0.5 and (single > ENOUGH or flexible):
-            alone = {c.name: left(given, c, healthy, bank)[0] for c in found}
+            singles = tuple(found)
+            alone = {c.name: left(given, c, healthy, bank)[0] for c in singles}
             for pair in _pairs(given, found, healthy, names, temperature):
                 better_half = min(alone.get(name, 1.0) for name in pair.effects)
-                if left(given, pair, healthy, bank)[0] < WORTH * better_half:
+                more = pair.evidence - max(c.evidence for c in singles if c.name in pair.effects)
+                if left(given, pair, healthy, bank)[0] < WORTH * better_half and more > MORE * pair.evidence:
                     found.append(pair)
             found.sort(key=lambda c: -c.evidence)
     return Search(given, healthy, tuple(found), statistics, temperature, tuple(warnings))
