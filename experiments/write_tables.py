@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from experiments import table_blind_check, table_gap
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
@@ -158,6 +159,9 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/calibration.md", "calibration", calibration),
     ("docs/calibration.md", "moves", moves),
     ("docs/calibration.md", "misfits", misfits),
+    ("README.md", "gap", table_gap.readme),
+    ("docs/gap.md", "recordings", table_gap.recordings),
+    ("docs/gap.md", "blind", table_blind_check.table),
 )
 
 

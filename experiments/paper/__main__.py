@@ -11,7 +11,18 @@ import time
 
 from rich.console import Console
 
-SCRIPTS = ("tables", "states", "recording", "estimates", "rigid", "slip", "replay", "virtual_block", "alike")
+SCRIPTS = (
+    "tables",
+    "states",
+    "recording",
+    "estimates",
+    "rigid",
+    "slip",
+    "replay",
+    "virtual_block",
+    "alike",
+    "paper_gap",
+)
 
 
 def main() -> None:

@@ -1,0 +1,61 @@
+"""Tables of the diagnosis: labelled recordings, and the blind check."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from experiments.table_text import load, markdown
+
+
+def recordings() -> str | None:
+    """docs/gap.md: verdicts on labelled recordings."""
+    rows = load("gap_recordings")
+    if rows is None:
+        return None
+    head = ["recording", "verdict without `actual`", "with `actual`", "parameters found (90 % interval)",
+            "true", "time"]  # fmt: skip
+    return markdown(head, [_row(row) for row in rows])
+
+
+def _row(row: dict[str, Any]) -> list[str]:
+    found = {k: v for k, v in row["actual"]["parameters"].items() if len(row["actual"]["parameters"]) <= 4}
+    values = "; ".join(
+        f"{k} {mean:.4g} {unit} ({low:.4g} to {high:.4g})" for k, (mean, low, high, unit) in found.items()
+    )
+    truth = "; ".join(f"{k} {_shown(v)}" for k, v in row["truth"].items())
+    return [row["case"], _verdict(row["blind"]), _verdict(row["actual"]), values, truth,
+            f"{row['blind']['wall']:.0f} s"]  # fmt: skip
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return "(" + ", ".join(_shown(v) for v in value) + ")"
+    return f"{value:.4g}" if isinstance(value, int | float) else str(value)
+
+
+def _verdict(found: dict[str, Any]) -> str:
+    if found["verdict"] == "set":
+        return f"set: {', '.join(found['causes'] + found['partners'])}"
+    return " + ".join(found["causes"]) or found["verdict"]
+
+
+def readme() -> str | None:
+    """README: how often the diagnosis is right."""
+    rows = load("gap_recordings")
+    if rows is None:
+        return None
+    affected = [r for r in rows if r["effects"]]
+    healthy = [r for r in rows if not r["effects"]]
+    right = {
+        k: sum(r[k]["causes"] == r["effects"] and r[k]["verdict"] == "named" for r in affected)
+        for k in ("blind", "actual")
+    }
+    sets = sum(r["blind"]["verdict"] == "set" and r["effects"][0] in r["blind"]["causes"] for r in affected)
+    quiet = sum(r["blind"]["verdict"] == "none" and r["actual"]["verdict"] == "none" for r in healthy)
+    slowest = max(r["blind"]["wall"] for r in rows)
+    return (
+        f"On {len(rows)} labelled recordings of the stand-in, which were in view while it was built: "
+        f"{quiet} of {len(healthy)} healthy ones called healthy; of {len(affected)} with one effect "
+        f"{right['blind']} named without knowing the blocks' properties ({sets} more as a set that holds "
+        f"the cause), {right['actual']} with them; {slowest:.0f} s at most for four trials in a warm process."
+    )
