@@ -7,6 +7,7 @@ import subprocess
 
 import pytest
 
+from commands.demo import DATA
 from commands.main import main
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -18,13 +19,12 @@ HEADLESS = (
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
 def test_the_page_opens_in_a_browser(tmp_path):
-    folder = "commands/demo_data"
-    trials = [f"{folder}/trial_0{k}.csv" for k in (1, 2)]
+    trials = [str(DATA / f"trial_0{k}.csv") for k in (1, 2)]
     page = tmp_path / "gap.html"
     rig = tmp_path / "rig.toml"
-    text = open(f"{folder}/rig.toml", encoding="utf-8").read()
+    text = (DATA / "rig.toml").read_text(encoding="utf-8")
     rig.write_text(text.replace("normal_stiffness = 4000.0", "normal_stiffness = inf"), encoding="utf-8")
-    args = ["--task", f"{folder}/task.toml", "--rig", str(rig), "--report", str(page), "--quiet"]
+    args = ["--task", str(DATA / "task.toml"), "--rig", str(rig), "--report", str(page), "--quiet"]
     assert main(["diagnose", *trials, *args]) == 0
     assert BROWSER is not None
     command = [BROWSER, *HEADLESS, f"--user-data-dir={tmp_path / 'profile'}"]
