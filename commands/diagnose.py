@@ -174,13 +174,18 @@ def _draw(out: Output, found, measured) -> None:
         out.stage(out.report).write_text(page(found, sentence(found.body), measured), encoding="utf-8")
 
 
+def p_text(p: float) -> str:
+    """A p value; what is too small to be told apart is only bounded."""
+    return f"p = {p:.2g}" if p > 1e-16 else "p < 1e-16"
+
+
 def sentence(body: dict[str, Any]) -> str:
     """The verdict in a sentence."""
-    p, causes = body["detection"]["p_value"], " and ".join(body["causes"])
+    p, causes = p_text(body["detection"]["p_value"]), " and ".join(body["causes"])
     if body["verdict"] == "none":
-        return f"No gap beyond the sensors' noise was found (p = {p:.2g})."
+        return f"No gap beyond the sensors' noise was found ({p})."
     if body["verdict"] == "unknown":
-        return f"There is a gap (p = {p:.2g}) that none of the candidate effects explains."
+        return f"There is a gap ({p}) that none of the candidate effects explains."
     shrinkage, far = body["shrinkage"], ""
     if shrinkage is not None and shrinkage["fraction"] is not None:
         percent = f"{100 * shrinkage['fraction']:.0f} %"

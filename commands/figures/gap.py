@@ -146,7 +146,7 @@ def draw_before_after(found: Diagnosis, path: Path) -> None:
 def draw_probabilities(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
     """The probabilities of the likeliest explanations."""
     rows = sorted(found.body["probabilities"].items(), key=lambda item: -item[1])[:8][::-1]
-    with canvas(path, width=5.0, height=2.4) as figure:
+    with canvas(path, height=2.0) as figure:
         axes = figure.add_subplot()
         axes.barh([name for name, _ in rows], [value for _, value in rows], color=BLUE)
         axes.set(xlim=(0, 1), xlabel="probability")
