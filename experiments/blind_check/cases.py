@@ -18,7 +18,7 @@ from experiments.blind_check.signals import Sampling, noise_of_channels, sample,
 TRIALS = 4
 TRIES = 12
 # Shares of the tiers; effects too small to see come about by themselves among single effects.
-TIERS = {"healthy": 100, "single": 120, "pair": 30, "outside": 25, "withheld": 25}
+TIERS = {"healthy": 300, "single": 138, "pair": 40, "outside": 36, "withheld": 36}
 SUBTASKS = (
     "pregrasp block1", "pickup block1", "carry block1", "place block1", "pregrasp block2",
     "pickup block2", "carry block2", "place block2", "release block2",

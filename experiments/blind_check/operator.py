@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.blind_check.scene import PIVOT, STEP, Block, Servo, World
+from experiments.blind_check.scene import PIVOT, STEP, TIP, Block, Servo, World
 
 CLEAR = 0.012  # m between a carried block and what it passes over
+OPEN = (0.010, 0.013)  # m that fingers are opened wider than a block
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,9 @@ def plan(blocks: dict[str, Block], world: World, style: Style, rng: np.random.Ge
     pace = u(*style.pace)
     stiffness = u(600.0, 1000.0)
     servos = tuple(_servo(stiffness * u(0.95, 1.05), u(0.10, 0.16), u(0.8, 1.1)) for _ in (0, 1))
-    here, there = u(0.108, 0.122), u(0.152, 0.166)
+    here = u(0.106, 0.118)
+    # Far enough off that a finger opened around block2 passes block1 where it was put down.
+    there = here + (first.width + second.width + OPEN[1]) / 2 + 2 * TIP + u(0.005, 0.014)
     lean = u(-0.0008, 0.0008)
     slope = np.tan(world.tilt)
     low = second.height / 2 + slope * (here - PIVOT)
@@ -89,7 +92,7 @@ def plan(blocks: dict[str, Block], world: World, style: Style, rng: np.random.Ge
         "block1": (here + lean, slope * (here - PIVOT) + second.height + first.height / 2),
     }
     top = centres["block1"][1] + first.height / 2
-    x0, y0, open0 = here + u(-0.015, 0.02), top + u(0.012, 0.02), first.width + u(0.010, 0.013)
+    x0, y0, open0 = here + u(-0.015, 0.02), top + u(0.012, 0.02), first.width + u(*OPEN)
     k = _Knots(x0, y0, open0)
     k.wait(u(*style.rest) / pace)
     ground = slope * (there - PIVOT) + first.height / 2
@@ -119,7 +122,7 @@ def _move(k: _Knots, block: Block, start, end, top: float, world: World, stiffne
     u = rng.uniform
     grasp = u(*style.height)
     over = max(top + block.height / 2 + CLEAR + 0.004, k.value["y"])
-    wide = block.width + u(0.010, 0.013)
+    wide = block.width + u(*OPEN)
     k.to(u(0.25, 0.35) / pace, y=over, opening=max(wide, k.value["opening"]))
     k.to(u(0.5, 0.65) / pace, early=0.1 / pace, x=start[0] + u(-0.0006, 0.0006))
     k.to(u(0.45, 0.6) / pace, early=0.02 / pace, y=start[1] + grasp, opening=wide)
