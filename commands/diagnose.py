@@ -48,6 +48,20 @@ ModelFile = Annotated[
     Path | None,
     typer.Option("--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit."),
 ]
+CalibrateOption = Annotated[
+    bool,
+    typer.Option(
+        "--calibrate",
+        help="Learn what healthy recordings of this rig and task look like from simulations of them "
+        "(a minute or two, once).",
+    ),
+]
+BANKS = {
+    "nominal": "Judged by healthy simulations of the paper's hand.",
+    "bootstrap": "Judged by healthy simulations of the paper's hand, thresholds moved to this rig and task "
+    "by a linearised bootstrap; --calibrate simulates them instead.",
+    "calibrated": "Judged by healthy simulations of this rig and task.",
+}
 
 
 def spread_against(args: list[str]) -> list[str]:
@@ -71,6 +85,7 @@ def diagnose(
     effect: EffectOption = None,
     against: AgainstOption = None,
     model: ModelFile = None,
+    calibrate: CalibrateOption = False,
     json: JsonOption = None,
     figures: FiguresOption = None,
     report: ReportOption = None,
@@ -82,6 +97,8 @@ def diagnose(
         paths = distinct_trials(trials)
         description = read_task(task)
         if against:
+            if calibrate:
+                raise InputError("--calibrate", "does not go with --against: no virtual model is used")
             _against(out, paths, against, description, rig, actual, effect or [], model)
             return
         if not isinstance(description, BlockTask):
@@ -92,11 +109,17 @@ def diagnose(
             raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
         from hmmseg.rig import read_rig
 
-        out.finish(run(out, paths, description, read_rig(rig), actual, effect or []))
+        out.finish(run(out, paths, description, read_rig(rig), actual, effect or [], calibrate))
 
 
 def run(
-    out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig, actual: Path | None, effect: Sequence[str]
+    out: Output,
+    paths: Sequence[Path],
+    task: BlockTask,
+    rig: Rig,
+    actual: Path | None,
+    effect: Sequence[str],
+    calibrate: bool = False,
 ) -> dict[str, Any]:
     """Diagnose, put table, figures and page where `out` has them go, and give the document."""
     from estimation.actual import read_actual
@@ -108,13 +131,23 @@ def run(
     measured = None if actual is None else read_actual(actual, task.objects)
     forced = [effect_named(name).name for name in dict.fromkeys(effect)]
     recordings = [read_trial(path, rig) for path in paths]
+    bank = _own_bank(out, recordings, task, rig) if calibrate else None
     with out.progress("diagnosing", total=STAGES) as advance:
-        found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1))
+        found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1), bank)
     for warning in found.warnings:
         out.warn(warning)
-    out.print(sentence(found.body), *tables(found.body))
+    out.print(sentence(found.body), BANKS[found.body["detection"]["bank"]], *tables(found.body))
     _draw(out, found, measured)
     return found.body
+
+
+def _own_bank(out: Output, recordings, task: BlockTask, rig: Rig):
+    """The bank learned on this rig and task, now or before."""
+    from simgap.gap.calibrate import steps
+    from simgap.gap.own_bank import own_bank
+
+    with out.progress("simulating healthy recordings", total=steps()) as advance:
+        return own_bank(recordings, task, rig, lambda text: advance(1))
 
 
 def _against(
@@ -171,7 +204,8 @@ def _draw(out: Output, found, measured) -> None:
     if out.figures is not None:
         draw_all(found, out.figure)
     if out.report is not None:
-        out.stage(out.report).write_text(page(found, sentence(found.body), measured), encoding="utf-8")
+        told = f"{sentence(found.body)} {BANKS[found.body['detection']['bank']]}"
+        out.stage(out.report).write_text(page(found, told, measured), encoding="utf-8")
 
 
 def p_text(p: float) -> str:

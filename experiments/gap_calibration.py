@@ -32,7 +32,8 @@ from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import DEFAULT_MISFIT, Calibration
 from simgap.gap.verdict import likelihoods
 
-SIMPLEX = np.array([[0, 0, 0], [2, 0, 0], [0, -1, 0], [0, 0, 0.7]])
+RARE = 0.4  # weight of a case from outside: the bank has as many as of the catalogue, the world fewer
+WEAK = np.array([3.0, 2.0, 1.0, 1.5, 1.0])  # sd of a weak prior about the first guess of each constant
 
 
 def finished(file: Path) -> dict[str, dict[str, Any]]:
@@ -57,15 +58,16 @@ def run(folder: Path, rounds: int, rig, task: BlockTask, first: int = 5000, coun
         except (InputError, ValueError) as error:  # a motion that this hand cannot make
             print(name, "not drawn:", error, file=sys.stderr)
             continue
+        told = {"case": name, "effects": case.effects, "values": case.values, "excluded": case.excluded}
         start = time.perf_counter()
         try:
-            found = diagnose(case.trials, task, rig)
+            found = diagnose(case.trials, task, rig, excluded=case.excluded)
         except InputError as error:
-            row = {"case": name, "effects": case.effects, "values": case.values, "refused": str(error)}
+            row = {**told, "refused": str(error)}
         else:
             row = {
-                "case": name, "effects": case.effects, "values": case.values, "size": case.size,
-                "seconds": time.perf_counter() - start, "body": found.body, "warnings": found.warnings,
+                **told, "size": case.size, "seconds": time.perf_counter() - start, "body": found.body,
+                "warnings": found.warnings,
                 "scores": found.scores,
             }  # fmt: skip
         with file.open("a", encoding="utf-8") as sink:
@@ -105,24 +107,30 @@ def misfits(rows: Sequence[dict[str, Any]], before: Calibration) -> dict[str, fl
 def unknown(rows: Sequence[dict[str, Any]], start: Calibration) -> Calibration:
     """The calibration of "unknown" and of the prior with the largest mean log probability of the truth."""
 
+    def placed(x: np.ndarray) -> Calibration:
+        at, width = np.exp(x[1:3])
+        return replace(start, prior=round(float(x[0]), 2), unknown_at=round(float(at), 4),
+                       unknown_width=round(float(width), 3), unknown_slope=round(float(x[3]), 3),
+                       unknown_coarse=round(float(np.exp(x[4])), 2))  # fmt: skip
+
     def log_score(x: np.ndarray) -> float:
-        c = replace(start, prior=x[0], unknown_at=float(np.exp(x[1])), unknown_width=float(np.exp(x[2])))
+        c = placed(x)
         total = 0.0
         for row in rows:
             if "scores" not in row:
                 continue
             s = row["scores"]
-            p = likelihoods(s["evidence"], min(1.0, 3 * min(s["p"].values())), s["left"], s["significant"], c)
-            alien = any(n.startswith("outside:") for n in row["effects"])
+            p = likelihoods(s["evidence"], min(1.0, 3 * min(s["p"].values())), s["left"], s["p_left"], c)
+            alien = row["excluded"] or any(n.startswith("outside:") for n in row["effects"])
             right = "unknown" if alien else "+".join(row["effects"]) or "none"
-            total += np.log(max(p.get(right, 0.0), 0.01))
-        return -total
+            total += (RARE if alien else 1.0) * np.log(max(p.get(right, 0.0), 0.01))
+        return -total + 0.5 * float((((x - first) / WEAK) ** 2).sum())
 
-    first = np.array([start.prior, np.log(start.unknown_at), np.log(start.unknown_width)])
-    best = minimize(log_score, first, method="Nelder-Mead", options={"initial_simplex": first + SIMPLEX})
-    prior, at, width = best.x
-    return replace(start, prior=round(float(prior), 2), unknown_at=round(float(np.exp(at)), 3),
-                   unknown_width=round(float(np.clip(np.exp(width), 0.15, 1.0)), 3))  # fmt: skip
+    first = np.array([-4.0, np.log(0.05), np.log(0.6), 1.0, 1.0])
+    simplex = first + np.vstack([np.zeros(5), np.diag([2.0, -1.0, 0.7, 1.0, 1.0])])
+    best = minimize(log_score, first, method="Nelder-Mead",
+                    options={"initial_simplex": simplex, "maxiter": 2000})  # fmt: skip
+    return placed(best.x)
 
 
 def learn(folder: Path) -> None:

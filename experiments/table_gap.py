@@ -1,10 +1,16 @@
-"""Tables of the diagnosis: labelled recordings, and the blind check."""
+"""Tables of the diagnosis: labelled recordings, other rigs, and the blind check."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from experiments.table_text import load, markdown, percent
+
+BANKS = {
+    "nominal": "nominal bank",
+    "bootstrap": "bootstrap",
+    "calibrated": "calibrated",
+}
 
 
 def recordings() -> str | None:
@@ -37,6 +43,20 @@ def _verdict(found: dict[str, Any]) -> str:
     if found["verdict"] == "set":
         return f"set: {', '.join(found['causes'] + found['partners'])}"
     return " + ".join(found["causes"]) or found["verdict"]
+
+
+def rigs() -> str | None:
+    """docs/gap.md: false alarms on other rigs by the bank that judges them."""
+    found = load("gap_rigs")
+    if found is None:
+        return None
+    head = ["rig or task", "healthy cases"]
+    head += [f"{bank}, p < {level}" for bank in BANKS.values() for level in found["levels"]]
+    rows = [
+        [name, f"{row['cases']}"] + [percent(share, 0) for bank in BANKS for share in row[bank]["below"]]
+        for name, row in found["rigs"].items()
+    ]
+    return markdown(head, rows)
 
 
 def readme() -> str | None:

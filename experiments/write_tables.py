@@ -161,6 +161,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/calibration.md", "misfits", misfits),
     ("README.md", "gap", table_gap.readme),
     ("docs/gap.md", "recordings", table_gap.recordings),
+    ("docs/gap.md", "rigs", table_gap.rigs),
     ("docs/gap.md", "blind", table_blind_check.table),
 )
 

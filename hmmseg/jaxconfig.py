@@ -15,12 +15,13 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
+    """The user's cache folder of this project, which may be yet to be made."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "hmmseg" / "jax"
+    return Path(base) / "hmmseg"
 
 
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-    jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
+    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

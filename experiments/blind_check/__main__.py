@@ -1,6 +1,6 @@
 """The blind check of `hmmseg diagnose` on a second simulator's recordings.
 
-    python -m experiments.blind_check generate --cases 300 --seed S --out DIR
+    python -m experiments.blind_check generate --cases 550 --seed S --out DIR
     python -m experiments.blind_check diagnose --cases DIR/cases --out RESULTS
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
 
@@ -30,7 +30,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     steps = parser.add_subparsers(dest="step", required=True)
     make = steps.add_parser("generate")
-    make.add_argument("--cases", type=int, default=300)
+    make.add_argument("--cases", type=int, default=550)
     make.add_argument("--seed", type=int, required=True)
     make.add_argument("--out", type=Path, required=True)
     run = steps.add_parser("diagnose")

@@ -20,7 +20,7 @@ TRIES = 12
 # Shares of the tiers; effects too small to see come about by themselves among single effects.
 TIERS = {"healthy": 300, "single": 138, "pair": 40, "outside": 36, "withheld": 36}
 SUBTASKS = (
-    "pregrasp block1", "pickup block1", "carry block1", "place block1", "pregrasp block2",
+    "pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1",
     "pickup block2", "carry block2", "place block2", "release block2",
 )  # fmt: skip
 HOLDS = 2.2  # a block is no heavier than this times the pads' friction, N: or it would be dropped

@@ -6,6 +6,7 @@ Done after the seal is opened, since the same blocks and effects have to be reco
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ KNOWN = {f.name for f in fields(Style)}
 def follow(folder: Path, results: Path, progress=None) -> list[dict[str, Any]]:
     """One entry for every case whose verdict is a set that holds the true cause; written case by case.
 
-    `separated`: the new recordings are given the true cause and no other.
+    `separated`: old and new recordings together are given the true cause and no other.
     """
     out = []
     for entry in unseal(folder)["cases"]:
@@ -37,6 +38,8 @@ def follow(folder: Path, results: Path, progress=None) -> list[dict[str, Any]]:
         file = place / "diagnosis.json"
         if not file.exists():
             _record(entry, found["next_experiment"], place)
+            for old in sorted((folder / "cases" / entry["case"]).glob("trial_*.csv")):
+                shutil.copy(old, place / old.name.replace("trial_", "trial_1"))
             file.write_text(json.dumps(diagnose_folder(place)) + "\n", encoding="utf-8")
             if progress is not None:
                 progress(entry["case"])

@@ -87,7 +87,7 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any], oracle: Oracle | No
         "said": said,
         "partners": sorted(found["indistinguishable"]),
         "gain": gain,
-        "above": gain is not None and gain >= FLOOR,
+        "above": gain is not None and gain >= FLOOR and seen_each(entry, found),
         "right": said == true and found["verdict"] in ("none", "named", "set"),
         "right_set": set(true) <= together and len(said) == max(len(true), 1),
         "probability": found["probabilities"].get(label(entry), 0.0),
@@ -97,7 +97,7 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any], oracle: Oracle | No
     if entry["tier"] == "outside":
         row["right"] = row["right_set"] = found["verdict"] == "unknown"
     if entry["tier"] == "withheld":
-        shared = bool(together & partners(entry)) and len(said) == 1
+        shared = bool(together & stand_ins(entry, found)) and len(said) == 1
         row["right"] = row["right_set"] = found["verdict"] == "unknown" or shared
     row["top"] = _top(entry, found)
     if row["right"] and true and entry["tier"] in ("single", "pair"):
@@ -106,6 +106,18 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any], oracle: Oracle | No
         row["cells"] = _cells(entry, found)
     row["shrinkage"] = _shrunk(found, best["fraction"])
     return row
+
+
+def seen_each(entry: dict[str, Any], found: dict[str, Any]) -> bool:
+    """Whether each effect of a pair lies above the floor by itself, where the scorer knows that."""
+    return entry["tier"] != "pair" or all(found["gains"].get(n, FLOOR) >= FLOOR for n in entry["effects"])
+
+
+def stand_ins(entry: dict[str, Any], found: dict[str, Any]) -> set[str]:
+    """Effects that may stand for a withheld one: its partners, and what predicts held-out trials as well."""
+    gains, (name,) = found["gains"], entry["effects"]
+    own = gains.get(name, np.inf)
+    return partners(entry) | {k for k, v in gains.items() if k != name and v >= own - FLOOR}
 
 
 def _true_fit(entry: dict, found: dict, oracle: Oracle | None) -> dict[str, float | None]:
@@ -138,7 +150,7 @@ def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
     name = max(known, key=lambda k: known[k])
     right = name == label(entry)
     if entry["tier"] == "withheld":
-        right = right or name in partners(entry)
+        right = right or name in stand_ins(entry, found)
     return float(known[name]), right
 
 

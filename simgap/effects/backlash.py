@@ -54,4 +54,5 @@ EFFECT = Effect(
     stage=KINEMATICS,
     correct=_correct,
     apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (play(q, v["width"]), dq)),
+    coarse=True,
 )

@@ -127,7 +127,8 @@ class Effect:
     `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
     scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
     `local` counts free amounts per grip of a trial. `chosen` is false for effects that only
-    `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them.
+    `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them. `coarse`
+    effects act between samples: their form holds to a per cent or so, the others' to far less.
     """
 
     name: str
@@ -145,6 +146,7 @@ class Effect:
     chosen: bool = True
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
     random: bool = False
+    coarse: bool = False
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""

@@ -33,8 +33,8 @@ EFFECT = Effect(
     shows="shear and net force follow the grip",
     mistaken_for=("sensor_rotation",),
     parameters=(
-        Parameter("fy_from_fx", "1", 0.06, low=-0.4, high=0.4),
-        Parameter("fx_from_fy", "1", 0.06, low=-0.4, high=0.4),
+        Parameter("fy_from_fx", "1", 0.06, low=-0.2, high=0.2),
+        Parameter("fx_from_fy", "1", 0.06, low=-0.2, high=0.2),
     ),
     stage=MIX,
     correct=_correct,

@@ -22,4 +22,5 @@ EFFECT = Effect(
     stage=FILTER,
     correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + v["delay"]),
     apply=_apply,
+    coarse=True,
 )

@@ -25,4 +25,5 @@ EFFECT = Effect(
     stage=FILTER,
     correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(smoothing=w.smoothing + v["time_constant"]),
     apply=_apply,
+    coarse=True,
 )

@@ -48,4 +48,5 @@ EFFECT = Effect(
     correct=_correct,
     local=1,
     scene=lambda v: {"friction": v["mu"]},
+    coarse=True,
 )

@@ -70,4 +70,5 @@ EFFECT = Effect(
     correct=_correct,
     apply=_apply,
     report=_report,
+    coarse=True,
 )

@@ -13,14 +13,17 @@ from simgap.gap.affected import shifts
 from simgap.gap.fit import Fitted, Problem, slots
 from simgap.gap.frame import CHANNELS
 from simgap.gap.judge import Calibration
-from simgap.gap.locate import BANDS, Cell, subtask_name
+from simgap.gap.locate import BANDS, Cell, normal_score, subtask_name
 from simgap.gap.search import Candidate
 from simgap.gap.shrinkage import folds_of
 
 PROPERTIES = ("weight", "width", "height")
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 DRAWS = 400
-AFFECTED = 3.0  # sds of one sample
+AFFECTED, SEEN = (
+    3.0,
+    2.0,
+)  # sds of one sample: shift of a cell that is listed for it; with a significant score
 
 
 def describe(
@@ -101,26 +104,35 @@ def where(
 ) -> list[dict[str, Any]]:
     """Significant cells, largest share of the excess first.
 
-    Where the cause is named they are the cells that it shifts by AFFECTED sds of a sample, and those
-    that it takes out of the noise; else those above the threshold, whatever made them.
+    Where the cause is named they are the cells that it shifts by AFFECTED sds of a sample, and those above
+    the threshold that it shifts by SEEN or scatters; else those above the threshold, whatever made them.
+    Shares are of what the model leaves in them: a shift that the properties absorb has none.
     """
     rows: dict[tuple, tuple[float, float]] = {}  # trial, channel, subtask, band -> excess, z
-    moved = None if candidate is None else shifts(given, candidate.fitted.effects, candidate.fitted.u)
+    shape = (given.frame.num_trials, len(given.frame.steps), len(CHANNELS))
+    mean, rms = np.zeros(shape), np.full(shape, np.inf)
+    if candidate is not None:
+        mean, rms = shifts(given, candidate.fitted.effects, candidate.fitted.u)
+    anywhere = candidate is None or candidate.spread is not None  # scatter has no place of its own
     lowest = {(k.trial, k.channel, k.subtask): k for k in found if k.band[0] == 0.0}
     for k in found:
-        shift = np.inf if moved is None else moved[k.trial, k.subtask, CHANNELS.index(k.channel)]
-        if k.z > threshold and (shift >= 1.0 or k.band[0] > 0.0):
-            rows[k.trial, k.channel, k.subtask, k.band] = (k.energy - k.count, k.z)
-    for r, s, c in np.argwhere(moved >= AFFECTED) if moved is not None else ():
-        cell, shift = lowest.get((r, CHANNELS[c], s)), float(moved[r, s, c])  # type: ignore[index]
+        at = k.trial, k.subtask, CHANNELS.index(k.channel)
+        moved = (mean if k.band[0] == 0.0 else rms)[at]
+        if k.z > threshold and (anywhere or moved >= SEEN):
+            rows[k.trial, k.channel, k.subtask, k.band] = (max(k.energy - k.count, 0.0), k.z)
+    for r, s, c in np.argwhere(mean >= AFFECTED):
+        cell, shift = lowest.get((r, CHANNELS[c], s)), float(mean[r, s, c])
         count = int((given.frame.arrays.subtask[r, : given.frame.lengths[r]] == s).sum())
         band = (0.0, BANDS[1]) if cell is None else cell.band
-        rows.setdefault((int(r), CHANNELS[c], int(s), band), (count * shift**2, shift * np.sqrt(count)))
-    total = sum(excess for excess, _ in rows.values())
+        excess = 0.0 if cell is None else max(cell.energy - cell.count, 0.0)
+        z = float(normal_score(count * (1 + shift**2), count))
+        rows.setdefault((int(r), CHANNELS[c], int(s), band), (excess, z))
+    ranked = sorted(rows.items(), key=lambda row: (-row[1][0], -row[1][1]))
+    total = max(sum(excess for excess, _ in rows.values()), 1e-12)
     return [
         {
             "trial": given.frame.files[r], "channel": channel, "subtask": subtask_name(given.frame.steps[s]),
             "band": list(band), "share": excess / total, "z": z,
         }
-        for (r, channel, s, band), (excess, z) in sorted(rows.items(), key=lambda row: -row[1][0])
+        for (r, channel, s, band), (excess, z) in ranked
     ]  # fmt: skip

@@ -12,6 +12,7 @@ from hmmseg.rig import Rig
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
 from simgap.gap import judge
+from simgap.gap.adapt import adapted
 from simgap.gap.bank import Bank, load_bank
 from simgap.gap.describe import describe, property_values, where
 from simgap.gap.experiments import next_experiment
@@ -61,32 +62,35 @@ def diagnose(
     """Diagnose recordings of one block task against the nominal model.
 
     `actual` as `estimation.actual.read_actual` gives it; `forced` names effects to be taken instead of
-    choosing; `excluded` effects are not thought of. InputError where no trial fits its task.
+    choosing; `excluded` effects are not thought of. `bank` is the package's own by default; where it has a
+    reference and that is another rig's, its thresholds are moved. InputError where no trial fits its task.
     """
     tell = progress or (lambda text: None)
     bank = bank or load_bank()
     found = search(trials, task, rig, bank, actual, forced, excluded, tell)
+    bank = adapted(bank, found.problem, found.healthy, trials)
     tell("held-out trials")
     given, best = found.problem, found.candidates[0]
     p = bank.detection.p_values(found.statistics | {"gain": best.evidence})
     p_value = min(1.0, len(p) * min(p.values()))
-    rest, significant = left(given, best, found.healthy, bank)
+    rest, p_left = left(given, best, found.healthy, bank)
     scores = {
         "evidence": {c.name: c.evidence for c in found.candidates},
-        "left": rest, "significant": significant, "p": p,
+        "left": rest, "p_left": p_left, "p": p,
     }  # fmt: skip
-    probability = likelihoods(scores["evidence"], p_value, rest, significant, bank.calibration)
+    probability = likelihoods(scores["evidence"], p_value, rest, p_left, bank.calibration)
     verdict, causes, partners = choose(probability, found, p_value < ALARM, bool(forced))
     before = residual_at(given, (), found.healthy.u)
     chosen = next((c for c in found.candidates if causes and c.name == judge.joined(causes)), None)
     every = cells(given, before)
-    named = {judge.joined(causes), *partners}
-    shown = [c for k, c in enumerate(found.candidates) if k < LISTED or c.name in named]
+    among = {*causes, *partners}
+    alike = [c for c in found.candidates if len(c.effects) == len(causes) and among >= set(c.effects)]
+    shown = [c for k, c in enumerate(found.candidates) if k < LISTED or c in alike]
     effects = {c.name: describe(given, c, found.healthy, bank.calibration, seed) for c in shown}
     following = None
-    if verdict == "set" and len(causes) == 1:
+    if verdict == "set":
         tell("the next experiment")
-        following = _following(found, causes[0], partners, effects, bank, seed)
+        following = _following(found, alike, effects, bank, seed)
     warnings = found.warnings
     if given.frame.num_trials == 1:
         warnings = (*warnings, "one trial: held out by moves, which is weaker than by trials")
@@ -95,7 +99,7 @@ def diagnose(
         "causes": causes,
         "indistinguishable": partners,
         "probabilities": listed(probability),
-        "detection": {"p_value": p_value, "statistic": found.statistics["cell"]},
+        "detection": {"p_value": p_value, "statistic": found.statistics["cell"], "bank": bank.source},
         "where": where(given, every, CELL, chosen) if p_value < ALARM else [],
         "effects": effects,
         "shrinkage": None if chosen is None else shrinkage(given, found.healthy, chosen, before, bank, seed),
@@ -107,14 +111,13 @@ def diagnose(
 
 
 def _following(
-    found: Search,
-    cause: str,
-    partners: Sequence[str],
-    effects: dict[str, Any],
-    bank: Bank,
-    seed: int,
+    found: Search, alike: Sequence[Candidate], effects: dict[str, Any], bank: Bank, seed: int
 ) -> dict[str, Any] | None:
-    """The experiment that would best tell the cause from its partners."""
-    values = {n: {k: p["mean"] for k, p in effects[n]["parameters"].items()} for n in (cause, *partners)}
-    properties = property_values(found.problem, found.candidates[0].fitted)
-    return next_experiment(found.problem, cause, values, properties, bank, seed)
+    """The experiment that would best tell the first of some candidates from the others."""
+    cause, *partners = alike
+    values: dict[str, dict[str, float]] = {name: {} for name in cause.effects}
+    for key, p in effects[cause.name]["parameters"].items():
+        *prefix, name = key.split(".")  # those of a pair are written effect.parameter
+        values[prefix[0] if prefix else cause.name][name] = p["mean"]
+    properties = property_values(found.problem, cause.fitted)
+    return next_experiment(found.problem, values, [c.effects for c in partners], properties, bank, seed)

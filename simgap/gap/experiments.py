@@ -7,6 +7,7 @@ two after properties and nuisances have done their best (Chaloner & Verdinelli, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,10 +18,10 @@ from hmmseg.segmentation import align_trials
 from hmmseg.signals import task_space
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
-from simgap.gap.fit import Problem, Start, fit, neutral, problem
+from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem
 from simgap.gap.frame import build
 from simgap.gap.spread import spreads
-from simgap.gap.synthetic import performed, recorded
+from simgap.gap.synthetic import Values, performed, recorded
 from simgap.operator import OperatorSettings
 from simgap.properties import Block, Blocks
 from simgap.writing import task_table
@@ -56,26 +57,25 @@ EXPERIMENTS = (
 
 def next_experiment(
     given: Problem,
-    cause: str,
-    values: dict[str, dict[str, float]],
+    cause: Values,
+    partners: Sequence[tuple[str, ...]],
     properties: np.ndarray,
     bank: Bank,
     seed: int,
 ) -> dict[str, Any] | None:
     """The experiment of the largest expected gain [nats], or None where none can be simulated.
 
-    `values` holds the parameters of the cause and of those it cannot be told from; `properties`
-    (objects, 3) what is thought of the blocks.
+    `cause` holds the parameters of each effect that acts, `partners` the explanations that cannot be told
+    from them; `properties` (objects, 3) what is thought of the blocks.
     """
     frame = given.frame
-    if not (properties > LEAST).all() or cause not in values:
+    if not (properties > LEAST).all():
         return None
     blocks = {n: Block(*map(float, p)) for n, p in zip(frame.task.objects, properties, strict=True)}
-    partners = [n for n in values if n != cause]
     best: tuple[float, Experiment] | None = None
     for experiment in EXPERIMENTS:
         try:
-            gain = _gain(given, experiment, blocks, {cause: values[cause]}, partners, bank, seed)
+            gain = _gain(given, experiment, blocks, cause, partners, bank, seed)
         except (InputError, ValueError):  # this rig or these blocks do not allow it
             continue
         if best is None or gain > best[0]:
@@ -85,7 +85,7 @@ def next_experiment(
     gain, chosen = best
     return {
         "do": chosen.do,
-        "separates": sorted([cause, *partners]),
+        "separates": sorted({*cause, *(name for each in partners for name in each)}),
         "expected_gain_nats": float(gain),
         "task": task_table(frame.task),
         "operator": {k: list(v) for k, v in chosen.operator.items()},
@@ -96,8 +96,8 @@ def _gain(
     given: Problem,
     experiment: Experiment,
     blocks: Blocks,
-    truth: dict[str, dict[str, float]],
-    partners: list[str],
+    truth: Values,
+    partners: Sequence[tuple[str, ...]],
     bank: Bank,
     seed: int,
 ) -> float:
@@ -115,9 +115,13 @@ def _gain(
         }
     asked = problem(build(trials, aligned, rig), bank.noise, actual)
     healthy = fit(asked, [Start((), neutral(asked))])[0]
-    names = [*truth, *partners]
-    shifting = deterministic(names)
-    cost = {f.effects[0]: f.cost for f in best_fits(asked, [(n,) for n in shifting], healthy)}
-    cost |= {s.effect: healthy.cost - s.evidence for s in spreads(asked, healthy) if s.effect in names}
-    cause, *others = (cost[n] for n in names)
+    cause, *others = (_cost(asked, healthy, names) for names in (tuple(truth), *partners))
     return min(others) - cause
+
+
+def _cost(asked: Problem, healthy: Fitted, names: tuple[str, ...]) -> float:
+    """What effects leave when fitted together, those that scatter on top of those that shift."""
+    shifting = tuple(sorted(deterministic(names)))
+    fitted = best_fits(asked, [shifting], healthy)[0] if shifting else healthy
+    scattering = [s for s in spreads(asked, fitted) if s.effect in names]
+    return fitted.cost - sum(s.evidence for s in scattering)

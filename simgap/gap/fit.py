@@ -241,13 +241,8 @@ def fit(given: Problem, starts: Sequence[Start], steps: int = STEPS) -> list[Fit
 
 def _fit_one(given: Problem, start: Start, steps: int) -> Fitted:
     """One candidate; coordinates stay within their limits."""
-    total = len(start.u)
     mine = columns_of(given, start.effects)
-    extra = len(mine) - given.num_properties
-    if extra > LARGE:
-        raise ValueError(f"{'+'.join(start.effects)} has {extra} parameters; {LARGE} are provided for")
-    columns = np.full(given.num_properties + (SMALL if extra <= SMALL else LARGE), total)
-    columns[: len(mine)] = mine  # the rest stand in for none: the last column, which nothing reads
+    columns = _padded(given, start.effects, mine)
     low, high = (edge[mine] for edge in limits(given))
     u = _extended(start.u)
     u[mine] = np.clip(u[mine], low, high)
@@ -277,6 +272,29 @@ def _fit_one(given: Problem, start: Start, steps: int) -> Fitted:
             if damping > 1e3:
                 break
     return _fitted(given, start.effects, u[:-1], mine, *now)
+
+
+def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
+    """Derivatives (n, K) of a candidate's n whitened residuals by its free columns, at coordinates u.
+
+    Residuals are those that exist, in the order of the mask `whitening.weight > 0`.
+    """
+    mine = columns_of(given, effects)
+    columns = jnp.asarray(_padded(given, effects, mine))
+    on = jnp.asarray(_on(given, effects))
+    _, push = _linearised(*_constants(given), jnp.asarray(_extended(u)), on, columns)
+    return np.asarray(push)[given.whitening.weight > 0][:, : len(mine)]
+
+
+def _padded(given: Problem, effects: Sequence[str], mine: np.ndarray) -> np.ndarray:
+    """Columns `mine` of a candidate, filled up to one of two widths."""
+    extra = len(mine) - given.num_properties
+    if extra > LARGE:
+        raise ValueError(f"{'+'.join(effects)} has {extra} parameters; {LARGE} are provided for")
+    nothing = slots(given.num_properties)[1]  # the last column, which nothing reads
+    columns = np.full(given.num_properties + (SMALL if extra <= SMALL else LARGE), nothing)
+    columns[: len(mine)] = mine
+    return columns
 
 
 def _fitted(

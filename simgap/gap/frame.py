@@ -161,6 +161,8 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
     sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, boundaries))
     lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
     there[lone, CHANNELS.index("fx") :] = 0.0
+    if group > 1:  # a mean over a contact change is of neither contact
+        there[np.abs(t[:, None] - boundaries).min(axis=1) <= step / 2] = 0.0
     return {
         "t": t,
         "joints": joints,

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
 from simgap.effects import catalogue
 from simgap.gap.fit import Fitted, Problem
@@ -20,6 +20,7 @@ from simgap.gap.fit import Fitted, Problem
 LOCAL_COST = 5.0  # nats for each free amount of an effect (a slide per grip): a millimetre against its noise
 
 DEFAULT_MISFIT = 0.03  # of an effect that the bank never had
+USUAL = 10.0  # decades by which what a wrong cause leaves usually exceeds noise
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class Calibration:
     `temperature`: floor of the evidence's temperature; `prior`: log prior of a candidate against none;
     `floor`: healthy mean square of whitened residuals; `unknown_at`, `unknown_width`: share of the gap
     left by the best candidate at which "unknown" is as likely, and its logistic width in log share;
+    `unknown_slope`: weight of how surely what is left is no noise; `unknown_coarse`: factor on
+    `unknown_at` where the best candidate is a coarse effect;
     `misfit`: by effect, how far its parameters were off on the bank beyond their own sd, as a share.
     """
 
@@ -37,6 +40,8 @@ class Calibration:
     floor: float = 0.95
     unknown_at: float = 0.3
     unknown_width: float = 0.25
+    unknown_slope: float = 0.0
+    unknown_coarse: float = 1.0
     misfit: dict[str, float] = field(default_factory=dict)
 
     def inflated(self, effect: str, sd: float, value: float) -> float:
@@ -89,20 +94,33 @@ def heldout(found: Fitted, labels: np.ndarray, num_trials: int) -> np.ndarray:
     return np.maximum(out[real], 0.0)
 
 
+def alien(best: str, left: float, p_left: float, c: Calibration) -> float:
+    """Probability that no candidate of the catalogue is the cause.
+
+    `left`: share of the gap that the `best` candidate leaves; `p_left`: chance of noise to look like what it
+    leaves. Logistic in both logarithms, and nothing where the remainder may well be noise.
+    """
+    surprise = -np.log10(max(p_left, 1e-300))
+    coarse = any(catalogue()[name].coarse for name in best.split("+") if name in catalogue())
+    usual = c.unknown_at * (c.unknown_coarse if coarse else 1.0)
+    odds = np.log(max(left, 1e-6) / usual) / c.unknown_width
+    odds += c.unknown_slope * np.log(max(surprise, 1.0) / USUAL)
+    return float(expit(odds) * expit(2 * (surprise - 2)))
+
+
 def probabilities(
-    evidence: Mapping[str, float], left: float, significant: float, c: Calibration
+    evidence: Mapping[str, float], left: float, p_left: float, c: Calibration
 ) -> dict[str, float]:
     """Probabilities of none, unknown and every candidate; sums to 1.
 
-    `evidence` [nats, tempered] over none; `left`: share of the gap that the best leaves; `significant`
-    (0 to 1): how surely the remainder is no noise.
+    `evidence` [nats, tempered] over none; `left` and `p_left` as `alien` takes them.
     """
     names = ["none", *evidence]
     score = np.array([0.0, *(value + c.prior for value in evidence.values())])
     share = np.exp(score - logsumexp(score))
-    alien = significant / (1 + np.exp(-(np.log(max(left, 1e-6)) - np.log(c.unknown_at)) / c.unknown_width))
-    out = {n: float(p * (1 - alien)) for n, p in zip(names, share, strict=True)}
-    return {"none": out.pop("none"), "unknown": float(alien), **out}
+    unknown = alien(max(evidence, key=lambda n: evidence[n]), left, p_left, c) if evidence else 0.0
+    out = {n: float(p * (1 - unknown)) for n, p in zip(names, share, strict=True)}
+    return {"none": out.pop("none"), "unknown": unknown, **out}
 
 
 def ranked(evidence: dict[str, float]) -> list[str]:

@@ -14,6 +14,8 @@ from simgap.gap.fit import Problem
 from simgap.gap.frame import CHANNELS
 
 BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges, the last band ends at half the sampling rate
+EVIDENCE = 2.3  # times the scale of a healthy recording's largest evidence: see docs/gap.md
+BESIDE = 3.0  # sd; no sample beside a contact change counts for more, its contact may be the other one
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,19 @@ def normal_score(energy: np.ndarray | float, count: np.ndarray | float) -> Any:
     return (np.cbrt(np.asarray(energy) / np.maximum(count, 1)) - (1 - spread)) / np.sqrt(spread)
 
 
+def tamed(given: Problem, z: np.ndarray) -> np.ndarray:
+    """Whitened residuals z (T, N, C), those beside a contact change clipped at BESIDE.
+
+    Such a sample may belong to the contact before or after: its residual has tails that no scale describes.
+    """
+    beside = (given.frame.arrays.kind % 2 == 1)[..., None]
+    return np.where(beside, np.clip(z, -BESIDE, BESIDE), z)
+
+
 def cells(given: Problem, z: np.ndarray) -> list[Cell]:
-    """All cells of whitened residuals z (T, N, C) that hold anything."""
+    """All cells of whitened residuals z (T, N, C), tamed, that hold anything."""
     frame, there = given.frame, given.whitening.weight > 0
+    z = tamed(given, z)
     out = []
     for trial in range(frame.num_trials):
         step = float(np.median(np.diff(frame.world.t[trial, : frame.lengths[trial]])))
@@ -86,7 +98,8 @@ class Detection:
     """Gumbel distributions (location, scale) of the largest score of healthy recordings.
 
     `cell`: single cells; `pooled`: cells with trials taken together; `gain`: log evidence of the best
-    candidate over none. `margin` widens them: a recording is not our own simulation.
+    candidate over none. `margin` widens the first two and EVIDENCE the last: a recording is not our own
+    simulation.
     """
 
     cell: tuple[float, float]
@@ -98,14 +111,18 @@ class Detection:
         """Chance of a healthy recording to exceed each of the given statistics."""
         out = {}
         for name, value in largest.items():
-            location, scale = getattr(self, name)
-            out[name] = float(gumbel_r.sf(value / self.margin if name != "gain" else value, location, scale))
+            location, scale, margin = self._of(name)
+            out[name] = float(gumbel_r.sf(value / margin, location, scale))
         return out
+
+    def _of(self, name: str) -> tuple[float, float, float]:
+        location, scale = getattr(self, name)
+        return (location, scale * EVIDENCE, 1.0) if name == "gain" else (location, scale, self.margin)
 
     def threshold(self, name: str, level: float) -> float:
         """Value that a healthy recording exceeds with probability `level`."""
-        location, scale = getattr(self, name)
-        return float(gumbel_r.isf(level, location, scale)) * (self.margin if name != "gain" else 1.0)
+        location, scale, margin = self._of(name)
+        return float(gumbel_r.isf(level, location, scale)) * margin
 
 
 def largest(found: list[Cell]) -> dict[str, float]:

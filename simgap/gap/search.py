@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
 
 from hmmseg.errors import InputError
 from hmmseg.rig import Rig
@@ -20,7 +19,7 @@ from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, residual_at, slots, without
 from simgap.gap.frame import build
-from simgap.gap.locate import cells, largest
+from simgap.gap.locate import cells, largest, subtask_name, tamed
 from simgap.gap.realign import moved, realigned
 from simgap.gap.spread import SPREADS, Spread, spreads
 
@@ -29,10 +28,14 @@ SHIFT = 0.008  # s; boundaries that move farther are taken anew
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
 REALIGNED = 2  # times at most
 REFINED = 6  # candidates fitted again after boundaries moved
-WORTH = 0.6  # a pair must leave no more than this share of what its better half leaves
-MORE = 0.07  # and must gain this share of its evidence over that half, more than a model's form is off by
-ENOUGH = 0.03  # a single that leaves less of the gap needs no partner: no model is exact to the last per cent
-WILD, BUMPS = 5.0, 0.015  # sd; share of samples that may be wilder and be left out
+WORTH = 0.5  # a pair must leave no more than this share of what its better half leaves
+MORE, COARSE = 0.001, 0.01  # and must gain this share of its evidence over that half, more if that is coarse
+LEAST = 20.0  # nats that a pair must gain as well
+LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
+WILD, LOUD = 5.0, 3.0  # sd; an event reaches the first and goes on while samples exceed the second
+BESIDE = 0.015  # share of residuals beside contact changes that may be left out of the fits
+EVENTS = 0.03  # share of residuals that may be left out as events
+RECURS = 3  # trials at least, to tell an event from an effect
 WORTHY = 50.0  # nats at T = 1 by which the leading candidate must win for boundaries to be taken anew
 PAIRED = 20.0  # nats that a single must have gained for pairs to be tried
 Progress = Callable[[str], None]
@@ -57,7 +60,7 @@ class Candidate:
 class Search:
     """All candidates, best first, fitted to one `problem`; `healthy` is the fit without any effect.
 
-    `statistics`: the largest scores of the residual at the first fit, before anything was left out;
+    `statistics`: the largest scores of the residual without any effect, events left out;
     `temperature` that of the evidence.
     """
 
@@ -103,11 +106,15 @@ def search(
         aligned = again
         given = problem(build(trials, aligned, rig), bank.noise, actual)
         healthy, fits = _refitted(given, healthy, fits, bool(forced))
-    wild = _bumps(given, fits, healthy)
-    if wild is not None:
-        warnings.append(f"{int(wild.sum())} samples that no candidate explains are left out of the fits")
-        given = without(given, wild)
+    beside, event = _wild(given, fits, healthy)
+    if beside is not None:
+        given = without(given, beside)
+    if event is not None:
+        warnings += _told(given, event)
+        given = without(given, event)
+    if beside is not None or event is not None:
         healthy, fits = _refitted(given, healthy, fits, bool(forced))
+        statistics = largest(cells(given, residual_at(given, (), healthy.u)))
     if forced:
         found, temperature = _forced(given, fits, healthy, forced, bank)
         return Search(given, healthy, (found,), statistics, temperature, tuple(warnings))
@@ -118,17 +125,18 @@ def search(
     found.sort(key=lambda c: -c.evidence)
     tell("trying pairs")
     if found[0].evidence > PAIRED:
-        single, rest = left(given, found[0], healthy, bank)
-        flexible = any(catalogue()[name].local for name in found[0].effects)  # free amounts fit others' gaps
-        if rest > 0.5 and (single > ENOUGH or flexible):
-            singles = tuple(found)
-            alone = {c.name: left(given, c, healthy, bank)[0] for c in singles}
-            for pair in _pairs(given, found, healthy, names, temperature):
-                better_half = min(alone.get(name, 1.0) for name in pair.effects)
-                more = pair.evidence - max(c.evidence for c in singles if c.name in pair.effects)
-                if left(given, pair, healthy, bank)[0] < WORTH * better_half and more > MORE * pair.evidence:
-                    found.append(pair)
-            found.sort(key=lambda c: -c.evidence)
+        singles = tuple(found)
+        enough = singles[0].spread is None and left(given, singles[0], healthy, bank)[1] > ALARM
+        beam = [c for c in singles if c.spread is None][: 1 if enough else BEAM]
+        for pair in _pairs(given, beam, healthy, names, temperature):
+            better = max((c for c in singles if c.name in pair.effects), key=lambda c: c.evidence)
+            coarse = any(catalogue()[name].coarse for name in better.effects)
+            if pair.evidence - better.evidence < max((COARSE if coarse else MORE) * pair.evidence, LEAST):
+                continue
+            rest = left(given, better, healthy, bank)[0]
+            if left(given, pair, healthy, bank)[0] < max(WORTH * rest, LITTLE):
+                found.append(pair)
+        found.sort(key=lambda c: -c.evidence)
     return Search(given, healthy, tuple(found), statistics, temperature, tuple(warnings))
 
 
@@ -197,40 +205,75 @@ def remainder(given: Problem, candidate: Candidate) -> np.ndarray:
     return z if candidate.spread is None else z / candidate.spread.scale
 
 
-def _bumps(given: Problem, fits: Sequence[Fitted], healthy: Fitted) -> np.ndarray | None:
-    """A few wild samples (T, N, C) that no candidate explains, and their neighbours; None where none are.
+def _wild(
+    given: Problem, fits: Sequence[Fitted], healthy: Fitted
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """What no candidate explains and is no gap: single residuals beside contact changes, and events.
 
-    A block that brushes another is an event and no effect. More than a few are a gap to be explained.
+    Both (T, N, C), None where there are none. An effect recurs: what is wild in one of several trials and
+    in none of the others (a finger that brushes a block) is an event. More than a few are a gap to be
+    explained.
     """
     leading = [healthy, *sorted(fits, key=lambda f: f.cost)[:3]]
     least = np.min([np.abs(residual_at(given, f.effects, f.u)) for f in leading], axis=0)
-    wild = least > WILD
-    near = wild.copy()
-    near[:, 1:] |= wild[:, :-1]
-    near[:, :-1] |= wild[:, 1:]
-    near &= given.whitening.weight > 0
-    return near if 0 < near.sum() <= BUMPS * given.size else None
+    there, edge = given.whitening.weight > 0, (given.frame.arrays.kind % 2 == 1)[..., None]
+    beside = there & edge & (least > WILD)
+    moments = _moments(given, np.where(edge, np.minimum(least, WILD), least).max(2))
+    event = there & moments[..., None]
+    return tuple(
+        found if 0 < found.sum() <= most * given.size else None
+        for found, most in ((beside, BESIDE), (event, EVENTS))
+    )  # type: ignore[return-value]
+
+
+def _moments(given: Problem, least: np.ndarray) -> np.ndarray:
+    """Samples (T, N) of events, from the largest residual of each sample that the best candidates leave."""
+    subtask = given.frame.arrays.subtask
+    if given.frame.num_trials < RECURS:
+        return np.zeros(subtask.shape, bool)
+    hit = np.stack([((least > WILD) & (subtask == s)).any(1) for s in range(len(given.frame.steps))], 1)
+    alone = np.take_along_axis(hit & (hit.sum(0) == 1), subtask, axis=1)
+    moments, loud = alone & (least > WILD), alone & (least > LOUD)
+    while True:
+        near = moments.copy()
+        near[:, 1:] |= moments[:, :-1]
+        near[:, :-1] |= moments[:, 1:]
+        if not (near & loud & ~moments).any():
+            return near
+        moments |= near & loud
+
+
+def _told(given: Problem, event: np.ndarray) -> list[str]:
+    """A warning for every trial and subtask with an event."""
+    frame, out = given.frame, []
+    for r in range(frame.num_trials):
+        when = event[r].any(1)
+        for s in np.unique(frame.arrays.subtask[r, when]):
+            t = frame.world.t[r, when & (frame.arrays.subtask[r] == s)]
+            out.append(
+                f"{frame.files[r]}: {subtask_name(frame.steps[s])}, {t[0]:.2f} to {t[-1]:.2f} s: an event of "
+                "this trial alone, left out"
+            )
+    return out
 
 
 def left(given: Problem, candidate: Candidate, healthy: Fitted, bank: Bank) -> tuple[float, float]:
-    """Share of the excess square that a candidate leaves, and how surely (0 to 1) that is no noise."""
+    """Share of the excess square that a candidate leaves, and the chance of noise to look like that."""
     floor = bank.calibration.floor * given.size
-    before = max(healthy.square.sum() - floor, 1.0)
+    before = max(float((tamed(given, residual_at(given, (), healthy.u)) ** 2).sum()) - floor, 1.0)
     z = remainder(given, candidate)
-    rest = float((z**2).sum()) - floor
-    scores = largest(cells(given, z))
-    p = min(bank.detection.p_values(scores).values())
-    share = float(np.clip(rest / before, 0.0, 1.0))
-    return share, float(expit(2 * (np.log10(ALARM) - np.log10(max(p, 1e-30)))))
+    rest = float((tamed(given, z) ** 2).sum()) - floor
+    p = min(bank.detection.p_values(largest(cells(given, z))).values())
+    return float(np.clip(rest / before, 0.0, 1.0)), p
 
 
 def _pairs(
-    given: Problem, found: list[Candidate], healthy: Fitted, names: list[str], temperature: float
+    given: Problem, best: Sequence[Candidate], healthy: Fitted, names: list[str], temperature: float
 ) -> list[Candidate]:
-    """Pairs of the best singles with whatever gains most beside them."""
+    """Pairs of the best singles, none of them a spread, with whatever gains most beside them."""
     out: dict[str, Candidate] = {}
     width = {s.effect.name: len(s.effect.parameters) for s in slots(given.num_properties)[0]}
-    for single in [c for c in found if c.spread is None][:BEAM]:
+    for single in best:
         partners = [
             n for n in deterministic(names) if n != single.name and width[n] + width[single.name] <= 26
         ]

@@ -13,6 +13,7 @@ import numpy as np
 from simgap.effects.base import tips
 from simgap.gap.fit import Fitted, Problem, residual_at
 from simgap.gap.frame import CHANNELS
+from simgap.gap.locate import tamed
 
 SPREADS = ("clock_jitter", "quantisation")
 REPEATED = 0.5  # share of repeated values that only a lattice has
@@ -34,7 +35,7 @@ class Spread:
 
 def clock(given: Problem, fitted: Fitted, samples: np.ndarray) -> Spread:
     """Variance in proportion to the squared rate of change, on a grid of jitters [s]."""
-    z = residual_at(given, fitted.effects, fitted.u)
+    z = tamed(given, residual_at(given, fitted.effects, fitted.u))
     rate = _rates(given)
     there = (given.whitening.weight > 0) & (rate > 0)
     h2, z2 = rate[there] ** 2, z[there] ** 2

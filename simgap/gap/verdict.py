@@ -10,16 +10,17 @@ from simgap.gap.judge import Calibration
 from simgap.gap.search import ALARM, Candidate, Search
 
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
+FORM = 0.002  # nor those within this share of its evidence: no form is exact to that
 
 
 def likelihoods(
-    evidence: Mapping[str, float], p_value: float, left: float, significant: float, c: Calibration
+    evidence: Mapping[str, float], p_value: float, left: float, p_left: float, c: Calibration
 ) -> dict[str, float]:
     """Probabilities of none, unknown and every candidate, given whether there is a gap at all.
 
     With a gap, what names no cause is unknown; without one, all but a little is none.
     """
-    out = judge.probabilities(evidence, left, significant, c)
+    out = judge.probabilities(evidence, left, p_left, c)
     if p_value < ALARM:
         none = min(out["none"], p_value)
         return out | {"none": none, "unknown": out["unknown"] + out["none"] - none}
@@ -41,7 +42,8 @@ def choose(
     if max(probability["unknown"], probability["none"]) > 0.5:
         return "unknown", [], []
     alike = [k for k in others if len(k.effects) == len(best.effects)]
-    near = [k for k in alike if best.evidence - k.evidence < TIE or _as_good(best, k, found.temperature)]
+    tie = max(TIE, FORM * best.evidence)
+    near = [k for k in alike if best.evidence - k.evidence < tie or _as_good(best, k, found.temperature)]
     partners = sorted({e for k in near for e in k.effects} - set(best.effects))
     return ("set" if partners else "named"), sorted(best.effects), partners
 

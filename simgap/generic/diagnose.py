@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.rig import Rig
@@ -189,9 +188,8 @@ def _conclude(
     left = 1 - fraction(before, after, floor)
     left = float(np.clip(left, 0, 1)) if np.isfinite(left) else 0.0
     rest = locate(lay, real - best.shift, sim, seed).p_value
-    significant = float(expit(2 * (np.log10(ALARM) - np.log10(max(rest, 1e-30)))))
     evidence = {joined(f.effects): f.evidence(temperature) for f in found}
-    probability = probabilities(evidence, left, significant, Calibration(unknown_at=UNKNOWN))
+    probability = probabilities(evidence, left, rest, Calibration(unknown_at=UNKNOWN))
     p, gap = located.p_value, located.p_value < ALARM
     if gap:
         excess = max(probability["none"] - p, 0.0)

@@ -213,6 +213,11 @@ def test_the_scorer_counts_hand_made_results():
                    said("named", ["fingertip_compliance"], gains={"force_gain": 90.0})),
         judge_case(entry("j", "pair", {"force_bias": {}, "force_lag": {}}),
                    said("named", ["force_bias", "force_lag"])),
+        judge_case(entry("k", "pair", {"force_bias": {}, "force_lag": {}}),  # one of them cannot be seen
+                   said("named", ["force_bias"], gains={"force_bias": 40.0, "force_lag": 1.0}),
+                   lambda case, name: {"gain": 40.0, "fraction": 0.6}),
+        judge_case(entry("l", "withheld", {"table_tilt": {"angle": 0.1}}),  # as good by 5 nats: stands for it
+                   said("named", ["joint_offset"], gains={"table_tilt": 90.0, "joint_offset": 87.0})),
     ]  # fmt: skip
     found = figures(rows)
     table = found["table"]
@@ -221,7 +226,7 @@ def test_the_scorer_counts_hand_made_results():
     assert table["named_right"]["hits"] == 1 and table["set_right"]["hits"] == 2
     assert table["known_rejected"]["hits"] == 1
     assert table["outside_unknown"]["value"] == 1.0
-    assert table["withheld_right"]["value"] == 0.5
+    assert table["withheld_right"]["value"] == pytest.approx(2 / 3)
     assert table["pair_exact"]["value"] == 1.0
     assert table["coverage_90"]["value"] == 0.5
     assert table["too_small_none"]["value"] == 1.0
@@ -232,6 +237,6 @@ def test_the_scorer_counts_hand_made_results():
     assert found["rivals"]["bic"]["named_right"]["hits"] == 2
     assert found["confusion"]["force_bias"] == {"force_bias": 1, "fingertip_mass": 1}
     top = found["reliability"][0]
-    assert top["said"] == pytest.approx(0.95) and top["right"]["count"] == 9
+    assert top["said"] == pytest.approx(0.95) and top["right"]["count"] == 10
     low, high = table["false_alarms"]["interval_95"]
     assert low == pytest.approx(0.0126, abs=1e-3) and high == pytest.approx(0.9874, abs=1e-3)

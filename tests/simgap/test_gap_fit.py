@@ -97,8 +97,8 @@ def test_normal_scores_are_standard_normal():
 
 
 def test_probabilities_sum_to_one_and_follow_the_evidence():
-    p = probabilities({"force_bias": 30.0, "force_drift": 3.0}, 0.01, 0.0, load_bank().calibration)
+    p = probabilities({"force_bias": 30.0, "force_drift": 3.0}, 0.01, 0.5, load_bank().calibration)
     assert sum(p.values()) == pytest.approx(1.0)
     assert max(p, key=lambda k: p[k]) == "force_bias"
-    alien = probabilities({"force_bias": 30.0}, 0.9, 1.0, load_bank().calibration)
+    alien = probabilities({"force_bias": 30.0}, 0.9, 1e-30, load_bank().calibration)
     assert alien["unknown"] > 0.9
