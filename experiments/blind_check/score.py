@@ -25,6 +25,7 @@ SIZES = (0.0, 0.1, 0.3, 1.0)
 GAINS = (5.0, 20.0, 100.0, float("inf"))
 BINS = 10
 RIVALS = ("bic", "all_at_once", "cosine")
+SPREADS = ("clock_jitter", "quantisation")  # their held-out score is no gain: see rivals.py
 # A diagnosis that ended in an error.
 NOTHING: dict[str, Any] = {
     "verdict": "error",
@@ -125,7 +126,7 @@ def _true_fit(entry: dict, found: dict, oracle: Oracle | None) -> dict[str, floa
     name = "+".join(sorted(entry["effects"]))
     listed = found["effects"].get(name)
     right = sorted(found["causes"]) == sorted(entry["effects"]) and found["shrinkage"]
-    gain = listed["heldout_score"] if listed else found["gains"].get(name)
+    gain = found["gains"].get(name) if name in SPREADS or not listed else listed["heldout_score"]
     fraction = found["shrinkage"]["fraction"] if right else None
     if (gain is None or (fraction is None and gain >= FLOOR)) and oracle is not None:
         forced = oracle(entry["case"], name)
