@@ -92,10 +92,11 @@ def _blind(found: dict[str, Any]) -> str:
         low, high = t[name]["interval_95"]
         return f"{percent(t[name]['value'], 0)} ({100 * low:.0f} to {100 * high:.0f})"
 
+    false = t["false_alarms"]
     return (
         f"\n\nBlind, on {sum(found['cases'].values())} sealed cases of another simulator (MuJoCo): right "
         f"names above the detection floor {share('named_right')}, false alarms on healthy recordings "
-        f"{share('false_alarms')}, what is outside the catalogue called unknown {share('outside_unknown')}, "
-        f"exact pairs {share('pair_exact')} (goals: 95, 1, 90 and 80 %). All figures, and what they "
-        "show, stand in [docs/gap.md](docs/gap.md)."
+        f"{false['hits']} of {false['count']}, what is outside the catalogue called unknown "
+        f"{share('outside_unknown')}, exact pairs {share('pair_exact')} (goals: 95, 1, 90 and 80 %). All "
+        "figures, and what they show, stand in [docs/gap.md](docs/gap.md)."
     )
