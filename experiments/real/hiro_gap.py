@@ -10,8 +10,6 @@ trials that have it.
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.stats import t as student
 
 from experiments.real.hiro_snap import KINDS, WRENCH, read_kind
+from experiments.real.on_folder import run_on_folder
 from hmmseg.task import SequenceTask
 from hmmseg.trial import Trial
 from simgap.generic.diagnose import GenericDiagnosis, diagnose
@@ -242,13 +241,7 @@ def rounded(value):
 
 def main() -> None:
     """Run on a folder and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--output", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
-    document = run(arguments.folder)
-    text = json.dumps(rounded(document), indent=1, allow_nan=False)
-    arguments.output.write_text(text + "\n", encoding="utf-8")
+    run_on_folder(__doc__, lambda folder: rounded(run(folder)), RESULTS)
 
 
 if __name__ == "__main__":

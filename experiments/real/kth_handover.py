@@ -9,14 +9,13 @@ below is learned from the five recordings themselves, the baton's pose is used o
 
 from __future__ import annotations
 
-import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from experiments.real.on_folder import run_on_folder
 from hmmseg.errors import InputError
 from hmmseg.sequence_segment import segment_sequence
 from hmmseg.task import SequenceTask
@@ -138,14 +137,8 @@ def table(document: dict) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--output", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
-    document = run(arguments.folder)
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(document, indent=1) + "\n")
-    print(table(document))
+    """Run on a folder and write the results."""
+    print(table(run_on_folder(__doc__, run, RESULTS)))
 
 
 if __name__ == "__main__":

@@ -10,8 +10,6 @@ one run repeat each other's error, so whole runs are held out and evidence is te
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from experiments.real.on_folder import run_on_folder
 from hmmseg.errors import InputError
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "way_eeg_gal.json"
@@ -197,12 +196,7 @@ def run(folder: Path) -> dict:
 
 def main() -> None:
     """Run on a folder and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--output", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
-    document = run(arguments.folder)
-    arguments.output.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    run_on_folder(__doc__, run, RESULTS)
 
 
 if __name__ == "__main__":
