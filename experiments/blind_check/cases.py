@@ -16,7 +16,7 @@ from experiments.blind_check.scene import Block, World
 from experiments.blind_check.signals import Sampling, noise_of_channels, sample, sense, task_space
 
 TRIALS = 4
-TRIES = 12
+TRIES = 60
 # Shares of the tiers; effects too small to see come about by themselves among single effects.
 TIERS = {"healthy": 300, "single": 138, "pair": 40, "outside": 36, "withheld": 36}
 SUBTASKS = (
