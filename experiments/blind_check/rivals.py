@@ -66,11 +66,9 @@ def _bic(found: Diagnosis, fits: Sequence[Fitted]) -> str:
     """Least sum of squares + parameters x log(number of residuals)."""
     given = found.problem
     n = int((given.whitening.weight > 0).sum())
-    grips = given.frame.num_trials * len(given.frame.task.performed)
     score = {"none": float(found.healthy.square.sum())}
     for f in fits:
         more = len(f.columns) - given.num_properties
-        more += catalogue()[f.effects[0]].local * grips
         score[f.effects[0]] = float(f.square.sum()) + more * np.log(n)
     return min(score, key=lambda k: score[k])
 
@@ -78,7 +76,7 @@ def _bic(found: Diagnosis, fits: Sequence[Fitted]) -> str:
 @jax.jit
 def _derivatives(world, arrays, w, centre, spread, u, on):
     """Whitened residuals (T, N, C) and their derivatives by all coordinates (K, T, N, C)."""
-    z, push = jax.linearize(lambda v: whitened(world, arrays, w, centre, spread, v, on), u)
+    z, push = jax.linearize(lambda v: whitened(world, arrays, w, centre, spread, v, on)[0], u)
     return z, jax.vmap(push)(jnp.eye(u.size))
 
 
@@ -96,7 +94,7 @@ def _linearised(given: Problem, u: np.ndarray, on: Sequence[str]) -> tuple[np.nd
 def _together(found: Diagnosis, names: list[str]) -> str:
     """One linear fit of all effects from the healthy optimum; the largest joint t statistic."""
     given = found.problem
-    smooth = [n for n in names if not catalogue()[n].local]
+    smooth = [n for n in names if not catalogue()[n].switched]
     z, push = _linearised(given, found.healthy.u, smooth)
     places = [s for s in slots(given.num_properties)[0] if s.effect.name in smooth]
     columns = np.concatenate([np.arange(given.num_properties), *[np.arange(s.start, s.stop) for s in places]])

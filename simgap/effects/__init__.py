@@ -1,4 +1,8 @@
-"""The candidate effects: every module of this package that defines EFFECT is one, found by itself."""
+"""The candidate effects: every module of this package that defines EFFECT is one, found by itself.
+
+A module that defines DECOY instead is an effect outside the contract: where it explains a recording best
+the verdict is "unknown".
+"""
 
 from __future__ import annotations
 
@@ -11,14 +15,28 @@ from simgap.effects.base import Effect
 
 
 @cache
-def catalogue() -> dict[str, Effect]:
-    """All effects by name, in alphabetical order."""
+def _defined(kind: str) -> dict[str, Effect]:
     found = {}
     for info in pkgutil.iter_modules(__path__):
-        effect = getattr(importlib.import_module(f"{__name__}.{info.name}"), "EFFECT", None)
+        effect = getattr(importlib.import_module(f"{__name__}.{info.name}"), kind, None)
         if effect is not None:
             found[effect.name] = effect
     return dict(sorted(found.items()))
+
+
+def catalogue() -> dict[str, Effect]:
+    """All effects by name, in alphabetical order."""
+    return _defined("EFFECT")
+
+
+def decoys() -> dict[str, Effect]:
+    """Effects that are fitted to be told from the catalogue's, and never named."""
+    return _defined("DECOY")
+
+
+def fitted() -> dict[str, Effect]:
+    """The catalogue's effects and the decoys."""
+    return catalogue() | decoys()
 
 
 def effect_named(name: str) -> Effect:

@@ -29,9 +29,12 @@ class World(NamedTuple):
     `delay`, `smoothing` [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
     the pads' delayed part. `tilt` [rad] and `give_support` [m/N] of the support. `inertia`: factor
     of the mass times acceleration. `couple` [m]: how far the mass lies right of the middle.
-    `loudness`: recorded noise over the noise of corrected forces. `slip` (T, N): whether (0 to 1) pads
-    slide on the block; `modes` (4,): 1 where a candidate delays or smooths forces, lets pads creep or slide
-    (LATE, SMOOTH, CREEPING, SLIDING), so that equations without it are not evaluated.
+    `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
+    `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
+    `doubt_joints` [rad^2], `doubt_force` [N^2] (T, N, 4): variance of what a correction cannot tell of
+    angles and of the pads' forces. `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (5,):
+    1 where a candidate delays or smooths forces, lets pads creep or slide or a mode ring (LATE, SMOOTH,
+    CREEPING, SLIDING, RINGING), so that equations without it are not evaluated.
     `free`, `ground`, `carry` (T, N): which state each sample is in (1 or 0); `events` (T, 4 M) [s]:
     touch, leave, meet, part of every move.
     """
@@ -56,6 +59,9 @@ class World(NamedTuple):
     inertia: Array
     couple: Array
     loudness: Array
+    ring: Array
+    doubt_joints: Array
+    doubt_force: Array
     slip: Array
     modes: Array
     free: Array
@@ -65,7 +71,7 @@ class World(NamedTuple):
     events: Array
 
 
-LATE, SMOOTH, CREEPING, SLIDING = range(4)
+LATE, SMOOTH, CREEPING, SLIDING, RINGING = range(5)
 
 
 class Performance(NamedTuple):
@@ -126,8 +132,9 @@ class Effect:
     gives standard deviations of a random disturbance instead (see `simgap.gap.spread`).
     `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
     scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
-    `local` counts free amounts per grip of a trial. `chosen` is false for effects that only
-    `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them. `coarse`
+    `chosen` is false for effects that only
+    `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them. `switched`
+    effects change the equations at their neutral values already. `coarse`
     effects act between samples: their form holds to a per cent or so, the others' to far less.
     """
 
@@ -142,10 +149,9 @@ class Effect:
     apply: Callable[[Performance, dict[str, float], np.random.Generator], Performance] | None = None
     scene: Callable[[dict[str, float]], dict[str, float]] | None = None
     finish: Callable[[np.ndarray, dict[str, float]], np.ndarray] | None = None
-    local: int = 0
     chosen: bool = True
+    switched: bool = False
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
-    random: bool = False
     coarse: bool = False
 
     def neutral(self) -> dict[str, float]:

@@ -12,6 +12,5 @@ EFFECT = Effect(
     mistaken_for=("noise",),
     parameters=(Parameter("sd", "s", 1.0, neutral=0.004, log=True, low=1e-4, high=0.05),),
     stage=READOUT,
-    random=True,
     coarse=True,
 )

@@ -18,7 +18,11 @@ EFFECT = Effect(
     says="recorded F(t) = F(t - delay)",
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
-    parameters=(Parameter("delay", "s", 0.1, starts=(0.03, 0.08, 0.15, 0.25), low=0.0, high=0.4),),
+    parameters=(
+        Parameter(
+            "delay", "s", 0.1, starts=(0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32), low=0.0, high=0.4
+        ),
+    ),
     stage=FILTER,
     correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + v["delay"]),
     apply=_apply,

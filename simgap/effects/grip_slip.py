@@ -12,14 +12,14 @@ import jax.numpy as jnp
 
 from simgap.effects.base import CONTACT, SLIDING, Effect, Parameter, World, with_mode
 
-LOADED = 0.8  # N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
+LOADED = 0.4  # N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
 
 
 def _correct(world: World, values, on) -> World:
     shear = jnp.abs(world.force[..., jnp.asarray([1, 3])])
     push = jnp.stack([world.force[..., 0], -world.force[..., 2]], -1)
     ratio = shear / jnp.maximum(push, 0.5 * LOADED)
-    sliding = jax.nn.sigmoid((ratio / values["mu"] - 0.96) / 0.02).max(axis=-1)
+    sliding = jax.nn.sigmoid((ratio / values["mu"] - 1.02) / 0.02).max(axis=-1)
     sliding = sliding * jax.nn.sigmoid((push.min(axis=-1) - LOADED) / 0.05)
     return with_mode(world, SLIDING, on)._replace(
         slip=world.slip + on * sliding * (world.ground + world.carry)
@@ -46,7 +46,7 @@ EFFECT = Effect(
     ),
     stage=CONTACT,
     correct=_correct,
-    local=1,
     scene=lambda v: {"friction": v["mu"]},
+    switched=True,
     coarse=True,
 )

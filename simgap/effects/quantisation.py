@@ -14,6 +14,5 @@ EFFECT = Effect(
     mistaken_for=("noise",),
     parameters=(Parameter("step", "N", 1.0, neutral=0.05, log=True, low=1e-3, high=0.5),),
     stage=READOUT,
-    random=True,
     finish=lambda force, v: v["step"] * np.round(force / v["step"]),
 )

@@ -1,11 +1,22 @@
-"""A lightly damped mode of the hand's structure, rung by every contact change."""
+"""A lightly damped mode of the hand's structure, rung by every contact change and by every change of load."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import FORCES, READOUT, Effect, Parameter, Performance, World, flat, with_force
+from simgap.effects.base import (
+    FORCES,
+    READOUT,
+    RINGING,
+    Effect,
+    Parameter,
+    Performance,
+    World,
+    flat,
+    with_force,
+    with_mode,
+)
 
 GROUPS = (("grip", (0, 3)), ("support", (1, 2)))  # events of a move that ring alike
 AMPLITUDES = tuple(f"{part}_{group}_{c}" for group, _ in GROUPS for part in ("sin", "cos") for c in FORCES)
@@ -29,7 +40,9 @@ def _ringing(world: World, values) -> jnp.ndarray:
 
 
 def _correct(world: World, values, on) -> World:
-    return world._replace(force=world.force - _ringing(world, values))
+    # What loads ring is put into what they should read, not taken out: recorded noise stays as it is.
+    ring = jnp.stack([jnp.asarray(values[n], float) for n in ("frequency", "damping", "drive")])
+    return with_mode(world, RINGING, on)._replace(force=world.force - _ringing(world, values), ring=ring)
 
 
 def _apply(performance: Performance, values, rng) -> Performance:
@@ -43,13 +56,14 @@ def _apply(performance: Performance, values, rng) -> Performance:
 
 def _report(draws, rig):
     size = np.sqrt(sum(np.asarray(draws[name]) ** 2 for name in AMPLITUDES) / 4)
-    return {"frequency": (draws["frequency"], "Hz"), "damping": (draws["damping"], "1"), "gain": (size, "N")}
+    units = {"frequency": "Hz", "damping": "1", "drive": "1"}
+    return {name: (draws[name], unit) for name, unit in units.items()} | {"gain": (size, "N")}
 
 
 EFFECT = Effect(
     name="structural_vibration",
     acts_on="dynamics",
-    says="a mode rung by contact changes: gain exp(-damping w t) sin(w t)",
+    says="a mode rung by contact changes, gain exp(-damping w t) sin(w t), and by changes of load",
     shows="decaying oscillation after contact changes",
     mistaken_for=("noise", "contact_impact"),
     parameters=(
@@ -63,7 +77,8 @@ EFFECT = Effect(
             high=10.0,
             log=True,
         ),
-        Parameter("damping", "1", 1.0, neutral=0.05, starts=(0.05,), low=0.003, high=0.5, log=True),
+        Parameter("damping", "1", 1.0, neutral=0.05, starts=(0.05,), low=0.003, high=0.15, log=True),
+        Parameter("drive", "1", 0.2, low=-0.8, high=0.8, hidden=True),
         *(Parameter(name, "N", 0.1, hidden=True) for name in AMPLITUDES),
     ),
     stage=READOUT,

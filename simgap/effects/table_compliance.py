@@ -20,4 +20,5 @@ EFFECT = Effect(
     correct=lambda w, v, on: w._replace(give_support=w.give_support + v["give"]),
     report=_report,
     scene=lambda v: {"support_stiffness": v["stiffness"]},
+    coarse=True,
 )

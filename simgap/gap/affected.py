@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects import catalogue
+from simgap.effects import fitted
 from simgap.effects.base import World, tips
 from simgap.gap.fit import Problem, raw_residual_at, world_without
 from simgap.gap.frame import CHANNELS
@@ -25,7 +25,7 @@ def shifts(given: Problem, effects: Sequence[str], u: np.ndarray) -> tuple[np.nd
     change = _channels(frame.world) - _channels(without)
     change[..., CHANNELS.index("shear")] += _couple(given, without, u)
     there = given.whitening.weight > 0
-    mechanical = [e for e in effects if catalogue()[e].acts_on not in ("sensing", "kinematics")]
+    mechanical = [e for e in effects if fitted()[e].acts_on not in ("sensing", "kinematics")]
     violated = np.zeros_like(change)
     if mechanical:
         others = [e for e in effects if e not in mechanical]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import dct
 
-from simgap.effects import catalogue
+from simgap.effects import fitted as known_effects
 from simgap.gap.fit import Fitted, Problem, derivatives
 from simgap.gap.frame import CHANNELS
 from simgap.gap.judge import Calibration
@@ -86,14 +86,14 @@ def largest_scores(given: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
 def _largest_evidence(given: Problem, healthy: Fitted, z: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Largest log evidence [nats] (D,) of a single effect over none, linearised where it is absent.
 
-    As `judge.log_evidence`. Effects that shift nothing to first order are left out, and those with free
-    amounts in every grip, whose charge no healthy recording pays.
+    As `judge.log_evidence`. Effects that shift nothing to first order are left out, and those that change the
+    equations by being there.
     """
     best = np.full(len(z), -np.inf)
     gain, volume = _gain(z, own)
-    for name, effect in catalogue().items():
+    for name, effect in known_effects().items():
         possible = given.frame.rig.jointed or effect.acts_on != "kinematics"
-        if effect.correct is None or not effect.chosen or effect.local or not possible:
+        if effect.correct is None or not effect.chosen or effect.switched or not possible:
             continue
         push = derivatives(given, (name,), healthy.u)
         if not np.isfinite(push).all():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simgap.effects import catalogue
+from simgap.effects import fitted
 from simgap.gap.fit import STEPS, Fitted, Problem, Start, fit, neutral, slots
 
 SCREEN = 2  # steps before the best start of an effect is chosen
@@ -38,7 +38,7 @@ def starts(
 
 def deterministic(names: Sequence[str]) -> list[str]:
     """Those of the named effects that shift signals (the others only spread them)."""
-    return [n for n in names if catalogue()[n].correct is not None]
+    return [n for n in names if fitted()[n].correct is not None]
 
 
 def best_fits(

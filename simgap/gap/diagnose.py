@@ -11,6 +11,7 @@ import numpy as np
 from hmmseg.rig import Rig
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
+from simgap.effects import decoys
 from simgap.gap import judge
 from simgap.gap.adapt import adapted
 from simgap.gap.bank import Bank, load_bank
@@ -85,13 +86,17 @@ def diagnose(
     every = cells(given, before)
     among = {*causes, *partners}
     alike = [c for c in found.candidates if len(c.effects) == len(causes) and among >= set(c.effects)]
-    shown = [c for k, c in enumerate(found.candidates) if k < LISTED or c in alike]
+    named = [c for c in found.candidates if c.name not in decoys()]
+    shown = [c for k, c in enumerate(named) if k < LISTED or c in alike]
     effects = {c.name: describe(given, c, found.healthy, bank.calibration, seed) for c in shown}
     following = None
     if verdict == "set":
         tell("the next experiment")
         following = _following(found, alike, effects, bank, seed)
     warnings = found.warnings
+    if verdict == "unknown" and best.name in decoys():
+        warnings = (*warnings, f"{best.name} explains the gap better than any effect of the catalogue: "
+                    f"{decoys()[best.name].says}")  # fmt: skip
     if given.frame.num_trials == 1:
         warnings = (*warnings, "one trial: held out by moves, which is weaker than by trials")
     body = {

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
-from simgap.effects import catalogue
+from simgap.effects import fitted as known_effects
 from simgap.effects.base import Effect, World, tips
 from simgap.gap.frame import Arrays, Frame
 from simgap.gap.noise import NoiseModel, Whitening, whiten, whitening
@@ -40,7 +40,7 @@ class Slot:
 def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
     """Slots of all deterministic effects in order of correction, and the number of columns."""
     out, at = [], num_properties
-    known = [e for e in catalogue().values() if e.correct is not None]
+    known = [e for e in known_effects().values() if e.correct is not None]
     for effect in sorted(known, key=lambda e: (e.stage, e.name)):
         out.append(Slot(effect, at))
         at += len(effect.parameters)
@@ -81,7 +81,7 @@ class Fitted:
 
     `blocks`: quadratic forms of the whitened residual about the optimum by trial and subtask:
     H (T, S, K, K), g (T, S, K), c (T, S), so that the residual's square at u + w is
-    c + 2 g w + w H w. `cost` is half the sum of squares plus prior.
+    c + 2 g w + w H w; twice the cost of doubts is among the squares. `cost` is half their sum plus prior.
     """
 
     effects: tuple[str, ...]
@@ -147,27 +147,34 @@ def whitened(
     spread: jax.Array,
     u: jax.Array,
     on: jax.Array,
-) -> jax.Array:
-    """Whitened residuals (T, N, C) at coordinates u."""
+) -> tuple[jax.Array, jax.Array]:
+    """Whitened residuals (T, N, C) at coordinates u, and by trial and subtask (T, S) the cost of doubts.
+
+    A residual in doubt counts for less; half the log of its variance's factor is what that costs [nats].
+    """
     properties = centre + spread * u[: centre.size].reshape(centre.shape)
-    return whiten(residuals(corrected(world, u, on, centre.size), arrays, properties), w)
+    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
+    raw, factor = residuals(corrected(world, u, on, centre.size), arrays, properties, noise)
+    cost = jnp.einsum("tns,tnc->ts", w.member, jnp.where(w.weight > 0, 0.5 * jnp.log(factor), 0.0))
+    return whiten(raw / jnp.sqrt(factor), w), cost
 
 
 @jax.jit
 def _linearised(world, arrays, w, centre, spread, u, on, columns):
-    """Whitened residuals (T, N, C) at u and their derivatives by the free columns (T, N, C, K)."""
+    """Whitened residuals (T, N, C) at u, the cost of doubts (T, S), and their derivatives by the free
+    columns (T, N, C, K), (T, S, K)."""
 
     def of(step):
         return whitened(world, arrays, w, centre, spread, u.at[columns].add(step), on)
 
     step = jnp.zeros(columns.shape[0])
-    z, push = jax.linearize(of, step)
-    return z, jnp.moveaxis(jax.vmap(push)(jnp.eye(step.size)), 0, -1)
+    now, push = jax.linearize(of, step)
+    return *now, *(jnp.moveaxis(d, 0, -1) for d in jax.vmap(push)(jnp.eye(step.size)))
 
 
 @jax.jit
 def _residual(world, arrays, w, centre, spread, u, on):
-    return whitened(world, arrays, w, centre, spread, u, on)
+    return whitened(world, arrays, w, centre, spread, u, on)[0]
 
 
 def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
@@ -177,20 +184,28 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
     )
 
 
+@partial(jax.jit, static_argnames="num_properties")
+def _without(world, u, on, num_properties):
+    world = corrected(world, u, on, num_properties)
+    return world._replace(force=undelayed(world))
+
+
+@jax.jit
+def _raw(world, arrays, w, centre, spread, u, on):
+    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
+    properties = centre + spread * u[: centre.size].reshape(centre.shape)
+    return residuals(corrected(world, u, on, centre.size), arrays, properties, noise)[0]
+
+
 def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
     """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
-    world = corrected(_constants(given)[0], jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects)),
-                      given.num_properties)  # fmt: skip
-    return world._replace(force=undelayed(world))
+    world, on = _constants(given)[0], jnp.asarray(_on(given, effects))
+    return _without(world, jnp.asarray(_extended(u)), on, given.num_properties)
 
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Residuals (T, N, C) in units of their channels."""
-    world, arrays, _, centre, spread = _constants(given)
-    world = corrected(world, jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects)), centre.size)
-    return np.asarray(
-        residuals(world, arrays, centre + spread * jnp.asarray(u[: centre.size]).reshape(centre.shape))
-    )
+    return np.asarray(_raw(*_constants(given), jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects))))
 
 
 def _constants(given: Problem):
@@ -250,22 +265,23 @@ def _fit_one(given: Problem, start: Start, steps: int) -> Fitted:
     on = jnp.asarray(_on(given, start.effects))
 
     def evaluate(at):
-        z, push = _linearised(*constants, jnp.asarray(at), on, jnp.asarray(columns))
+        z, doubt, push, lift = _linearised(*constants, jnp.asarray(at), on, jnp.asarray(columns))
         z, push = np.asarray(z)[there], np.asarray(push)[there][:, : len(mine)]
-        return z, push, 0.5 * float(z @ z) + 0.5 * float(at[mine] @ at[mine])
+        doubt, lift = np.asarray(doubt), np.asarray(lift)[..., : len(mine)]
+        cost = 0.5 * float(z @ z) + float(doubt.sum()) + 0.5 * float(at[mine] @ at[mine])
+        return z, doubt, push, lift, cost
 
     now, damping = evaluate(u), 1e-3
     for _ in range(steps):
-        z, push, cost = now
-        step = _bounded_step(
-            u[mine], push.T @ z + u[mine], push.T @ push + np.eye(len(mine)), damping, low, high
-        )
+        z, _, push, lift, cost = now
+        slope = push.T @ z + lift.sum((0, 1)) + u[mine]
+        step = _bounded_step(u[mine], slope, push.T @ push + np.eye(len(mine)), damping, low, high)
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
         new = evaluate(trial)
-        if np.isfinite(new[2]) and new[2] < cost:
+        if np.isfinite(new[-1]) and new[-1] < cost:
             u, now, damping = trial, new, damping / 5
-            if cost - new[2] < 0.02:
+            if cost - new[-1] < 0.02:
                 break
         else:
             damping *= 8
@@ -282,7 +298,7 @@ def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
     mine = columns_of(given, effects)
     columns = jnp.asarray(_padded(given, effects, mine))
     on = jnp.asarray(_on(given, effects))
-    _, push = _linearised(*_constants(given), jnp.asarray(_extended(u)), on, columns)
+    push = _linearised(*_constants(given), jnp.asarray(_extended(u)), on, columns)[2]
     return np.asarray(push)[given.whitening.weight > 0][:, : len(mine)]
 
 
@@ -303,10 +319,12 @@ def _fitted(
     u: np.ndarray,
     columns: np.ndarray,
     z: np.ndarray,
+    doubt: np.ndarray,
     push: np.ndarray,
+    lift: np.ndarray,
     cost: float,
 ) -> Fitted:
-    """Quadratic forms by trial and subtask of a linearised residual."""
+    """Quadratic forms by trial and subtask of a linearised residual, the cost of doubts included."""
     frame, there = given.frame, given.whitening.weight > 0
     trials, steps = there.shape[0], len(frame.steps)
     cell = np.arange(trials)[:, None] * steps + frame.arrays.subtask
@@ -327,8 +345,8 @@ def _fitted(
         u,
         columns,
         hessian.reshape(*shape, k, k),
-        gradient.reshape(*shape, k),
-        square.reshape(shape),
+        gradient.reshape(*shape, k) + lift,
+        square.reshape(shape) + 2 * doubt,
         cost,
     )
 

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from simgap.effects import catalogue
+from simgap.effects import decoys
+from simgap.effects import fitted as known_effects
 from simgap.gap.fit import Fitted, Problem
-
-LOCAL_COST = 5.0  # nats for each free amount of an effect (a slide per grip): a millimetre against its noise
 
 DEFAULT_MISFIT = 0.03  # of an effect that the bank never had
 USUAL = 10.0  # decades by which what a wrong cause leaves usually exceeds noise
@@ -51,12 +50,8 @@ class Calibration:
 
 def log_evidence(given: Problem, found: Fitted, healthy: Fitted, temperature: float = 1.0) -> float:
     """Log evidence [nats] of a candidate over none, coordinates standard normal beforehand."""
-    grips = given.frame.num_trials * len(given.frame.task.performed)
-    free = sum(catalogue()[name].local for name in found.effects) * grips
     gain = (healthy.cost - found.cost) / temperature
-    return float(
-        gain - 0.5 * (_log_det(found, temperature) - _log_det(healthy, temperature)) - LOCAL_COST * free
-    )
+    return float(gain - 0.5 * (_log_det(found, temperature) - _log_det(healthy, temperature)))
 
 
 def _log_det(found: Fitted, temperature: float) -> float:
@@ -101,7 +96,7 @@ def alien(best: str, left: float, p_left: float, c: Calibration) -> float:
     leaves. Logistic in both logarithms, and nothing where the remainder may well be noise.
     """
     surprise = -np.log10(max(p_left, 1e-300))
-    coarse = any(catalogue()[name].coarse for name in best.split("+") if name in catalogue())
+    coarse = any(known_effects()[name].coarse for name in best.split("+") if name in known_effects())
     usual = c.unknown_at * (c.unknown_coarse if coarse else 1.0)
     odds = np.log(max(left, 1e-6) / usual) / c.unknown_width
     odds += c.unknown_slope * np.log(max(surprise, 1.0) / USUAL)
@@ -111,7 +106,7 @@ def alien(best: str, left: float, p_left: float, c: Calibration) -> float:
 def probabilities(
     evidence: Mapping[str, float], left: float, p_left: float, c: Calibration
 ) -> dict[str, float]:
-    """Probabilities of none, unknown and every candidate; sums to 1.
+    """Probabilities of none, unknown and every candidate; sums to 1. What decoys have goes to unknown.
 
     `evidence` [nats, tempered] over none; `left` and `p_left` as `alien` takes them.
     """
@@ -120,6 +115,7 @@ def probabilities(
     share = np.exp(score - logsumexp(score))
     unknown = alien(max(evidence, key=lambda n: evidence[n]), left, p_left, c) if evidence else 0.0
     out = {n: float(p * (1 - unknown)) for n, p in zip(names, share, strict=True)}
+    unknown += sum(out.pop(n) for n in decoys() if n in out)
     return {"none": out.pop("none"), "unknown": unknown, **out}
 
 

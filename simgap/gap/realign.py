@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.rig import Rig
@@ -14,19 +12,15 @@ from hmmseg.segmentation import AlignedTrials, align_trials
 from hmmseg.signals import task_space
 from hmmseg.trial import Trial
 from simgap.effects.base import tips
-from simgap.gap.fit import Fitted, Problem, _extended, _on, corrected
+from simgap.gap.fit import Fitted, Problem, world_without
 from simgap.gap.frame import thinned
-from simgap.gap.residuals import undelayed
 
 
 def realigned(trials: Sequence[Trial], given: Problem, found: Fitted) -> AlignedTrials:
     """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
     frame, rig = given.frame, given.frame.rig
-    world = jax.tree.map(jnp.asarray, frame.world)
-    world = corrected(
-        world, jnp.asarray(_extended(found.u)), jnp.asarray(_on(given, found.effects)), given.num_properties
-    )
-    (position, velocity), force = tips(world), undelayed(world)
+    world = world_without(given, found.effects, found.u)
+    (position, velocity), force = tips(world), world.force
     rows = []
     for r, trial in enumerate(trials):
         n = frame.lengths[r]

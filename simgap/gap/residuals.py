@@ -13,16 +13,26 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from simgap.effects.base import CREEPING, LATE, SLIDING, SMOOTH, World, gradient, tips
+from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, World, gradient, tips
 from simgap.gap.frame import CHANNELS, Arrays
 
 TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # sds of the distance by which fingers must be nearer than the block is wide to touch it
 HELD = 0.1  # N; a grip below this holds nothing
+BETWEEN = 0.3  # of a bend, sd: a force read between samples
+EITHER = 0.6  # of a force's change, sd: how a force between two samples goes from one to the other
+SLIDE = 2e-3  # m; how far a pad may slide from one sample to the next
+ANYWHERE = 0.05  # m; sd of where a grip takes its block
 
 
-def residuals(world: World, arrays: Arrays, properties: jax.Array) -> jax.Array:
-    """Residuals (T, N, C) in units of the channels; `properties` (O, 3): weight, width, height."""
+def residuals(
+    world: World, arrays: Arrays, properties: jax.Array, noise: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Residuals (T, N, C) in units of the channels, and how far their variance exceeds `noise` squared.
+
+    `properties` (O, 3): weight, width, height. The variance's factor is 1 where the correction of an effect
+    leaves nothing in doubt.
+    """
     own = jnp.einsum("tnm,mo,op->tnp", arrays.onehot, arrays.objects, properties)
     weight, width = own[..., 0], own[..., 1]
     rise = jnp.einsum("tnm,mo,o->tn", arrays.onehot, arrays.rises, properties[:, 2])
@@ -53,9 +63,9 @@ def residuals(world: World, arrays: Arrays, properties: jax.Array) -> jax.Array:
     y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
     still = firm * (arrays.phase[..., 1] + place)
     onground = firm * world.ground
-    offset = _centred(offset, arrays, firm * held * _known(arrays, "offset"), None, world)
-    x = _centred(x, arrays, still * _known(arrays, "x"), place, None)
-    y = _centred(y, arrays, onground * _known(arrays, "y"), None, world)
+    offset, loose_offset = _in_grip(offset, firm * held, "offset", arrays, noise, world)
+    x = _centred(x, arrays, still * _known(arrays, "x"), place)
+    y, loose_y = _in_grip(y, onground, "y", arrays, noise, world)
 
     acceleration = gradient(world.t, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
@@ -76,7 +86,9 @@ def residuals(world: World, arrays: Arrays, properties: jax.Array) -> jax.Array:
         ],
         -1,
     )
-    forces = (seen - _filtered(world, expected)) * world.loudness
+    filtered, either = _filtered(world, expected)
+    filtered = _when(world, RINGING, lambda f: _driven(world, f, back=False), filtered)
+    forces = (seen - filtered) * world.loudness
 
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
@@ -84,7 +96,31 @@ def residuals(world: World, arrays: Arrays, properties: jax.Array) -> jax.Array:
     geometry = jnp.stack([x, y, distance * held, offset], -1)
     # In the units of what was recorded: an effect must not gain by scaling the noise down.
     size = jnp.mean(world.link)
-    return jnp.concatenate([geometry / size, speeds / size, forces], -1)
+    loose = jnp.stack([jnp.ones_like(x), loose_y, jnp.ones_like(x), loose_offset], -1)
+    factor = loose + _doubt(world, firm) / jnp.square(noise[..., :4])
+    return (
+        jnp.concatenate([geometry / size, speeds / size, forces], -1),
+        jnp.concatenate([factor, jnp.ones_like(speeds), 1 + either / jnp.square(noise[..., 6:])], -1),
+    )
+
+
+def _doubt(world: World, firm: jax.Array) -> jax.Array:
+    """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of angles and forces."""
+    length = (world.length * world.link)[None, None, :]
+    turn_x, turn_y = length * jnp.sin(world.joints), length * jnp.cos(world.joints)
+    there = world.jointed > 0.5
+    turn_x, turn_y = (jnp.where(there, turn, 0.0) for turn in (turn_x, turn_y))
+
+    pads = world.doubt_force + _between(world)
+
+    def finger(turn: jax.Array, give: jax.Array, force: int) -> tuple[jax.Array, jax.Array]:
+        place = jnp.square(turn) * world.doubt_joints
+        pad = pads[..., force::2] * jnp.square(give)
+        return (place[..., :2].sum(-1) + pad[..., 0]), (place[..., 2:].sum(-1) + pad[..., 1])
+
+    (x1, x2), (y1, y2) = finger(turn_x, world.give_normal, 0), finger(turn_y, world.give_shear, 1)
+    x, y = x1 + x2, y1 + y2
+    return jnp.stack([x / 4, y / 4, x, y], -1) * jnp.square(firm)[..., None]
 
 
 def _compact(v: jax.Array) -> jax.Array:
@@ -109,15 +145,50 @@ def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
 
 
 def undelayed(world: World) -> jax.Array:
-    """Forces (T, N, 4) before delay and low-pass."""
-    force = _when(world, LATE, lambda f: shifted(f, world.delay / _step(world)), world.force)
+    """Forces (T, N, 4) before delay and low-pass, and before they rang a mode."""
+    force = _when(world, RINGING, lambda f: _driven(world, f, back=True), world.force)
+    force = _when(world, LATE, lambda f: shifted(f, world.delay / _step(world)), force)
     return _when(world, SMOOTH, lambda f: f + world.smoothing * gradient(world.t, f), force)
 
 
-def _filtered(world: World, force: jax.Array) -> jax.Array:
-    """Forces (T, N, C) after low-pass (exact between samples for straight lines) and delay."""
+def _filtered(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Forces (T, N, C) after low-pass (exact between samples for straight lines) and delay, and the variance
+    of what is read between two samples: a contact may have changed before or after."""
     smooth = _when(world, SMOOTH, lambda f: _lowpass(f, world.smoothing, _step(world)), force)
-    return _when(world, LATE, lambda f: shifted(f, -world.delay / _step(world)), smooth)
+
+    def late(f: jax.Array) -> tuple[jax.Array, jax.Array]:
+        steps = world.delay / _step(world)
+        whole = jnp.floor(steps)
+        share, index = steps - whole, jnp.arange(f.shape[1]) - whole.astype(int)
+        new, old = (f[:, jnp.clip(index - k, 0, f.shape[1] - 1)] for k in (0, 1))
+        return (1 - share) * new + share * old, share * (1 - share) * jnp.square(EITHER * (new - old))
+
+    def prompt(f: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return f, jnp.zeros_like(f)
+
+    return jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, late, prompt, smooth)
+
+
+def _driven(world: World, force: jax.Array, back: bool) -> jax.Array:
+    """Loads (T, N, C) with the mode that their changes ring; `back`: the loads that rang to these readings.
+
+    The load goes straight from sample to sample: exact in between, a step at a time.
+    """
+    frequency, damping, drive = (jnp.asarray(world.ring)[k] for k in range(3))
+    pole = 2 * jnp.pi * frequency * (-damping + 1j * jnp.sqrt(jnp.maximum(1 - damping**2, 1e-6)))
+    keep = jnp.exp(pole * _step(world))
+    gain = (keep - 1) / (pole * _step(world))
+
+    def step(state, now):
+        load, ring = state
+        free = keep * ring - gain * load
+        new = (now - drive * free.imag) / (1 + drive * gain.imag) if back else now
+        ring = free + gain * new
+        return (new, ring), new if back else new + drive * ring.imag
+
+    start = force[:, 0], jnp.zeros_like(force[:, 0]) * (1 + 0j)
+    _, out = jax.lax.scan(step, start, jnp.moveaxis(force, 1, 0))
+    return jnp.moveaxis(out, 0, 1)
 
 
 def _when(world: World, mode: int, change: Callable[[jax.Array], jax.Array], values: jax.Array) -> jax.Array:
@@ -154,17 +225,20 @@ def _known(arrays: Arrays, channel: str) -> jax.Array:
     return jnp.asarray(arrays.there[..., CHANNELS.index(channel)])
 
 
-def _centred(
-    values: jax.Array,
-    arrays: Arrays,
-    weight: jax.Array,
-    place: jax.Array | None,
-    sliding: World | None,
-) -> jax.Array:
-    """Values (T, N) less their weighted mean in every grip (pickup and place apart if `place` is given).
+def _between(world: World) -> jax.Array:
+    """Variance (T, N, 4) [N^2] of forces that were read between samples, from how sharply they bend there."""
 
-    The progress of a slide in `sliding` is regressed out alike: its amount is free in every grip.
-    """
+    def rough(f: jax.Array) -> jax.Array:
+        bend = jnp.abs(jnp.pad(f[:, 2:] - 2 * f[:, 1:-1] + f[:, :-2], ((0, 0), (2, 2), (0, 0))))
+        share = world.delay / _step(world) % 1.0
+        sd = BETWEEN * share * (1 - share)
+        return jnp.square(sd * jnp.maximum(jnp.maximum(bend[:, :-2], bend[:, 1:-1]), bend[:, 2:]))
+
+    return jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, rough, jnp.zeros_like, jnp.asarray(world.force))
+
+
+def _centred(values: jax.Array, arrays: Arrays, weight: jax.Array, place: jax.Array | None) -> jax.Array:
+    """Values (T, N) less their weighted mean in every grip (pickup and place apart if `place` is given)."""
     parts = (
         [arrays.onehot]
         if place is None
@@ -175,19 +249,53 @@ def _centred(
         members = part * weight[..., None]
         members = members / jnp.maximum(members.sum(1, keepdims=True), 1e-9)
         out = out - jnp.einsum("tnm,tm->tn", part, jnp.einsum("tnm,tn->tm", members, values))
-    if sliding is not None:
-        out = _when(sliding, SLIDING, lambda v: _less_slide(v, arrays, weight, sliding.slip), out)
     return out * weight
 
 
-def _less_slide(values: jax.Array, arrays: Arrays, weight: jax.Array, slip: jax.Array) -> jax.Array:
-    """Values (T, N) with the best amount of sliding taken out of every grip."""
-    members = arrays.onehot * weight[..., None]
-    steps = jnp.cumsum(slip[..., None] * arrays.onehot, axis=1)
-    total = (slip[..., None] * arrays.onehot).sum(1, keepdims=True)
-    progress = steps / (total + 0.05) * jnp.clip(total / 2, 0.0, 1.0) ** 2  # one bad sample is no slide
-    mean = (members * progress).sum(1, keepdims=True) / jnp.maximum(members.sum(1, keepdims=True), 1e-9)
-    progress = (progress - mean) * arrays.onehot
-    amount = jnp.einsum("tnm,tnm,tn->tm", members, progress, values)
-    amount = amount / (jnp.einsum("tnm,tnm,tnm->tm", members, progress, progress) + 1e-2)
-    return values - jnp.einsum("tnm,tm->tn", progress, amount)
+def _in_grip(
+    values: jax.Array, firm: jax.Array, channel: str, arrays: Arrays, noise: jax.Array, world: World
+) -> tuple[jax.Array, jax.Array]:
+    """Values (T, N) that are one constant in every grip, less that constant; and their variance's factor.
+
+    Where pads may slide the constant walks at random; the values are less its prediction from those before.
+    """
+    weight = firm * _known(arrays, channel)
+    sd = noise[..., CHANNELS.index(channel)]
+
+    def followed(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _followed(values, weight, sd, world.slip, jnp.asarray(arrays.onehot))
+
+    def centred(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _centred(values, arrays, weight, None), jnp.ones_like(values)
+
+    return jax.lax.cond(jnp.asarray(world.modes)[SLIDING] > 0, followed, centred, values)
+
+
+def _followed(
+    values: jax.Array, weight: jax.Array, sd: jax.Array, slip: jax.Array, grips: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
+
+    The state is where a grip holds its block; it walks by SLIDE from one sample to the next where pads slide
+    at either. A grip's first value sets it and tells nothing.
+    """
+    other = jnp.concatenate([jnp.ones_like(slip[:, :1]), 1 - (grips[:, 1:] * grips[:, :-1]).sum(-1)], 1)
+    before = jnp.concatenate([slip[:, :1], slip[:, :-1]], 1)
+    walk = jnp.square(jnp.maximum(slip, before) * SLIDE)
+
+    def step(state, now):
+        place, variance, fresh = state
+        value, w, s, q, new = now
+        variance = jnp.where(new > 0.5, ANYWHERE**2, variance + q)
+        fresh = jnp.where(new > 0.5, 1.0, fresh)
+        factor = 1 + w * variance / s**2
+        miss = value - place
+        place = place + w * variance / (s**2 * factor) * miss
+        known = 1 - fresh
+        out = known * w * miss, 1 + known * (factor - 1)
+        return (place, variance / factor, fresh * (1 - w)), out
+
+    rows = [jnp.moveaxis(z, 1, 0) for z in (values, weight, sd, walk, other)]
+    start = (values[:, 0], jnp.full_like(values[:, 0], ANYWHERE**2), jnp.ones_like(values[:, 0]))
+    _, (out, factor) = jax.lax.scan(step, start, tuple(rows))
+    return jnp.moveaxis(out, 0, 1), jnp.moveaxis(factor, 0, 1)

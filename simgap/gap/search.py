@@ -13,7 +13,7 @@ from hmmseg.segmentation import AlignedTrials, align_trials
 from hmmseg.signals import task_space
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
-from simgap.effects import catalogue
+from simgap.effects import catalogue, decoys
 from simgap.gap import judge
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
@@ -26,11 +26,11 @@ from simgap.gap.spread import SPREADS, Spread, spreads
 ALARM = 0.01  # chance that a healthy recording is called otherwise
 SHIFT = 0.008  # s; boundaries that move farther are taken anew
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
-REALIGNED = 2  # times at most
+REALIGNED, LEADING = 2, 3  # times at most; without the first of so many candidates that all trials then fit
 REFINED = 6  # candidates fitted again after boundaries moved
 WORTH = 0.5  # a pair must leave no more than this share of what its better half leaves
-MORE, COARSE = 0.001, 0.01  # and must gain this share of its evidence over that half, more if that is coarse
-LEAST = 20.0  # nats that a pair must gain as well
+MORE, COARSE = 0.0003, 0.003  # and must gain this share of its evidence over that half, more if that is coarse
+LEAST = 12.0  # nats that a pair must gain as well
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 WILD, LOUD = 5.0, 3.0  # sd; an event reaches the first and goes on while samples exceed the second
 BESIDE = 0.015  # share of residuals beside contact changes that may be left out of the fits
@@ -92,16 +92,16 @@ def search(
     names = _names(rig, excluded)
     tell("fitting single effects")
     wanted = [w for w in [tuple(sorted(set(forced) - set(SPREADS)))] if w]
-    fits = best_fits(given, wanted if forced else [(n,) for n in deterministic(names)], healthy)
+    singles = [(n,) for n in (*deterministic(names), *decoys())]
+    fits = best_fits(given, wanted if forced else singles, healthy)
 
     # Late, slow or soft contacts displace boundaries: align again without the best explanation.
     for _ in range(REALIGNED):
-        leading = min(fits, key=lambda f: f.cost, default=None)
-        if leading is None or healthy.cost - leading.cost < WORTHY:
-            break
+        leading = [f for f in sorted(fits, key=lambda f: f.cost) if healthy.cost - f.cost >= WORTHY]
         tell("aligning again without the best explanation")
-        again = realigned(trials, given, leading)
-        if not SHIFT < moved(aligned, again) < np.inf:
+        tried = (realigned(trials, given, f) for f in leading[:LEADING])
+        again = next((a for a in tried if moved(aligned, a) < np.inf), None)
+        if again is None or moved(aligned, again) <= SHIFT:
             break
         aligned = again
         given = problem(build(trials, aligned, rig), bank.noise, actual)
@@ -127,7 +127,7 @@ def search(
     if found[0].evidence > PAIRED:
         singles = tuple(found)
         enough = singles[0].spread is None and left(given, singles[0], healthy, bank)[1] > ALARM
-        beam = [c for c in singles if c.spread is None][: 1 if enough else BEAM]
+        beam = [c for c in singles if c.spread is None and c.name not in decoys()][: 1 if enough else BEAM]
         for pair in _pairs(given, beam, healthy, names, temperature):
             better = max((c for c in singles if c.name in pair.effects), key=lambda c: c.evidence)
             coarse = any(catalogue()[name].coarse for name in better.effects)

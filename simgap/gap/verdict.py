@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from simgap.effects import catalogue
+from simgap.effects import decoys
 from simgap.gap import judge
 from simgap.gap.judge import Calibration
 from simgap.gap.search import ALARM, Candidate, Search
@@ -34,7 +34,7 @@ def choose(
     probability: Mapping[str, float], found: Search, gap: bool, forced: bool
 ) -> tuple[str, list[str], list[str]]:
     """Verdict, causes and the effects that cannot be told from them."""
-    best, *others = found.candidates
+    best, *others = [k for k in found.candidates if k.name not in decoys()]
     if forced:
         return "named", sorted(best.effects), []
     if not gap:
@@ -51,8 +51,6 @@ def choose(
 def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:
     """Whether another candidate of about as many parameters fits as well: a matter of priors alone."""
     if best.spread is not None or other.spread is not None:
-        return False
-    if any(catalogue()[name].local for name in other.effects):  # free amounts fit anything a little
         return False
     more = other.fitted.columns.size - best.fitted.columns.size
     return more <= 2 and (other.fitted.cost - best.fitted.cost) / temperature < TIE
