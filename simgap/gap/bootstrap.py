@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import dct
 
-from simgap.effects import fitted as known_effects
+from simgap.effects import catalogue
 from simgap.gap.fit import Fitted, Problem, derivatives
 from simgap.gap.frame import CHANNELS
 from simgap.gap.judge import Calibration
@@ -91,7 +91,7 @@ def _largest_evidence(given: Problem, healthy: Fitted, z: np.ndarray, own: np.nd
     """
     best = np.full(len(z), -np.inf)
     gain, volume = _gain(z, own)
-    for name, effect in known_effects().items():
+    for name, effect in catalogue().items():
         possible = given.frame.rig.jointed or effect.acts_on != "kinematics"
         if effect.correct is None or not effect.chosen or effect.switched or not possible:
             continue

@@ -13,7 +13,7 @@ from hmmseg.segmentation import align_trials
 from hmmseg.signals import task_space
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
-from simgap.effects import catalogue, decoys
+from simgap.effects import catalogue
 from simgap.gap import judge
 from simgap.gap.adapt import fingerprint
 from simgap.gap.bank import Bank, Reference
@@ -123,7 +123,7 @@ def detection(
         best = ""
         if k < catalogued:
             names = [n for n, e in catalogue().items() if e.chosen]
-            fits = best_fits(task, [(n,) for n in (*deterministic(names), *decoys())], found)
+            fits = best_fits(task, [(n,) for n in deterministic(names)], found)
             scores = {
                 f.effects[0]: judge.log_evidence(task, f, found, Calibration().temperature) for f in fits
             }

@@ -175,18 +175,24 @@ def _driven(world: World, force: jax.Array, back: bool) -> jax.Array:
     The load goes straight from sample to sample: exact in between, a step at a time.
     """
     frequency, damping, drive = (jnp.asarray(world.ring)[k] for k in range(3))
-    pole = 2 * jnp.pi * frequency * (-damping + 1j * jnp.sqrt(jnp.maximum(1 - damping**2, 1e-6)))
-    keep = jnp.exp(pole * _step(world))
-    gain = (keep - 1) / (pole * _step(world))
+    # The mode as a complex number: (keep_r, keep_i) turns it by a step, (gain_r, gain_i) is what a unit of
+    # load, put on evenly over that step, rings it to: (keep - 1) / (fall + 1j turn).
+    angle = 2 * jnp.pi * frequency * _step(world)
+    fall, turn = -damping * angle, jnp.sqrt(jnp.maximum(1 - damping**2, 1e-6)) * angle
+    keep_r, keep_i = jnp.exp(fall) * jnp.cos(turn), jnp.exp(fall) * jnp.sin(turn)
+    size = fall**2 + turn**2
+    gain_r = ((keep_r - 1) * fall + keep_i * turn) / size
+    gain_i = (keep_i * fall - (keep_r - 1) * turn) / size
 
     def step(state, now):
-        load, ring = state
-        free = keep * ring - gain * load
-        new = (now - drive * free.imag) / (1 + drive * gain.imag) if back else now
-        ring = free + gain * new
-        return (new, ring), new if back else new + drive * ring.imag
+        load, ring_r, ring_i = state
+        free_r = keep_r * ring_r - keep_i * ring_i - gain_r * load
+        free_i = keep_r * ring_i + keep_i * ring_r - gain_i * load
+        new = (now - drive * free_i) / (1 + drive * gain_i) if back else now
+        state = new, free_r + gain_r * new, free_i + gain_i * new
+        return state, new if back else new + drive * state[2]
 
-    start = force[:, 0], jnp.zeros_like(force[:, 0]) * (1 + 0j)
+    start = force[:, 0], jnp.zeros_like(force[:, 0]), jnp.zeros_like(force[:, 0])
     _, out = jax.lax.scan(step, start, jnp.moveaxis(force, 1, 0))
     return jnp.moveaxis(out, 0, 1)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,18 @@ from simgap.effects import catalogue, decoys
 from simgap.gap import judge
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
-from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, residual_at, slots, without
+from simgap.gap.fit import (
+    LARGE,
+    Fitted,
+    Problem,
+    Start,
+    fit,
+    neutral,
+    problem,
+    residual_at,
+    slots,
+    without,
+)
 from simgap.gap.frame import build
 from simgap.gap.locate import cells, largest, subtask_name, tamed
 from simgap.gap.realign import moved, realigned
@@ -29,7 +40,10 @@ BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for eac
 REALIGNED, LEADING = 2, 3  # times at most; without the first of so many candidates that all trials then fit
 REFINED = 6  # candidates fitted again after boundaries moved
 WORTH = 0.5  # a pair must leave no more than this share of what its better half leaves
-MORE, COARSE = 0.0003, 0.003  # and must gain this share of its evidence over that half, more if that is coarse
+MORE, COARSE = (
+    0.0003,
+    0.003,
+)  # and must gain this share of its evidence over that half, more if that is coarse
 LEAST = 12.0  # nats that a pair must gain as well
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 WILD, LOUD = 5.0, 3.0  # sd; an event reaches the first and goes on while samples exceed the second
@@ -37,6 +51,9 @@ BESIDE = 0.015  # share of residuals beside contact changes that may be left out
 EVENTS = 0.03  # share of residuals that may be left out as events
 RECURS = 3  # trials at least, to tell an event from an effect
 WORTHY = 50.0  # nats at T = 1 by which the leading candidate must win for boundaries to be taken anew
+# What shifts or smooths samples in time.
+SHAPING = frozenset({"clock_jitter", "force_lag", "force_lowpass", "structural_vibration"})
+STRANGE = 6.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue
 PAIRED = 20.0  # nats that a single must have gained for pairs to be tried
 Progress = Callable[[str], None]
 
@@ -120,7 +137,7 @@ def search(
         return Search(given, healthy, (found,), statistics, temperature, tuple(warnings))
     spread = [s for s in spreads(given, healthy) if s.effect in names]
     temperature = _temperature(given, fits, spread, healthy, bank)
-    found = [_candidate(given, f, healthy, temperature) for f in fits]
+    found = [_single(given, f, healthy, temperature) for f in fits]
     found += [Candidate(s.effect, s.evidence / temperature, healthy, s) for s in spread]
     found.sort(key=lambda c: -c.evidence)
     tell("trying pairs")
@@ -142,6 +159,12 @@ def search(
 
 def _candidate(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Candidate:
     return Candidate(judge.joined(f.effects), judge.log_evidence(given, f, healthy, temperature), f)
+
+
+def _single(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Candidate:
+    """A single effect; decoys hold what others are and more, so they are thought less likely."""
+    found = _candidate(given, f, healthy, temperature)
+    return replace(found, evidence=found.evidence - STRANGE) if found.name in decoys() else found
 
 
 def _forced(
@@ -270,12 +293,18 @@ def left(given: Problem, candidate: Candidate, healthy: Fitted, bank: Bank) -> t
 def _pairs(
     given: Problem, best: Sequence[Candidate], healthy: Fitted, names: list[str], temperature: float
 ) -> list[Candidate]:
-    """Pairs of the best singles, none of them a spread, with whatever gains most beside them."""
+    """Pairs of the best singles, none of them a spread, with whatever gains most beside them.
+
+    Two effects that both reshape signals in time (SHAPING) make up for each other's form: no
+    sampled recording tells such a pair from one of them.
+    """
     out: dict[str, Candidate] = {}
     width = {s.effect.name: len(s.effect.parameters) for s in slots(given.num_properties)[0]}
     for single in best:
         partners = [
-            n for n in deterministic(names) if n != single.name and width[n] + width[single.name] <= 26
+            n
+            for n in deterministic(names)
+            if n != single.name and width[n] + width[single.name] <= LARGE and not {n, single.name} <= SHAPING
         ]
         wanted = [tuple(sorted((single.name, n))) for n in partners]
         fits = best_fits(given, wanted, healthy, [single.fitted] * len(wanted), steps=3)
@@ -286,6 +315,8 @@ def _pairs(
             if name not in out or candidate.evidence > out[name].evidence:
                 out[name] = candidate
         for s in spreads(given, single.fitted):
+            if {s.effect, single.name} <= SHAPING:
+                continue
             name = judge.joined((single.name, s.effect))
             out[name] = Candidate(name, single.evidence + s.evidence / temperature, single.fitted, s)
     return list(out.values())

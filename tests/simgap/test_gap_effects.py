@@ -10,7 +10,7 @@ import pytest
 from hmmseg import jaxconfig  # noqa: F401
 from hmmseg.errors import InputError
 from hmmseg.rig import Finger, Fingertip, Rig
-from simgap.effects import catalogue, effect_named
+from simgap.effects import catalogue, decoys, effect_named, fitted
 from simgap.effects.base import Performance, World, flat, tips
 from simgap.hand import inverse
 
@@ -47,7 +47,7 @@ RIG = Rig(
     },
     fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0),
 )
-DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
+DETERMINISTIC = sorted(n for n, e in fitted().items() if e.correct is not None)
 
 
 def performance(n: int = 400) -> Performance:
@@ -99,9 +99,12 @@ def world_of(p: Performance) -> World:
         give_support=zero,
         inertia=one,
         couple=zero,
-        loudness=one,
+        loudness=np.ones((1, held.size, 4)),
+        ring=np.array([1.0, 0.05, 0.0]),
+        doubt_joints=np.zeros((1, held.size, 4)),
+        doubt_force=np.zeros((1, held.size, 4)),
         slip=np.zeros((1, held.size)),
-        modes=np.zeros(4),
+        modes=np.zeros(5),
         free=1 - held[None],
         ground=(held - carry)[None],
         carry=carry[None],
@@ -118,6 +121,11 @@ def test_every_name_of_the_contract_is_an_effect():
     assert set(catalogue()) == CONTRACT
 
 
+def test_decoys_are_fitted_but_have_no_name():
+    assert decoys() and not set(decoys()) & set(catalogue())
+    assert set(fitted()) == set(decoys()) | set(catalogue())
+
+
 def test_an_unknown_effect_is_refused_with_the_nearest_name():
     with pytest.raises(InputError, match="force_bias"):
         effect_named("force_bais")
@@ -125,7 +133,7 @@ def test_an_unknown_effect_is_refused_with_the_nearest_name():
 
 @pytest.mark.parametrize("name", DETERMINISTIC)
 def test_gradients_are_finite_at_every_start(name):
-    effect, world = catalogue()[name], as_jax(world_of(performance()))
+    effect, world = fitted()[name], as_jax(world_of(performance()))
 
     def size(u):
         values = {p.name: p.value(u[k]) for k, p in enumerate(effect.parameters)}
@@ -143,10 +151,10 @@ def test_gradients_are_finite_at_every_start(name):
 
 @pytest.mark.parametrize("name", DETERMINISTIC)
 def test_an_effect_that_is_off_changes_nothing(name):
-    effect, world = catalogue()[name], as_jax(world_of(performance()))
+    effect, world = fitted()[name], as_jax(world_of(performance()))
     out = effect.correct(world, {p.name: jnp.asarray(p.neutral) for p in effect.parameters}, 0.0)
     for before, after, field in zip(world, out, World._fields, strict=True):
-        if field != "creep_time":  # without a share that creeps, its time says nothing
+        if field not in ("creep_time", "ring"):  # without a share that creeps or rings they say nothing
             np.testing.assert_allclose(after, before, atol=1e-12, err_msg=field)
 
 
@@ -159,13 +167,15 @@ PLANTED = {
     "viscous_drag": {"coefficient": 0.7},
     "fingertip_mass": {"mass": 0.012},
     "contact_impact": {"impulse": 0.02},
+    "force_nonlinearity": {"curve": 0.05, "gain": -0.03},
+    "gain_drift": {"rate": 0.03, "gain": -0.02},
 }
 
 
 @pytest.mark.parametrize("name", sorted(PLANTED))
 def test_what_apply_puts_in_correct_takes_out(name):
     truth, values = performance(), PLANTED[name]
-    effect = catalogue()[name]
+    effect = fitted()[name]
     recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
     out = effect.correct(as_jax(recorded), {k: jnp.asarray(v) for k, v in values.items()}, 1.0)
     before = np.abs(recorded.force - world_of(truth).force).max()
