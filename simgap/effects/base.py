@@ -135,7 +135,8 @@ class Effect:
     `chosen` is false for effects that only
     `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them. `switched`
     effects change the equations at their neutral values already. `coarse`
-    effects act between samples: their form holds to a per cent or so, the others' to far less.
+    effects act between samples: their form holds to a per cent or so, the others' to far less. `form` is the
+    share, `blur` the amount, by which parameters of real parts are off what our own simulator can show.
     """
 
     name: str
@@ -151,6 +152,8 @@ class Effect:
     finish: Callable[[np.ndarray, dict[str, float]], np.ndarray] | None = None
     chosen: bool = True
     switched: bool = False
+    form: float = 0.0
+    blur: float = 0.0
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
     coarse: bool = False
 

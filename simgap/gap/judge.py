@@ -45,7 +45,9 @@ class Calibration:
 
     def inflated(self, effect: str, sd: float, value: float) -> float:
         """Standard deviation of a parameter with what the effect's form is off by."""
-        return float(np.hypot(sd, self.misfit.get(effect, DEFAULT_MISFIT) * value))
+        known = known_effects()[effect]
+        share = np.hypot(self.misfit.get(effect, DEFAULT_MISFIT), known.form)
+        return float(np.sqrt(sd**2 + (share * value) ** 2 + known.blur**2))
 
 
 def log_evidence(given: Problem, found: Fitted, healthy: Fitted, temperature: float = 1.0) -> float:

@@ -74,7 +74,10 @@ def _rates(given: Problem) -> np.ndarray:
     held = frame.arrays.phase[..., 2]
     relative = np.abs(np.asarray(velocity[..., 2] - velocity[..., 0]))
     out[..., CHANNELS.index("distance")] = relative * (1 - held)
-    return out * given.whitening.weight
+    # Errors of central differences two samples apart have no part in common with the sample before: the
+    # whitening filter, made for noise that does, enlarges them.
+    rho2 = given.whitening.carryover**2
+    return out * given.whitening.weight * np.sqrt((1 + rho2) / (1 - rho2))
 
 
 def quantised(given: Problem) -> Spread:
