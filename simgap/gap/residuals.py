@@ -115,7 +115,7 @@ def _doubt(world: World, firm: jax.Array) -> jax.Array:
 
     def finger(turn: jax.Array, give: jax.Array, force: int) -> tuple[jax.Array, jax.Array]:
         place = jnp.square(turn) * world.doubt_joints
-        pad = pads[..., force::2] * jnp.square(give)
+        pad = pads[..., force::2] * jnp.square(give)[None, None, :]
         return (place[..., :2].sum(-1) + pad[..., 0]), (place[..., 2:].sum(-1) + pad[..., 1])
 
     (x1, x2), (y1, y2) = finger(turn_x, world.give_normal, 0), finger(turn_y, world.give_shear, 1)
