@@ -40,6 +40,7 @@ def main(args: Sequence[str] | None = None) -> int:
     judge.add_argument("--sealed", type=Path, required=True)
     judge.add_argument("--results", type=Path, required=True)
     judge.add_argument("--json", type=Path, default=RESULTS)
+    judge.add_argument("--first", type=int, help="judge this many cases only: a run that was cut short")
     given = parser.parse_args(args)
     return {"generate": _generate, "diagnose": _diagnose, "score": _score}[given.step](given)
 
@@ -67,8 +68,8 @@ def _score(given: argparse.Namespace) -> int:
     from experiments.blind_check.score import score
 
     oracles = _Oracles(given.sealed / "cases", given.results / "oracle")
-    again = partial(follow, progress=lambda name: _tell(f"again {name}"))
-    found = score(given.sealed, given.results, oracles, again)
+    again = partial(follow, progress=lambda name: _tell(f"again {name}"), first=given.first)
+    found = score(given.sealed, given.results, oracles, again, given.first)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(table(found))

@@ -22,13 +22,13 @@ from experiments.blind_check.sealing import unseal
 KNOWN = {f.name for f in fields(Style)}
 
 
-def follow(folder: Path, results: Path, progress=None) -> list[dict[str, Any]]:
-    """One entry for every case whose verdict is a set that holds the true cause; written case by case.
+def follow(folder: Path, results: Path, progress=None, first: int | None = None) -> list[dict[str, Any]]:
+    """One entry for every set (of the `first` cases) that holds the true cause; written case by case.
 
     `separated`: old and new recordings together are given the true cause and no other.
     """
     out = []
-    for entry in unseal(folder)["cases"]:
+    for entry in unseal(folder)["cases"][:first]:
         found = json.loads((results / f"{entry['case']}.json").read_text(encoding="utf-8"))
         if found.get("verdict") != "set" or found["next_experiment"] is None:
             continue
