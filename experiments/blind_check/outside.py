@@ -56,9 +56,33 @@ def _magnet(v: Values) -> Stage:
     return _force(shift)
 
 
-def _bent(v: Values) -> Stage:
-    """A force sensor whose gain grows with the load, the same way for push and pull."""
-    return lambda s, rng: replace(s, force=s.force * (1 + v["curve"] * np.abs(s.force)))
+def _kinked(v: Values) -> Stage:
+    """An overload spring: beyond a load each force channel has another gain."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        beyond = np.sign(s.force) * np.maximum(np.abs(s.force) - v["load"], 0.0)
+        return replace(s, force=s.force + v["change"] * beyond)
+
+    return stage
+
+
+def _creeping(v: Values) -> Stage:
+    """A sensor whose glue creeps: what it carries for long reads higher, and lingers when it is gone."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        slow = np.zeros_like(s.force)
+        for k in range(1, len(slow)):
+            share = 1 - np.exp(-(s.t[k] - s.t[k - 1]) / v["time"])
+            slow[k] = slow[k - 1] + share * (s.force[k - 1] - slow[k - 1])
+        return replace(s, force=s.force + v["share"] * slow)
+
+    return stage
+
+
+def _leaking(v: Values) -> Stage:
+    """A bad cable: the second finger's reading holds a share of the first's."""
+    first = [2, 3, 0, 1]
+    return lambda s, rng: replace(s, force=s.force + v["share"] * s.force[:, first] * [0, 0, 1, 1])
 
 
 def _ripple(v: Values) -> Stage:
@@ -79,9 +103,13 @@ def _dry(v: Values) -> Stage:
     return _force(lambda s, rng: v["force"] * np.tanh(s.motion.velocity / 0.004))
 
 
-def _warming(v: Values) -> Stage:
-    """A gain that changes in the course of a trial."""
-    return lambda s, rng: replace(s, force=s.force * (1 + v["rate"] * (s.t - s.t.mean()))[:, None])
+def _settling(v: Values) -> Stage:
+    """Amplifiers switched on at the start of each trial: their gain settles."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        return replace(s, force=s.force * (1 + v["change"] * np.exp(-(s.t - s.t[0]) / v["time"]))[:, None])
+
+    return stage
 
 
 def _made(name: str, draw, stage: int, build) -> Made:
@@ -98,10 +126,15 @@ OUTSIDE = {
               READOUT, _jump),
         _made("magnetic_table", lambda r, s: {"pull": 0.7 * s, "reach": r.uniform(0.006, 0.012)},
               HAND, _magnet),
-        _made("bent_gain", lambda r, s: {"curve": 0.12 * s * _sign(r)}, SCALE, _bent),
+        _made("kinked_gain", lambda r, s: {"change": 0.3 * s * _sign(r), "load": r.uniform(0.8, 1.6)},
+              SCALE, _kinked),
         _made("encoder_ripple", lambda r, s: {"amplitude": 0.006 * s, "periods": float(r.integers(9, 22))},
               ENCODER, _ripple),
         _made("dry_sleeve", lambda r, s: {"force": 0.16 * s}, HAND, _dry),
-        _made("warming_gain", lambda r, s: {"rate": 0.03 * s * _sign(r)}, SCALE, _warming),
+        _made("settling_gain", lambda r, s: {"change": 0.15 * s * _sign(r), "time": r.uniform(1.0, 3.0)},
+              SCALE, _settling),
+        _made("sensor_creep", lambda r, s: {"share": 0.1 * s * _sign(r), "time": r.uniform(0.4, 2.0)},
+              SCALE, _creeping),
+        _made("finger_leak", lambda r, s: {"share": 0.06 * s * _sign(r)}, SCALE, _leaking),
     )
 }  # fmt: skip
