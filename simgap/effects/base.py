@@ -27,14 +27,15 @@ class World(NamedTuple):
     (tip positions and velocities of a Cartesian hand), forces fx1, fy1, fx2, fy2. `link` (4,)
     relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
     `delay`, `smoothing` [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
-    the pads' delayed part. `tilt` [rad] and `give_support` [m/N] of the support. `inertia`: factor
-    of the mass times acceleration. `couple` [m]: how far the mass lies right of the middle.
+    the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
+    yields with that delay (a spring beside a damper). `inertia`: factor of the mass times acceleration.
+    `couple` [m]: how far the mass lies right of the middle.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
-    `doubt_joints` [rad^2], `doubt_force` [N^2] (T, N, 4): variance of what a correction cannot tell of
-    angles and of the pads' forces. `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (5,):
-    1 where a candidate delays or smooths forces, lets pads creep or slide or a mode ring (LATE, SMOOTH,
-    CREEPING, SLIDING, RINGING), so that equations without it are not evaluated.
+    `doubt_joints` [rad^2] (T, N, 4): variance of what a correction cannot tell of angles.
+    `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (6,): 1 where a candidate delays or
+    smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE, SMOOTH, CREEPING,
+    SLIDING, RINGING, YIELDING), so that equations without it are not evaluated.
     `free`, `ground`, `carry` (T, N): which state each sample is in (1 or 0); `events` (T, 4 M) [s]:
     touch, leave, meet, part of every move.
     """
@@ -56,12 +57,12 @@ class World(NamedTuple):
     creep_time: Array
     tilt: Array
     give_support: Array
+    support_time: Array
     inertia: Array
     couple: Array
     loudness: Array
     ring: Array
     doubt_joints: Array
-    doubt_force: Array
     slip: Array
     modes: Array
     free: Array
@@ -71,7 +72,7 @@ class World(NamedTuple):
     events: Array
 
 
-LATE, SMOOTH, CREEPING, SLIDING, RINGING = range(5)
+LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 
 class Performance(NamedTuple):

@@ -1,8 +1,16 @@
-"""A support that yields under load."""
+"""A support that yields under load, a little late."""
 
 from __future__ import annotations
 
-from simgap.effects.base import CONTACT, Effect, Parameter
+from simgap.effects.base import CONTACT, YIELDING, Effect, Parameter, World, with_mode
+
+
+def _correct(world: World, values, on) -> World:
+    # What yields has mass and damping: it is late by some hundredths of a second.
+    return with_mode(world, YIELDING, on)._replace(
+        give_support=world.give_support + values["give"],
+        support_time=world.support_time + on * values["settling"],
+    )
 
 
 def _report(draws, rig):
@@ -15,9 +23,12 @@ EFFECT = Effect(
     says="the support yields by load / stiffness",
     shows="height falls with vertical force on the ground",
     mistaken_for=("fingertip_compliance",),
-    parameters=(Parameter("give", "m/N", 4e-4, low=0.0),),
+    parameters=(
+        Parameter("give", "m/N", 4e-4, low=0.0),
+        Parameter("settling", "s", 0.8, neutral=0.02, low=1e-3, high=0.2, log=True, hidden=True),
+    ),
     stage=CONTACT,
-    correct=lambda w, v, on: w._replace(give_support=w.give_support + v["give"]),
+    correct=_correct,
     report=_report,
     scene=lambda v: {"support_stiffness": v["stiffness"]},
     coarse=True,

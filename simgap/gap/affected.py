@@ -2,48 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects import fitted
-from simgap.effects.base import World, tips
+from simgap.effects.base import World, gradient, tips
 from simgap.gap.fit import Problem, raw_residual_at, world_without
 from simgap.gap.frame import CHANNELS
+from simgap.gap.search import Candidate
+
+YIELDS = frozenset({"grip_slip", "table_compliance"})  # effects that show as a path from where a grip began
 
 
-def shifts(given: Problem, effects: Sequence[str], u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and rms shift (T, S, C) of a cell under the effects at coordinates u, in noise of one sample.
+def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
+    """Mean shift (T, S, C) of a cell under a candidate's effects, in noise of one sample.
 
     A sensor's or a joint's effect shifts what is recorded. What acts on contact shows in the equations of
-    the contact as well; the larger of the two counts.
+    the contact as well; the larger of the two counts. Times that are off at random shift the mean of a cell
+    by so much in root mean square.
     """
-    frame = given.frame
+    frame, effects, u = given.frame, candidate.fitted.effects, candidate.fitted.u
     without = world_without(given, effects, u)
-    change = _channels(frame.world) - _channels(without)
+    recorded = _channels(frame.world)
+    change = recorded - _channels(without)
     change[..., CHANNELS.index("shear")] += _couple(given, without, u)
+    change[..., CHANNELS.index("y")] += _inclined(given, without)
     there = given.whitening.weight > 0
-    mechanical = [e for e in effects if fitted()[e].acts_on not in ("sensing", "kinematics")]
+    mechanical = [
+        e for e in effects if fitted()[e].acts_on not in ("sensing", "kinematics") and e != "table_tilt"
+    ]
     violated = np.zeros_like(change)
     if mechanical:
         others = [e for e in effects if e not in mechanical]
         violated = np.where(
             there, raw_residual_at(given, others, u) - raw_residual_at(given, effects, u), 0.0
         )
+        if not YIELDS.isdisjoint(mechanical):
+            _from_pickup(given, violated)
+    jitter = np.zeros_like(change)
+    if candidate.spread is not None and candidate.spread.effect == "clock_jitter":
+        jitter = candidate.spread.value * np.asarray(gradient(frame.world.t, recorded))
     mean = np.zeros((frame.num_trials, len(frame.steps), change.shape[2]))
-    rms = np.zeros_like(mean)
     for r in range(frame.num_trials):
         n = frame.lengths[r]
         for s in range(len(frame.steps)):
             mine = np.flatnonzero(frame.arrays.subtask[r, :n] == s)
             if mine.size:
-                signal, number = change[r, mine], np.maximum(there[r, mine].sum(0), 1)
-                equation, square = violated[r, mine].sum(0) / number, (violated[r, mine] ** 2).sum(0) / number
-                mean[r, s] = np.maximum(np.abs(signal.mean(0)), np.abs(equation)) / frame.arrays.sample[r]
-                rms[r, s] = np.sqrt(np.maximum((signal**2).mean(0), square)) / frame.arrays.sample[r]
-    return mean, rms
+                signal, number = change[r, mine].mean(0), np.maximum(there[r, mine].sum(0), 1)
+                equation = violated[r, mine].sum(0) / number
+                scatter = np.sqrt((jitter[r, mine] ** 2).sum(0)) / mine.size
+                shift = np.maximum(np.abs(signal), np.abs(equation))
+                mean[r, s] = np.hypot(shift, scatter) / frame.arrays.sample[r]
+    return mean
+
+
+def _inclined(given: Problem, world: World) -> np.ndarray:
+    """Height (T, N) [m] of the support over where the first grip took its block."""
+    x = _channels(given.frame.world)[..., CHANNELS.index("x")]
+    first = _pickup(given, 0)
+    start = (x * first).sum(1, keepdims=True) / np.maximum(first.sum(1, keepdims=True), 1)
+    return np.tan(np.asarray(world.tilt)) * (x - start)
+
+
+def _pickup(given: Problem, move: int) -> np.ndarray:
+    """Samples (T, N) of a move's pickup, 1 or 0."""
+    arrays = given.frame.arrays
+    return arrays.phase[..., 1] * arrays.onehot[..., move]
+
+
+def _from_pickup(given: Problem, violated: np.ndarray) -> None:
+    """Shifts (T, N, C) of a grip from where it was in its pickup, in place.
+
+    What gives way under a load lets go of as much force as the pads have for that path.
+    """
+    arrays, pads = given.frame.arrays, given.frame.rig.fingertip
+    there = given.whitening.weight > 0
+    for move in range(arrays.onehot.shape[2]):
+        mine, first = arrays.onehot[..., move] * (arrays.phase[..., 0] == 0), _pickup(given, move)
+        for channel in ("y", "offset"):
+            c = CHANNELS.index(channel)
+            known = first * there[..., c]
+            start = (violated[..., c] * known).sum(1) / np.maximum(known.sum(1), 1)
+            violated[..., c] -= np.where(there[..., c], mine * start[:, None], 0.0)
+    stiffness = np.where(arrays.phase[..., 3] > 0, pads.shear_stiffness, 0.0)
+    for path, force, share in (("y", "fy", 2.0), ("offset", "shear", 0.5)):
+        violated[..., CHANNELS.index(force)] = share * stiffness * violated[..., CHANNELS.index(path)]
 
 
 def _couple(given: Problem, world: World, u: np.ndarray) -> np.ndarray:

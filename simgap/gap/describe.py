@@ -20,10 +20,7 @@ from simgap.gap.shrinkage import folds_of
 PROPERTIES = ("weight", "width", "height")
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 DRAWS = 400
-AFFECTED, SEEN = (
-    3.0,
-    2.0,
-)  # sds of one sample: shift of a cell that is listed for it; with a significant score
+AFFECTED = 3.0  # sds of one sample: mean shift of a cell that is listed for it
 
 
 def describe(
@@ -104,29 +101,26 @@ def where(
 ) -> list[dict[str, Any]]:
     """Significant cells, largest share of the excess first.
 
-    Where the cause is named they are the cells that it shifts by AFFECTED sds of a sample, and those above
-    the threshold that it shifts by SEEN or scatters; else those above the threshold, whatever made them.
-    Shares are of what the model leaves in them: a shift that the properties absorb has none.
+    Where the cause is named they are the cells whose mean it shifts by AFFECTED sds of a sample; where it
+    shifts none so far, those above the threshold of the channel and subtask with the largest excess. With no
+    cause named they are all those above the threshold. Shares are of what the model leaves in them: a shift
+    that the properties absorb has none.
     """
     rows: dict[tuple, tuple[float, float]] = {}  # trial, channel, subtask, band -> excess, z
-    shape = (given.frame.num_trials, len(given.frame.steps), len(CHANNELS))
-    mean, rms = np.zeros(shape), np.full(shape, np.inf)
-    if candidate is not None:
-        mean, rms = shifts(given, candidate.fitted.effects, candidate.fitted.u)
-    anywhere = candidate is None or candidate.spread is not None  # scatter has no place of its own
     lowest = {(k.trial, k.channel, k.subtask): k for k in found if k.band[0] == 0.0}
-    for k in found:
-        at = k.trial, k.subtask, CHANNELS.index(k.channel)
-        moved = (mean if k.band[0] == 0.0 else rms)[at]
-        if k.z > threshold and (anywhere or moved >= SEEN):
-            rows[k.trial, k.channel, k.subtask, k.band] = (max(k.energy - k.count, 0.0), k.z)
+    mean = np.zeros((0, 0, 0)) if candidate is None else shifts(given, candidate)
     for r, s, c in np.argwhere(mean >= AFFECTED):
         cell, shift = lowest.get((r, CHANNELS[c], s)), float(mean[r, s, c])
         count = int((given.frame.arrays.subtask[r, : given.frame.lengths[r]] == s).sum())
         band = (0.0, BANDS[1]) if cell is None else cell.band
         excess = 0.0 if cell is None else max(cell.energy - cell.count, 0.0)
-        z = float(normal_score(count * (1 + shift**2), count))
-        rows.setdefault((int(r), CHANNELS[c], int(s), band), (excess, z))
+        rows[int(r), CHANNELS[c], int(s), band] = excess, float(normal_score(count * (1 + shift**2), count))
+    if not rows:
+        loud = [k for k in found if k.z > threshold]
+        most = _loudest(loud) if candidate is not None else None
+        for k in loud:
+            if most in (None, (k.channel, k.subtask)):
+                rows[k.trial, k.channel, k.subtask, k.band] = max(k.energy - k.count, 0.0), k.z
     ranked = sorted(rows.items(), key=lambda row: (-row[1][0], -row[1][1]))
     total = max(sum(excess for excess, _ in rows.values()), 1e-12)
     return [
@@ -136,3 +130,11 @@ def where(
         }
         for (r, channel, s, band), (excess, z) in ranked
     ]  # fmt: skip
+
+
+def _loudest(found: Sequence[Cell]) -> tuple[str, int] | None:
+    """Channel and subtask with the largest excess over all trials and bands; None where there is none."""
+    total: dict[tuple[str, int], float] = {}
+    for k in found:
+        total[k.channel, k.subtask] = total.get((k.channel, k.subtask), 0.0) + k.energy - k.count
+    return max(total, key=lambda at: total[at]) if total else None

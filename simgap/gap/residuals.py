@@ -13,13 +13,16 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, World, gradient, tips
+from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, YIELDING, World, gradient, tips
 from simgap.gap.frame import CHANNELS, Arrays
 
 TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # sds of the distance by which fingers must be nearer than the block is wide to touch it
 HELD = 0.1  # N; a grip below this holds nothing
 BETWEEN = 0.3  # of a bend, sd: a force read between samples
+CURVED = 0.5  # of the difference of two ways to take a slope, sd: how far it may be off
+EVEN = 0.025  # N; changes from one sample to the next below this have no corner
+SHARP = 0.75  # change of slope, as a share of its sides, beyond which a force has a corner
 EITHER = 0.6  # of a force's change, sd: how a force between two samples goes from one to the other
 SLIDE = 2e-3  # m; how far a pad may slide from one sample to the next
 ANYWHERE = 0.05  # m; sd of where a grip takes its block
@@ -59,7 +62,7 @@ def residuals(
     offset = y2 - y1 - (fy2 * s2 - fy1 * s1)
     x = (x1 + x2) / 2 - (fx1 * n1 + fx2 * n2) / 2
     load = weight - force[..., 1] - force[..., 3]
-    y = (y1 + y2) / 2 - (fy1 * s1 + fy2 * s2) / 2 + load * world.give_support
+    y = (y1 + y2) / 2 - (fy1 * s1 + fy2 * s2) / 2 + _sunk(world, load)
     y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
     still = firm * (arrays.phase[..., 1] + place)
     onground = firm * world.ground
@@ -111,7 +114,7 @@ def _doubt(world: World, firm: jax.Array) -> jax.Array:
     there = world.jointed > 0.5
     turn_x, turn_y = (jnp.where(there, turn, 0.0) for turn in (turn_x, turn_y))
 
-    pads = world.doubt_force + _between(world)
+    pads = _between(world)
 
     def finger(turn: jax.Array, give: jax.Array, force: int) -> tuple[jax.Array, jax.Array]:
         place = jnp.square(turn) * world.doubt_joints
@@ -121,6 +124,31 @@ def _doubt(world: World, firm: jax.Array) -> jax.Array:
     (x1, x2), (y1, y2) = finger(turn_x, world.give_normal, 0), finger(turn_y, world.give_shear, 1)
     x, y = x1 + x2, y1 + y2
     return jnp.stack([x / 4, y / 4, x, y], -1) * jnp.square(firm)[..., None]
+
+
+def _sunk(world: World, load: jax.Array) -> jax.Array:
+    """How far (T, N) [m] the support yields to what it carries of a block's weight, with its delay.
+
+    Before a grip it has settled under the block; it carries nothing of one that is in the air.
+    """
+
+    def sinking(load: jax.Array) -> jax.Array:
+        borne = load * (1 - world.carry)
+        ratio = _step(world) / jnp.maximum(world.support_time, 1e-4)
+        keep = jnp.exp(-ratio)
+        new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep
+        before = jnp.concatenate([borne[:, :1], borne[:, :-1]], 1)
+
+        def step(depth, now):
+            drive, borne, free, carry = now
+            depth = (1 - carry) * ((1 - free) * (keep * depth + drive) + free * borne)
+            return depth, depth
+
+        rows = tuple(z.T for z in (new * borne + old * before, borne, world.free, world.carry))
+        _, out = jax.lax.scan(step, borne[:, 0], rows)
+        return out.T
+
+    return world.give_support * _when(world, YIELDING, sinking, load)
 
 
 def _compact(v: jax.Array) -> jax.Array:
@@ -134,21 +162,54 @@ def _step(world: World) -> jax.Array:
 
 
 def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
-    """Values (T, N, C) read `steps` samples later (a fraction allowed): cubic Catmull-Rom."""
+    """Values (T, N, C) read `steps` samples later (a fraction allowed): cubic Catmull-Rom.
+
+    Where they have a corner between two samples, as at a contact change, both sides go straight on to it:
+    before a contact there is no force yet.
+    """
     n = values.shape[1]
     whole = jnp.floor(steps)
     s = steps - whole
     index = jnp.arange(n) + whole.astype(int)
     p0, p1, p2, p3 = (values[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2))
     cubic = ((-p0 + 3 * p1 - 3 * p2 + p3) * s + (2 * p0 - 5 * p1 + 4 * p2 - p3)) * s + (p2 - p0)
-    return p1 + 0.5 * s * cubic
+    left, right = p1 + s * (p1 - p0), p2 - (1 - s) * (p3 - p2)
+    corner = jnp.where(p3 - p2 > p1 - p0, jnp.maximum(left, right), jnp.minimum(left, right))
+    corner = jnp.clip(corner, jnp.minimum(p1, p2), jnp.maximum(p1, p2))
+    smooth = p1 + 0.5 * s * cubic
+    return smooth + _sharp(p1 - p0, p3 - p2, EVEN) * (corner - smooth)
+
+
+def _sharp(left: jax.Array, right: jax.Array, even: float | jax.Array) -> jax.Array:
+    """How surely (0 to 1) changes on both sides are those of a corner; both are alike below `even`."""
+    size = jnp.abs(left) + jnp.abs(right) + even
+    return jax.nn.sigmoid((jnp.abs(left - right) / size - SHARP) / 0.08)
 
 
 def undelayed(world: World) -> jax.Array:
     """Forces (T, N, 4) before delay and low-pass, and before they rang a mode."""
     force = _when(world, RINGING, lambda f: _driven(world, f, back=True), world.force)
     force = _when(world, LATE, lambda f: shifted(f, world.delay / _step(world)), force)
-    return _when(world, SMOOTH, lambda f: f + world.smoothing * gradient(world.t, f), force)
+    return _when(world, SMOOTH, lambda f: f + world.smoothing * _slope(world, f)[0], force)
+
+
+def _slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Rate of change (T, N, C) of forces from five samples, and by how much it is in doubt.
+
+    Three samples alone take sin(w) for w [rad a sample]: a low-pass would come out too slow. Where a force
+    bends too sharply for either, at a contact change, the flatter side counts (a minmod limiter: Sweby, SIAM
+    J. Numer. Anal. 21, 1984): before a contact there is no force yet.
+    """
+    near = gradient(world.t, force)
+    far = (force[:, 4:] - force[:, :-4]) / jnp.maximum(world.t[:, 4:] - world.t[:, :-4], 1e-6)[..., None]
+    far = jnp.concatenate([near[:, :2], far, near[:, -2:]], 1)
+    smooth = (4 * near - far) / 3
+    side = (force[:, 1:] - force[:, :-1]) / jnp.maximum(world.t[:, 1:] - world.t[:, :-1], 1e-6)[..., None]
+    left, right = jnp.concatenate([side[:, :1], side], 1), jnp.concatenate([side, side[:, -1:]], 1)
+    sharp = _sharp(left, right, EVEN / _step(world))
+    flatter = jnp.where(left * right > 0, jnp.where(jnp.abs(left) < jnp.abs(right), left, right), 0.0)
+    doubt = (1 - sharp) * jnp.abs(smooth - near) + sharp * jnp.abs(smooth - flatter)
+    return smooth + sharp * (flatter - smooth), doubt
 
 
 def _filtered(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -232,7 +293,7 @@ def _known(arrays: Arrays, channel: str) -> jax.Array:
 
 
 def _between(world: World) -> jax.Array:
-    """Variance (T, N, 4) [N^2] of forces that were read between samples, from how sharply they bend there."""
+    """Variance (T, N, 4) [N^2] of forces before delay and low-pass, from how sharply they bend."""
 
     def rough(f: jax.Array) -> jax.Array:
         bend = jnp.abs(jnp.pad(f[:, 2:] - 2 * f[:, 1:-1] + f[:, :-2], ((0, 0), (2, 2), (0, 0))))
@@ -240,7 +301,12 @@ def _between(world: World) -> jax.Array:
         sd = BETWEEN * share * (1 - share)
         return jnp.square(sd * jnp.maximum(jnp.maximum(bend[:, :-2], bend[:, 1:-1]), bend[:, 2:]))
 
-    return jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, rough, jnp.zeros_like, jnp.asarray(world.force))
+    def steep(f: jax.Array) -> jax.Array:
+        return jnp.square(CURVED * world.smoothing * _slope(world, f)[1])
+
+    force = jnp.asarray(world.force)
+    late = jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, rough, jnp.zeros_like, force)
+    return late + jax.lax.cond(jnp.asarray(world.modes)[SMOOTH] > 0, steep, jnp.zeros_like, force)
 
 
 def _centred(values: jax.Array, arrays: Arrays, weight: jax.Array, place: jax.Array | None) -> jax.Array:

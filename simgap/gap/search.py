@@ -37,14 +37,15 @@ from simgap.gap.spread import SPREADS, Spread, spreads
 ALARM = 0.01  # chance that a healthy recording is called otherwise
 SHIFT = 0.008  # s; boundaries that move farther are taken anew
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
-REALIGNED, LEADING = 2, 3  # times at most; without the first of so many candidates that all trials then fit
+REALIGNED, LEADING = 3, 3  # times at most; without the first of so many candidates that all trials then fit
 REFINED = 6  # candidates fitted again after boundaries moved
-WORTH = 0.5  # a pair must leave no more than this share of what its better half leaves
-MORE, COARSE = (
-    0.0003,
-    0.003,
-)  # and must gain this share of its evidence over that half, more if that is coarse
-LEAST = 12.0  # nats that a pair must gain as well
+WORTH = 0.7  # a pair must leave no more than this share of what its better half leaves
+MORE = 0.0003  # and must gain this share of its evidence over that half,
+COARSE = 0.005  # more if that is coarse
+FITTING = 0.01  # and still more if nothing but noise seems left,
+LEAST = 10.0  # and so many nats
+STUCK = 2.0  # nats at T = 1 by which a half of a pair, taken alone, may do better than as a single so far
+ALONE = 0.2  # share of its gain that an effect must keep without the subtask of a trial that it gains most in
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 WILD, LOUD = 5.0, 3.0  # sd; an event reaches the first and goes on while samples exceed the second
 BESIDE = 0.015  # share of residuals beside contact changes that may be left out of the fits
@@ -115,10 +116,12 @@ def search(
     # Late, slow or soft contacts displace boundaries: align again without the best explanation.
     for _ in range(REALIGNED):
         leading = [f for f in sorted(fits, key=lambda f: f.cost) if healthy.cost - f.cost >= WORTHY]
-        tell("aligning again without the best explanation")
+        if leading:
+            tell("aligning again without the best explanation")
         tried = (realigned(trials, given, f) for f in leading[:LEADING])
-        again = next((a for a in tried if moved(aligned, a) < np.inf), None)
-        if again is None or moved(aligned, again) <= SHIFT:
+        shifts = ((moved(aligned, a), a) for a in tried)
+        far, again = next((pair for pair in shifts if pair[0] < np.inf), (0.0, aligned))
+        if far <= SHIFT:
             break
         aligned = again
         given = problem(build(trials, aligned, rig), bank.noise, actual)
@@ -142,18 +145,12 @@ def search(
     found.sort(key=lambda c: -c.evidence)
     tell("trying pairs")
     if found[0].evidence > PAIRED:
-        singles = tuple(found)
-        enough = singles[0].spread is None and left(given, singles[0], healthy, bank)[1] > ALARM
-        beam = [c for c in singles if c.spread is None and c.name not in decoys()][: 1 if enough else BEAM]
-        for pair in _pairs(given, beam, healthy, names, temperature):
-            better = max((c for c in singles if c.name in pair.effects), key=lambda c: c.evidence)
-            coarse = any(catalogue()[name].coarse for name in better.effects)
-            if pair.evidence - better.evidence < max((COARSE if coarse else MORE) * pair.evidence, LEAST):
-                continue
-            rest = left(given, better, healthy, bank)[0]
-            if left(given, pair, healthy, bank)[0] < max(WORTH * rest, LITTLE):
-                found.append(pair)
-        found.sort(key=lambda c: -c.evidence)
+        pairs = _tried(given, found, healthy, names, temperature, bank)
+        better = _unstuck(given, found, pairs, healthy, temperature)
+        if better != found:  # a single was in a worse optimum: what goes with it may have been, too
+            found = better
+            pairs = _tried(given, found, healthy, names, temperature, bank)
+        found = sorted([*found, *_worthwhile(given, found, pairs, healthy, bank)], key=lambda c: -c.evidence)
     return Search(given, healthy, tuple(found), statistics, temperature, tuple(warnings))
 
 
@@ -164,7 +161,80 @@ def _candidate(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -
 def _single(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Candidate:
     """A single effect; decoys hold what others are and more, so they are thought less likely."""
     found = _candidate(given, f, healthy, temperature)
-    return replace(found, evidence=found.evidence - STRANGE) if found.name in decoys() else found
+    if found.name in decoys():
+        return replace(found, evidence=found.evidence - STRANGE)
+    return _recurring(given, found, healthy, temperature)
+
+
+def _recurring(given: Problem, found: Candidate, without: Fitted, temperature: float) -> Candidate:
+    """A candidate less what it gains over a fit `without` in one subtask of one trial, if that is most of it.
+
+    How far pads slide is free in every grip: a candidate that may slide explains any one jump. An effect
+    would recur.
+    """
+    f = found.fitted
+    added = set(f.effects) - set(without.effects)
+    if given.frame.num_trials < RECURS or not any(catalogue()[name].switched for name in added):
+        return found
+    gain = (without.square - f.square) / 2
+    most, total = float(gain.max()), float(gain.sum())
+    once = most if total - most < ALONE * total else 0.0
+    return replace(found, evidence=found.evidence - once / temperature)
+
+
+def _tried(
+    given: Problem,
+    singles: Sequence[Candidate],
+    healthy: Fitted,
+    names: list[str],
+    temperature: float,
+    bank: Bank,
+) -> list[Candidate]:
+    """Pairs of the leading singles with whatever gains most beside them."""
+    enough = singles[0].spread is None and left(given, singles[0], healthy, bank)[1] > ALARM
+    beam = [c for c in singles if c.spread is None and c.name not in decoys()][: 1 if enough else BEAM]
+    return _pairs(given, beam, healthy, names, temperature)
+
+
+def _unstuck(
+    given: Problem,
+    singles: list[Candidate],
+    pairs: Sequence[Candidate],
+    healthy: Fitted,
+    temperature: float,
+) -> list[Candidate]:
+    """The singles, best first, fitted again from the values that they have in the best pair."""
+    if not pairs:
+        return singles
+    best = max(pairs, key=lambda c: c.evidence)
+    stuck = [c for c in singles if c.name in best.fitted.effects]
+    if best.spread is not None or best.evidence < max(c.evidence for c in stuck) + LEAST:
+        return singles
+    again = {f.effects: f for f in fit(given, [Start(c.effects, best.fitted.u) for c in stuck])}
+    freed = {
+        c.name: _single(given, again[c.effects], healthy, temperature)
+        for c in stuck
+        if again[c.effects].cost < c.fitted.cost - STUCK
+    }
+    return sorted((freed.get(c.name, c) for c in singles), key=lambda c: -c.evidence) if freed else singles
+
+
+def _worthwhile(
+    given: Problem, singles: Sequence[Candidate], pairs: Sequence[Candidate], healthy: Fitted, bank: Bank
+) -> list[Candidate]:
+    """The pairs that say enough more than the better one of their halves."""
+    out = []
+    for pair in pairs:
+        better = max((c for c in singles if c.name in pair.effects), key=lambda c: c.evidence)
+        rest, p_rest = left(given, better, healthy, bank)
+        share = MORE
+        if any(catalogue()[name].coarse for name in better.effects):
+            share = FITTING if p_rest > ALARM else COARSE
+        if pair.evidence - better.evidence < max(share * pair.evidence, LEAST):
+            continue
+        if left(given, pair, healthy, bank)[0] < max(WORTH * rest, LITTLE):
+            out.append(pair)
+    return out
 
 
 def _forced(
@@ -311,7 +381,9 @@ def _pairs(
         fits = sorted(fits, key=lambda f: f.cost)[:PARTNERS]
         for f in fit(given, [Start(f.effects, f.u) for f in fits]):
             name = judge.joined(f.effects)
-            candidate = Candidate(name, judge.log_evidence(given, f, healthy, temperature), f)
+            candidate = _recurring(
+                given, _candidate(given, f, healthy, temperature), single.fitted, temperature
+            )
             if name not in out or candidate.evidence > out[name].evidence:
                 out[name] = candidate
         for s in spreads(given, single.fitted):
