@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from simgap.effects import decoys
+from simgap.effects import decoys, fitted
 from simgap.gap import judge
 from simgap.gap.judge import Calibration
 from simgap.gap.search import ALARM, Candidate, Search
 
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
-FORM = 0.002  # nor those within this share of its evidence: no form is exact to that
+FORM = 0.002  # nor those within this share of its evidence that differ by a coarse effect,
+EXACT = 1e-4  # or within this one by others: no form is exact to that
 
 
 def likelihoods(
@@ -42,10 +43,18 @@ def choose(
     if max(probability["unknown"], probability["none"]) > 0.5:
         return "unknown", [], []
     alike = [k for k in others if len(k.effects) == len(best.effects)]
-    tie = max(TIE, FORM * best.evidence)
-    near = [k for k in alike if best.evidence - k.evidence < tie or _as_good(best, k, found.temperature)]
+    near = [
+        k for k in alike if best.evidence - k.evidence < _tie(best, k) or _as_good(best, k, found.temperature)
+    ]
     partners = sorted({e for k in near for e in k.effects} - set(best.effects))
     return ("set" if partners else "named"), sorted(best.effects), partners
+
+
+def _tie(best: Candidate, other: Candidate) -> float:
+    """Nats (tempered) by which a candidate must be behind the best to be told from it."""
+    differ = set(best.effects) ^ set(other.effects)
+    coarse = any(fitted()[name].coarse for name in differ)
+    return max(TIE, (FORM if coarse else EXACT) * best.evidence)
 
 
 def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:

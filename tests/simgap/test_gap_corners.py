@@ -1,0 +1,97 @@
+"""Late, slow and yielding things at contact changes: forces before their sensor, supports that settle."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lfilter, lsim
+
+from hmmseg import jaxconfig  # noqa: F401
+from simgap.effects.base import SMOOTH, YIELDING
+from simgap.gap.residuals import _between, _sunk, shifted, undelayed
+from tests.simgap.test_gap_effects import as_jax, performance, world_of
+
+STEP = 0.05  # s
+
+
+def _slow(force, time: float):
+    """A world whose forces (N,) are all the same and pass a low-pass of `time` [s]."""
+    world = as_jax(world_of(performance(10 * len(force))))
+    every = jnp.repeat(jnp.asarray(force)[None, :, None], 4, axis=2)
+    return world._replace(
+        force=every, smoothing=jnp.asarray(time), modes=jnp.asarray(world.modes).at[SMOOTH].set(1.0)
+    )
+
+
+def _recorded(force_of, time: float, n: int) -> np.ndarray:
+    """Forces (n,) after an exact low-pass on a grid a hundred times finer."""
+    fine = np.arange(100 * n) * STEP / 100
+    keep = np.exp(-STEP / 100 / time)
+    return np.asarray(lfilter([1 - keep], [1, -keep], force_of(fine)))[::100]
+
+
+@pytest.mark.parametrize("time", [0.06, 0.15])
+def test_smooth_forces_are_found_behind_a_low_pass(time):
+    t = np.arange(80) * STEP
+
+    def force(at):
+        return 1.5 + np.sin(2 * np.pi * 1.5 * at)
+
+    found = np.asarray(undelayed(_slow(_recorded(force, time, 80), time)))[0, 20:-5, 0]
+    assert np.abs(found - force(t)[20:-5]).max() < 0.12  # three samples alone are off by more than 0.2
+
+
+def test_no_force_before_the_contact_behind_a_low_pass():
+    t = np.arange(60) * STEP
+    onset = 20.4 * STEP
+
+    def force(at):
+        return 4.0 * np.maximum(at - onset, 0.0)
+
+    found = np.asarray(undelayed(_slow(_recorded(force, 0.1, 60), 0.1)))[0, :, 0]
+    assert np.abs(found[:21]).max() < 0.02
+    assert np.abs(found - force(t))[24:-5].max() < 0.05
+
+
+def test_a_corner_is_in_doubt_and_a_straight_force_is_not():
+    ramp = 3.0 * np.maximum(np.arange(60) - 20, 0.0) * STEP
+    variance = np.asarray(_between(_slow(ramp, 0.1)))[0, :, 0]
+    assert variance[18:23].max() > 1e-3 and variance[25:-5].max() < 1e-6
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_contact_between_two_samples_is_read_on_either_side_of_it(share):
+    t = np.arange(40.0)
+    force = 0.8 * np.maximum(t - 19.6, 0.0)
+    found = np.asarray(shifted(jnp.asarray(force)[None, :, None], jnp.asarray(share)))[0, :, 0]
+    true = 0.8 * np.maximum(t + share - 19.6, 0.0)
+    assert np.abs(found - true)[:-3].max() < 0.03
+
+
+def test_smooth_values_between_samples_are_cubic():
+    t = np.arange(60.0)
+    found = np.asarray(shifted(jnp.asarray(np.sin(0.4 * t))[None, :, None], jnp.asarray(0.5)))[0, 3:-3, 0]
+    wave = np.sin(0.4 * (t + 0.5))[3:-3]
+    off = np.abs(found - wave)
+    assert off.max() < 0.05  # a crest between two samples is taken for a blunt corner
+    assert off[np.abs(wave) < 0.8].max() < 0.001
+
+
+def test_a_support_settles_like_a_spring_beside_a_damper():
+    n, time, give = 60, 0.04, 4e-4
+    world = as_jax(world_of(performance(10 * n)))
+    t = np.arange(n) * STEP
+    carry = ((t > 1.0) & (t < 2.0)).astype(float)
+    world = world._replace(
+        give_support=jnp.asarray(give), support_time=jnp.asarray(time), carry=jnp.asarray(carry)[None],
+        free=jnp.zeros((1, n)), ground=jnp.asarray(1 - carry)[None],
+        modes=jnp.asarray(world.modes).at[YIELDING].set(1.0),
+    )  # fmt: skip
+    load = np.where(t >= 2.0, np.minimum(3.0 * (t - 2.0 + STEP), 0.8), 0.5)
+    depth = np.asarray(_sunk(world, jnp.asarray(load)[None]))[0]
+    borne = load * (1 - carry)
+    after = t > 1.5  # what is in the air weighs on nothing: the oracle starts from rest
+    oracle = lsim(([give], [time, 1.0]), borne[after], t[after] - t[after][0])[1]
+    np.testing.assert_allclose(depth[after], oracle, atol=1e-9)
+    np.testing.assert_allclose(depth[t < 1.0], give * 0.5, atol=1e-9)

@@ -1,0 +1,77 @@
+"""What is seen once is no effect; a single in a worse optimum is freed from it by its pair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import commands
+from hmmseg.rig import read_rig
+from hmmseg.task import BlockTask, read_task
+from hmmseg.trial import read_trial
+from simgap.gap import search as searching
+from simgap.gap.affected import shifts
+from simgap.gap.diagnose import diagnose
+from simgap.gap.fit import Start, fit
+from simgap.gap.frame import CHANNELS
+from simgap.gap.search import Candidate, _recurring, _unstuck
+
+FOLDER = Path(commands.__file__).parent / "demo_data"
+RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
+assert isinstance(TASK, BlockTask)
+TRIALS = [read_trial(FOLDER / f"trial_{k:02d}.csv", RIG) for k in (1, 2, 3, 4)]
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    return diagnose(TRIALS, TASK, RIG)
+
+
+def _slip(quiet, gain):
+    """A slip whose squares are less than the healthy ones by twice `gain` (T, S)."""
+    f = replace(quiet.healthy, effects=("grip_slip",), square=quiet.healthy.square - 2 * gain)
+    return Candidate("grip_slip", 20.0, f)
+
+
+def test_what_one_subtask_of_one_trial_gains_is_no_slip(quiet):
+    gain = np.zeros(quiet.healthy.square.shape)
+    gain[1, 3] = 30.0
+    assert _recurring(quiet.problem, _slip(quiet, gain), quiet.healthy, 1.5).evidence == pytest.approx(0.0)
+    gain[:, 3] = 30.0
+    assert _recurring(quiet.problem, _slip(quiet, gain), quiet.healthy, 1.5).evidence == 20.0
+
+
+def test_other_effects_may_gain_anywhere(quiet):
+    gain = np.zeros(quiet.healthy.square.shape)
+    gain[1, 3] = 30.0
+    found = replace(_slip(quiet, gain), name="force_bias")
+    found = replace(found, fitted=replace(found.fitted, effects=("force_bias",)))
+    assert _recurring(quiet.problem, found, quiet.healthy, 1.5).evidence == 20.0
+
+
+def test_a_single_in_a_worse_optimum_is_freed_by_its_pair(quiet):
+    given, healthy = quiet.problem, quiet.healthy
+    single = Candidate("force_bias", -5.0, fit(given, [Start(("force_bias",), healthy.u)])[0])
+    stuck = replace(single, evidence=-50.0, fitted=replace(single.fitted, cost=single.fitted.cost + 40.0))
+    both = fit(given, [Start(("force_bias", "force_gain"), healthy.u)])[0]
+    pair = Candidate("force_bias+force_gain", 10.0, both)
+    (freed,) = _unstuck(given, [stuck], [pair], healthy, 1.5)
+    assert freed.fitted.cost == pytest.approx(single.fitted.cost, abs=0.5) and freed.evidence > stuck.evidence
+    (same,) = _unstuck(given, [single], [pair], healthy, 1.5)
+    assert same is single
+
+
+def test_a_tilt_shifts_heights_away_from_where_the_stack_stood(quiet):
+    found = diagnose(TRIALS, TASK, RIG, forced=["table_tilt"])
+    (tilt,) = found.candidates
+    slot = next(s for s in searching.slots(found.problem.num_properties)[0] if s.effect.name == "table_tilt")
+    u = tilt.fitted.u.copy()
+    u[slot.start] = slot.effect.parameters[0].coordinate(0.02)
+    mean = shifts(found.problem, replace(tilt, fitted=replace(tilt.fitted, u=u)))
+    heights, steps = mean[0, :, CHANNELS.index("y")], [s.name for s in found.problem.frame.steps]
+    assert heights[steps.index("pickup")] < 1.0 and heights[steps.index("place")] > 3.0
+    others = [c for c in range(len(CHANNELS)) if CHANNELS[c] != "y"]
+    assert np.abs(mean[0][:, others]).max() < 1e-6
