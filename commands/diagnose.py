@@ -232,6 +232,13 @@ def sentence(body: dict[str, Any]) -> str:
     return f"The gap is caused by {causes}{far}."
 
 
+def cells_title(body: dict[str, Any]) -> str:
+    """What the cells of `where` are: a named cause's own, judged by a bank, or all that are significant."""
+    if body["causes"] and "bank" in body["detection"]:
+        return f"cells that {' and '.join(body['causes'])} shifted, largest share of the excess first"
+    return "where the gap is largest"
+
+
 def tables(body: dict[str, Any]) -> list[Table]:
     """Probabilities, parameters of the cause and the largest cells, for people to read."""
     likely = Table(title="probabilities", title_justify="left")
@@ -253,7 +260,7 @@ def tables(body: dict[str, Any]) -> list[Table]:
         following.add_row(body["next_experiment"]["do"])
         out.append(following)
     if body["where"]:
-        cells = Table(title="where the gap is largest", title_justify="left")
+        cells = Table(title=cells_title(body), title_justify="left")
         for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
             cells.add_column(head, no_wrap=True)
         for row in body["where"][:8]:

@@ -34,6 +34,7 @@ def test_the_page_opens_in_a_browser(tmp_path):
     for id in ("verdict", "where", "suspects", "parameters", "properties"):
         assert f'id="{id}"' in shown.stdout
     assert "fingertip_compliance" in shown.stdout.split('id="verdict"')[1].split("</p>")[0]
+    assert "Cells that fingertip_compliance shifted" in shown.stdout
     picture = tmp_path / "page.png"
     subprocess.run(
         [*command, f"--screenshot={picture}", "--window-size=1000,2400", page.as_uri()],
