@@ -190,7 +190,8 @@ def _against(
     if out.report is not None:
         from commands.gap_report import generic_page
 
-        out.stage(out.report).write_text(generic_page(found, sentence(found.body)), encoding="utf-8")
+        told = generic_page(found, sentence(found.body), cells_title(found.body))
+        out.stage(out.report).write_text(told, encoding="utf-8")
     out.finish(found.body)
 
 
@@ -205,7 +206,8 @@ def _draw(out: Output, found, measured) -> None:
         draw_all(found, out.figure)
     if out.report is not None:
         told = f"{sentence(found.body)} {BANKS[found.body['detection']['bank']]}"
-        out.stage(out.report).write_text(page(found, told, measured), encoding="utf-8")
+        text = page(found, told, cells_title(found.body), measured)
+        out.stage(out.report).write_text(text, encoding="utf-8")
 
 
 def p_text(p: float) -> str:

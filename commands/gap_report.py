@@ -20,25 +20,26 @@ if TYPE_CHECKING:
 TEMPLATE = Path(__file__).with_name("gap_report.html")
 
 
-def page(found: Diagnosis, sentence: str, measured: dict | None) -> str:
-    """The page as text; figures are drawn and embedded."""
+def page(found: Diagnosis, sentence: str, cells: str, measured: dict | None) -> str:
+    """The page as text, `cells` over the table of cells; figures are drawn and embedded."""
     shows = {name: effect.shows for name, effect in catalogue().items()}
-    return rendered(found, sentence, measured, draw_all, found.problem.frame.files, shows)
+    return rendered(found, sentence, cells, measured, draw_all, found.problem.frame.files, shows)
 
 
-def generic_page(found: GenericDiagnosis, sentence: str) -> str:
+def generic_page(found: GenericDiagnosis, sentence: str, cells: str) -> str:
     """The page of a diagnosis against given simulated trials."""
     from commands.figures.gap_generic import draw_all as draw
     from simgap.generic.effects import CANDIDATES
 
     files = [cut.trial.name for cut in found.scene.layout.ensembles.real]
     shows = {name: candidate.shows for name, candidate in CANDIDATES.items()}
-    return rendered(found, sentence, None, draw, files, shows)
+    return rendered(found, sentence, cells, None, draw, files, shows)
 
 
 def rendered(
     found: Any,
     sentence: str,
+    cells: str,
     measured: dict | None,
     draw: Callable,
     files: Sequence[str],
@@ -54,6 +55,7 @@ def rendered(
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         body=body,
         sentence=sentence,
+        cells=cells,
         images=images,
         files=files,
         warnings=found.warnings,

@@ -38,8 +38,14 @@ def test_smooth_forces_are_found_behind_a_low_pass(time):
     def force(at):
         return 1.5 + np.sin(2 * np.pi * 1.5 * at)
 
-    found = np.asarray(undelayed(_slow(_recorded(force, time, 80), time)))[0, 20:-5, 0]
-    assert np.abs(found - force(t)[20:-5]).max() < 0.12  # three samples alone are off by more than 0.2
+    recorded = _recorded(force, time, 80)
+    found = np.asarray(undelayed(_slow(recorded, time)))[0, :, 0]
+    three = recorded + time * np.gradient(recorded, STEP)
+    off, plain = (np.abs(z - force(t))[20:-5] for z in (found, three))
+    slope = np.abs(np.diff(recorded, prepend=0))[20:-5]
+    steep = slope > 0.6 * slope.max()
+    assert np.sqrt((off[steep] ** 2).mean()) < 0.7 * np.sqrt((plain[steep] ** 2).mean())
+    assert off.max() < 0.12  # at a crest, which is taken for a corner; three samples are better there
 
 
 def test_no_force_before_the_contact_behind_a_low_pass():

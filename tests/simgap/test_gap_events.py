@@ -80,6 +80,7 @@ def test_unknown_grows_with_what_is_left_and_how_surely():
     assert (
         alien("force_bias", 3 * c.unknown_at, 1e-40, c) > 0.8 > alien("force_bias", 3 * c.unknown_at, 1e-4, c)
     )
+    assert alien("force_bias", 0.3, 1e-40, c) > 0.95
     assert alien("force_bias", 0.003, 1e-10, c) < 0.5
     assert alien("force_lag", 0.1, 1e-10, c) < alien("force_bias", 0.1, 1e-10, c)  # coarse in time
     assert alien("force_bias", 0.9, 0.5, c) < 0.05  # noise
