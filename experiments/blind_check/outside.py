@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from experiments.blind_check.effects import Change, Made, Rng, Values, _force, _sign
 from experiments.blind_check.signals import ENCODER, HAND, READOUT, SCALE, Signals, Stage
@@ -112,6 +113,50 @@ def _settling(v: Values) -> Stage:
     return stage
 
 
+def _wandering(v: Values) -> Stage:
+    """A draught about warm strain gauges: every force channel's zero wanders at random."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        keep = np.exp(-(s.t[1] - s.t[0]) / v["time"])
+        steps = np.sqrt(1 - keep**2) * rng.standard_normal(s.force.shape)
+        start = keep * rng.standard_normal((1, 4))
+        return v["rms"] * np.asarray(lfilter([1.0], [1.0, -keep], steps, axis=0, zi=start)[0])
+
+    return _force(shift)
+
+
+def _behind(v: Values) -> Stage:
+    """Two boards polled in turn: all that the second finger's says is older than its time stamp."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None and s.dq is not None
+
+        def aged(values: np.ndarray) -> np.ndarray:
+            late = [np.interp(s.t - v["age"], s.t, c) for c in values[:, 2:].T]
+            return np.concatenate([values[:, :2], np.stack(late, 1)], 1)
+
+        return replace(s, q=aged(s.q), dq=aged(s.dq), force=aged(s.force))
+
+    return stage
+
+
+def _tacky(v: Values) -> Stage:
+    """Tacky pads: a finger that lets go is held back by threads until it has drawn them out."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        out = np.zeros_like(s.force)
+        for part in s.motion.boundaries[3::4]:
+            for channel, inwards in ((0, 1.0), (2, -1.0)):
+                place, pressed = s.motion.position[:, channel:][:, :2], inwards * s.motion.force[:, channel]
+                way = np.hypot(*(place - place[np.searchsorted(s.t, part)]).T) * (s.t > part)
+                drawn = np.exp(-np.maximum.accumulate(way) / v["reach"])  # what has torn stays torn
+                eased = np.exp(-np.maximum(pressed, 0.0) / 0.3) * (s.t > part - 0.1)
+                out[:, channel] -= inwards * v["pull"] * drawn * eased
+        return out
+
+    return _force(shift)
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -136,5 +181,10 @@ OUTSIDE = {
         _made("sensor_creep", lambda r, s: {"share": 0.1 * s * _sign(r), "time": r.uniform(0.4, 2.0)},
               SCALE, _creeping),
         _made("finger_leak", lambda r, s: {"share": 0.06 * s * _sign(r)}, SCALE, _leaking),
+        _made("zero_wander", lambda r, s: {"rms": 0.18 * s, "time": r.uniform(0.2, 0.6)},
+              READOUT, _wandering),
+        _made("late_board", lambda r, s: {"age": 0.015 * s}, READOUT, _behind),
+        _made("tacky_pads", lambda r, s: {"pull": 0.8 * s, "reach": r.uniform(0.003, 0.006)},
+              HAND, _tacky),
     )
 }  # fmt: skip
