@@ -24,7 +24,8 @@ class World(NamedTuple):
     """Aligned trials and the constants of the hand, as far as an effect may change them.
 
     T trials, N samples, M moves. `joints`, `rates`, `force` (T, N, 4): link angles and their rates
-    (tip positions and velocities of a Cartesian hand), forces fx1, fy1, fx2, fy2. `link` (4,)
+    (tip positions and velocities of a Cartesian hand), forces fx1, fy1, fx2, fy2. `load` (T, N, 4) [N]: what
+    of them acts between the contact and the sensor, in time with the contact. `link` (4,)
     relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
     `delay`, `smoothing` [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
     the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
@@ -44,6 +45,7 @@ class World(NamedTuple):
     joints: Array
     rates: Array
     force: Array
+    load: Array
     base: Array
     length: Array
     jointed: Array
@@ -117,6 +119,16 @@ class Parameter:
         return float(np.log(value / self.neutral) / self.sd if self.log else (value - self.neutral) / self.sd)
 
     @property
+    def amplitude(self) -> bool:
+        """Whether it says how strong an effect is: it is zero where there is none."""
+        return not self.log and self.neutral == 0.0
+
+    @property
+    def gridded(self) -> bool:
+        """Whether a search has to try several start values of it."""
+        return self.starts != (0.0,)
+
+    @property
     def limits(self) -> tuple[float, float]:
         """Bounds of the standard normal coordinate; five standard deviations at most."""
         low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -5.0
@@ -186,6 +198,11 @@ def tips(world: World) -> tuple[Array, Array]:
 def with_mode(world: World, mode: int, on: Array) -> World:
     """The world with one of `modes` switched on where `on` is 1."""
     return world._replace(modes=jnp.asarray(world.modes).at[mode].add(on))
+
+
+def with_load(world: World, force: Array) -> World:
+    """The world with a force (T, N, 4) [N] on each finger that is none of the contact's."""
+    return world._replace(load=world.load + force)
 
 
 def gradient(t: Array, values: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import HAND, Effect, Parameter, Performance, World, flat, tips, with_force
+from simgap.effects.base import HAND, Effect, Parameter, Performance, World, flat, tips, with_force, with_load
 
 MIDDLE = (0.13, 0.02)  # m; about where the fingers work
 
@@ -18,9 +18,7 @@ def _anchor(values, xp):
 def _correct(world: World, values, on) -> World:
     position, _ = tips(world)
     offset = position - jnp.asarray(MIDDLE * 2)[None, None, :]
-    return world._replace(
-        force=world.force - values["stiffness"] * offset - _anchor(values, jnp)[None, None, :]
-    )
+    return with_load(world, values["stiffness"] * offset + _anchor(values, jnp)[None, None, :])
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

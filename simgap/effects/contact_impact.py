@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import CONTACT, Effect, Parameter, Performance, World, flat, with_force
+from simgap.effects.base import CONTACT, Effect, Parameter, Performance, World, flat, with_force, with_load
 
 LENGTH = 0.06  # s; a pulse shorter than a sample is known as an impulse only
 
@@ -19,7 +19,7 @@ def _pulse(since, xp):
 def _correct(world: World, values, on) -> World:
     since = world.t[:, :, None] - world.events[:, None, 2::4]
     pulse = _pulse(since, jnp).sum(-1)[..., None] * jnp.asarray([0.0, 0.5, 0.0, 0.5])[None, None, :]
-    return world._replace(force=world.force + values["impulse"] * pulse)
+    return with_load(world, -values["impulse"] * pulse)
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

@@ -5,13 +5,24 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import HAND, Effect, Parameter, Performance, World, flat, gradient, tips, with_force
+from simgap.effects.base import (
+    HAND,
+    Effect,
+    Parameter,
+    Performance,
+    World,
+    flat,
+    gradient,
+    tips,
+    with_force,
+    with_load,
+)
 
 
 def _correct(world: World, values, on) -> World:
     _, velocity = tips(world)
     up = jnp.stack([0.0 * world.gravity, world.gravity] * 2)[None, None, :]
-    return world._replace(force=world.force - values["mass"] * (gradient(world.t, velocity) + up))
+    return with_load(world, values["mass"] * (gradient(world.t, velocity) + up))
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

@@ -18,7 +18,10 @@ def mixed(force, matrix, xp):
 def _correct(world: World, values, on) -> World:
     e, h = values["fy_from_fx"], values["fx_from_fy"]
     scale = 1 / (1 - e * h)
-    return world._replace(force=mixed(world.force, ((scale, -h * scale), (-e * scale, scale)), jnp))
+    force = mixed(world.force, ((scale, -h * scale), (-e * scale, scale)), jnp)
+    # Of net fx, net fy, grip and shear: each has the noise of both axes.
+    quiet = jnp.stack([1 / jnp.sqrt(1 + h**2), 1 / jnp.sqrt(1 + e**2)] * 2) / scale
+    return world._replace(force=force, loudness=world.loudness * quiet[None, None, :])
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

@@ -13,13 +13,19 @@ import jax.numpy as jnp
 from simgap.effects.base import CONTACT, SLIDING, Effect, Parameter, World, with_mode
 
 LOADED = 0.4  # N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
+HANGING = 0.9  # share of a carry, at least, that pads do not slide in: or the block would fall
 
 
 def _correct(world: World, values, on) -> World:
-    shear = jnp.abs(world.force[..., jnp.asarray([1, 3])])
-    push = jnp.stack([world.force[..., 0], -world.force[..., 2]], -1)
+    force = world.force - world.load
+    shear = jnp.abs(force[..., jnp.asarray([1, 3])])
+    push = jnp.stack([force[..., 0], -force[..., 2]], -1)
     ratio = shear / jnp.maximum(push, 0.5 * LOADED)
-    sliding = jax.nn.sigmoid((ratio / values["mu"] - 1.02) / 0.02).max(axis=-1)
+    carried = (world.carry > 0) & (push.min(axis=-1) > LOADED)
+    unknown = jnp.where(carried.any(), jnp.nan, 0.0)
+    steady = jnp.nanquantile(jnp.where(carried, ratio.max(axis=-1), unknown), HANGING)
+    mu = jnp.maximum(values["mu"], 1.05 * steady)
+    sliding = jax.nn.sigmoid((ratio / mu - 1.02) / 0.02).max(axis=-1)
     sliding = sliding * jax.nn.sigmoid((push.min(axis=-1) - LOADED) / 0.05)
     return with_mode(world, SLIDING, on)._replace(
         slip=world.slip + on * sliding * (world.ground + world.carry)

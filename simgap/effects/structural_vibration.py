@@ -72,7 +72,7 @@ EFFECT = Effect(
             "Hz",
             0.7,
             neutral=5.0,
-            starts=(1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5),
+            starts=tuple(0.75 + 0.5 * k for k in range(19)),
             low=0.7,
             high=10.0,
             log=True,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from simgap.effects.base import HAND, Effect, Parameter, Performance, World, flat, tips, with_force
+from simgap.effects.base import HAND, Effect, Parameter, Performance, World, flat, tips, with_force, with_load
 
 
 def _correct(world: World, values, on) -> World:
     _, velocity = tips(world)
-    return world._replace(force=world.force - values["coefficient"] * velocity)
+    return with_load(world, values["coefficient"] * velocity)
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

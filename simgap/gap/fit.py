@@ -16,7 +16,7 @@ from simgap.effects import fitted as known_effects
 from simgap.effects.base import Effect, World, tips
 from simgap.gap.frame import Arrays, Frame
 from simgap.gap.noise import NoiseModel, Whitening, whiten, whitening
-from simgap.gap.residuals import residuals, undelayed
+from simgap.gap.residuals import contact, residuals
 
 SMALL, LARGE = 8, 26  # columns of effects (beyond the properties), two compiled shapes
 STEPS = 12
@@ -187,7 +187,7 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
 @partial(jax.jit, static_argnames="num_properties")
 def _without(world, u, on, num_properties):
     world = corrected(world, u, on, num_properties)
-    return world._replace(force=undelayed(world))
+    return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
 
 
 @jax.jit

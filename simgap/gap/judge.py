@@ -8,6 +8,7 @@ the verdict "unknown" only.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -16,9 +17,11 @@ from scipy.special import expit, logsumexp
 
 from simgap.effects import decoys
 from simgap.effects import fitted as known_effects
-from simgap.gap.fit import Fitted, Problem
+from simgap.gap.fit import Fitted, Problem, limits, slots
 
 DEFAULT_MISFIT = 0.03  # of an effect that the bank never had
+SCALES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of an effect's amplitudes, in sds of their priors
+EDGE = 1e-6
 USUAL = 10.0  # decades by which what a wrong cause leaves usually exceeds noise
 
 
@@ -51,14 +54,46 @@ class Calibration:
 
 
 def log_evidence(given: Problem, found: Fitted, healthy: Fitted, temperature: float = 1.0) -> float:
-    """Log evidence [nats] of a candidate over none, coordinates standard normal beforehand."""
-    gain = (healthy.cost - found.cost) / temperature
-    return float(gain - 0.5 * (_log_det(found, temperature) - _log_det(healthy, temperature)))
+    """Log evidence [nats] of a candidate over none, Laplace's approximation about its fit.
+
+    Coordinates are standard normal beforehand, but how large an effect is as a whole is unknown: its
+    amplitudes share a scale, uniform over SCALES (automatic relevance determination: MacKay, Neural
+    Computation 4, 1992). Many small parameters then cost no more than they should.
+    """
+    return _log_integral(given, found, temperature) - _log_integral(given, healthy, temperature)
 
 
-def _log_det(found: Fitted, temperature: float) -> float:
-    total = found.hessian.sum((0, 1)) / temperature
-    return float(np.linalg.slogdet(total + np.eye(total.shape[0]))[1])
+def _log_integral(given: Problem, found: Fitted, temperature: float) -> float:
+    """Log of likelihood times prior, integrated over a candidate's parameters and its effects' scales."""
+    u = found.u[found.columns]
+    bend = found.hessian.sum((0, 1)) / temperature
+    slope = found.gradient.sum((0, 1)) / temperature
+    groups = _amplitudes(given, found)
+    low, high = (edge[found.columns] for edge in limits(given))
+    down = slope + u < 0
+    free = np.where(down, u < high - EDGE, u > low + EDGE)  # a coordinate at its limit stays there
+    each = []
+    for scales in itertools.product(SCALES, repeat=len(groups)):
+        sure = np.ones(u.size)  # precision of the prior
+        for group, scale in zip(groups, scales, strict=True):
+            sure[group] = scale**-2.0
+        total = bend + np.diag(sure)
+        pull = (slope + sure * u)[free]
+        gain = 0.5 * (pull @ np.linalg.solve(total[np.ix_(free, free)], pull) - sure @ u**2)
+        each.append(gain + 0.5 * (np.log(sure).sum() - np.linalg.slogdet(total)[1]))
+    fitted_part = (found.cost - 0.5 * u @ u) / temperature
+    return float(logsumexp(each) - np.log(len(each)) - fitted_part)
+
+
+def _amplitudes(given: Problem, found: Fitted) -> list[np.ndarray]:
+    """For every effect of a candidate which of its columns are amplitudes."""
+    out = []
+    for slot in slots(given.num_properties)[0]:
+        if slot.effect.name in found.effects:
+            at = [slot.start + j for j, p in enumerate(slot.effect.parameters) if p.amplitude]
+            if at:
+                out.append(np.flatnonzero(np.isin(found.columns, at)))
+    return out
 
 
 def folds(found: Fitted, num_trials: int, moves: np.ndarray) -> np.ndarray:

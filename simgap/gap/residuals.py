@@ -22,7 +22,7 @@ HELD = 0.1  # N; a grip below this holds nothing
 BETWEEN = 0.3  # of a bend, sd: a force read between samples
 CURVED = 0.5  # of the difference of two ways to take a slope, sd: how far it may be off
 EVEN = 0.025  # N; changes from one sample to the next below this have no corner
-SHARP = 0.75  # change of slope, as a share of its sides, beyond which a force has a corner
+SHARP = 0.75  # by how much one side is flatter, as a share of both, beyond which a force has a corner
 EITHER = 0.6  # of a force's change, sd: how a force between two samples goes from one to the other
 SLIDE = 2e-3  # m; how far a pad may slide from one sample to the next
 ANYWHERE = 0.05  # m; sd of where a grip takes its block
@@ -40,7 +40,7 @@ def residuals(
     weight, width = own[..., 0], own[..., 1]
     rise = jnp.einsum("tnm,mo,o->tn", arrays.onehot, arrays.rises, properties[:, 2])
     position, velocity = tips(world)
-    force = undelayed(world)
+    force = contact(world)
     pads = _relaxed(world, force)
     x1, y1, x2, y2 = (position[..., k] for k in range(4))
     fx1, fy1, fx2, fy2 = (pads[..., k] for k in range(4))
@@ -78,20 +78,10 @@ def residuals(
     net_y = carry * (weight + mass * ay) + ground * (force[..., 1] + force[..., 3])
     half = (force[..., 0] - force[..., 2]) / 2, (force[..., 1] - force[..., 3]) / 2
     free = touching / jnp.maximum(n1 + n2, 2e-4) * world.free
-    expected = jnp.stack([net_x, net_y, held * half[0] + free, held * half[1]], -1)
-    recorded = world.force
-    seen = jnp.stack(
-        [
-            recorded[..., 0] + recorded[..., 2],
-            recorded[..., 1] + recorded[..., 3],
-            (recorded[..., 0] - recorded[..., 2]) / 2,
-            (recorded[..., 1] - recorded[..., 3]) / 2,
-        ],
-        -1,
-    )
+    expected = jnp.stack([net_x, net_y, held * half[0] + free, held * half[1]], -1) + _net(world.load)
     filtered, either = _filtered(world, expected)
     filtered = _when(world, RINGING, lambda f: _driven(world, f, back=False), filtered)
-    forces = (seen - filtered) * world.loudness
+    forces = (_net(world.force) - filtered) * world.loudness
 
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
@@ -105,6 +95,12 @@ def residuals(
         jnp.concatenate([geometry / size, speeds / size, forces], -1),
         jnp.concatenate([factor, jnp.ones_like(speeds), 1 + either / jnp.square(noise[..., 6:])], -1),
     )
+
+
+def _net(force: jax.Array) -> jax.Array:
+    """Net force, grip and shear (T, N, 4) of both fingers' forces (T, N, 4)."""
+    one, two = force[..., :2], force[..., 2:]
+    return jnp.concatenate([one + two, (one - two) / 2], -1)
 
 
 def _doubt(world: World, firm: jax.Array) -> jax.Array:
@@ -181,16 +177,19 @@ def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
 
 
 def _sharp(left: jax.Array, right: jax.Array, even: float | jax.Array) -> jax.Array:
-    """How surely (0 to 1) changes on both sides are those of a corner; both are alike below `even`."""
-    size = jnp.abs(left) + jnp.abs(right) + even
-    return jax.nn.sigmoid((jnp.abs(left - right) / size - SHARP) / 0.08)
+    """How surely (0 to 1) changes on both sides are those of a corner; both are alike below `even`.
+
+    A force that rises and falls as fast has a crest there: at a corner one side is flatter than the other.
+    """
+    left, right = jnp.abs(left), jnp.abs(right)
+    return jax.nn.sigmoid((jnp.abs(left - right) / (left + right + even) - SHARP) / 0.08)
 
 
-def undelayed(world: World) -> jax.Array:
-    """Forces (T, N, 4) before delay and low-pass, and before they rang a mode."""
+def contact(world: World) -> jax.Array:
+    """Forces (T, N, 4) of the contacts: before delay and low-pass, before they rang a mode, without loads."""
     force = _when(world, RINGING, lambda f: _driven(world, f, back=True), world.force)
     force = _when(world, LATE, lambda f: shifted(f, world.delay / _step(world)), force)
-    return _when(world, SMOOTH, lambda f: f + world.smoothing * _slope(world, f)[0], force)
+    return _when(world, SMOOTH, lambda f: f + world.smoothing * _slope(world, f)[0], force) - world.load
 
 
 def _slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -215,7 +214,9 @@ def _slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _filtered(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Forces (T, N, C) after low-pass (exact between samples for straight lines) and delay, and the variance
     of what is read between two samples: a contact may have changed before or after."""
-    smooth = _when(world, SMOOTH, lambda f: _lowpass(f, world.smoothing, _step(world)), force)
+
+    def slow(f: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _lowpass(f, world.smoothing, _step(world)), _unsure(f, world.smoothing, _step(world))
 
     def late(f: jax.Array) -> tuple[jax.Array, jax.Array]:
         steps = world.delay / _step(world)
@@ -227,7 +228,10 @@ def _filtered(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
     def prompt(f: jax.Array) -> tuple[jax.Array, jax.Array]:
         return f, jnp.zeros_like(f)
 
-    return jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, late, prompt, smooth)
+    modes = jnp.asarray(world.modes)
+    smooth, jumps = jax.lax.cond(modes[SMOOTH] > 0, slow, prompt, force)
+    delayed, either = jax.lax.cond(modes[LATE] > 0, late, prompt, smooth)
+    return delayed, jumps + either
 
 
 def _driven(world: World, force: jax.Array, back: bool) -> jax.Array:
@@ -270,10 +274,21 @@ def _lowpass(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
     new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep
     before = jnp.concatenate([values[:, :1], values[:, :-1]], 1)
     drive = new * values + old * before
-    # y[k] = keep y[k-1] + drive[k] by doubling: after j rounds y holds the last 2^j drives.
-    out = jnp.concatenate([values[:, :1], drive[:, 1:]], 1)
-    reach = 1
-    while reach < values.shape[1]:
+    return _faded(jnp.concatenate([values[:, :1], drive[:, 1:]], 1), ratio)
+
+
+def _unsure(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
+    """Variance (T, N, C) behind a low-pass of what may have changed at any moment between two samples."""
+    ratio = step / jnp.maximum(time, 1e-4)
+    share = (1 - jnp.exp(-2 * ratio)) / (2 * ratio) - jnp.square((1 - jnp.exp(-ratio)) / ratio)
+    change = jnp.concatenate([jnp.zeros_like(values[:, :1]), values[:, 1:] - values[:, :-1]], 1)
+    return _faded(share * jnp.square(EITHER * change), 2 * ratio)
+
+
+def _faded(drive: jax.Array, ratio: jax.Array) -> jax.Array:
+    """y[k] = exp(-ratio) y[k-1] + drive[k] along N, by doubling: after j rounds y holds the last 2^j."""
+    out, reach = drive, 1
+    while reach < drive.shape[1]:
         before = jnp.concatenate([jnp.zeros_like(out[:, :reach]), out[:, :-reach]], 1)
         out, reach = out + jnp.exp(-ratio * reach) * before, 2 * reach
     return out

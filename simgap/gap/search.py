@@ -37,7 +37,8 @@ from simgap.gap.spread import SPREADS, Spread, spreads
 ALARM = 0.01  # chance that a healthy recording is called otherwise
 SHIFT = 0.008  # s; boundaries that move farther are taken anew
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
-REALIGNED, LEADING = 3, 3  # times at most; without the first of so many candidates that all trials then fit
+REALIGNED, LEADING = 3, 6  # times at most; without the first of so many candidates that then fits better
+UNEASY = 1.3  # times the healthy mean square: what a leading candidate leaves for others to be tried
 REFINED = 6  # candidates fitted again after boundaries moved
 WORTH = 0.7  # a pair must leave no more than this share of what its better half leaves
 MORE = 0.0003  # and must gain this share of its evidence over that half,
@@ -45,7 +46,7 @@ COARSE = 0.005  # more if that is coarse
 FITTING = 0.01  # and still more if nothing but noise seems left,
 LEAST = 10.0  # and so many nats
 STUCK = 2.0  # nats at T = 1 by which a half of a pair, taken alone, may do better than as a single so far
-ALONE = 0.2  # share of its gain that an effect must keep without the subtask of a trial that it gains most in
+ALONE = 0.2  # share of its gain that an effect must keep without the place that it gains most in
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 WILD, LOUD = 5.0, 3.0  # sd; an event reaches the first and goes on while samples exceed the second
 BESIDE = 0.015  # share of residuals beside contact changes that may be left out of the fits
@@ -54,7 +55,7 @@ RECURS = 3  # trials at least, to tell an event from an effect
 WORTHY = 50.0  # nats at T = 1 by which the leading candidate must win for boundaries to be taken anew
 # What shifts or smooths samples in time.
 SHAPING = frozenset({"clock_jitter", "force_lag", "force_lowpass", "structural_vibration"})
-STRANGE = 6.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue
+STRANGE = 3.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue
 PAIRED = 20.0  # nats that a single must have gained for pairs to be tried
 Progress = Callable[[str], None]
 
@@ -116,16 +117,22 @@ def search(
     # Late, slow or soft contacts displace boundaries: align again without the best explanation.
     for _ in range(REALIGNED):
         leading = [f for f in sorted(fits, key=lambda f: f.cost) if healthy.cost - f.cost >= WORTHY]
-        if leading:
-            tell("aligning again without the best explanation")
-        tried = (realigned(trials, given, f) for f in leading[:LEADING])
-        shifts = ((moved(aligned, a), a) for a in tried)
-        far, again = next((pair for pair in shifts if pair[0] < np.inf), (0.0, aligned))
-        if far <= SHIFT:
+        if not leading:
             break
-        aligned = again
-        given = problem(build(trials, aligned, rig), bank.noise, actual)
-        healthy, fits = _refitted(given, healthy, fits, bool(forced))
+        tell("aligning again without the best explanation")
+        floor = 0.5 * bank.calibration.floor
+        rest = leading[0].cost > UNEASY * floor * given.size
+        for best in leading[: LEADING if rest else 1]:
+            again = realigned(trials, given, best)
+            if not SHIFT < moved(aligned, again) < np.inf:
+                continue
+            other = problem(build(trials, again, rig), bank.noise, actual)
+            found = _refitted(other, healthy, fits, bool(forced))
+            if min(f.cost for f in found[1]) - floor * other.size < leading[0].cost - floor * given.size:
+                aligned, given, (healthy, fits) = again, other, found
+                break
+        else:
+            break
     beside, event = _wild(given, fits, healthy)
     if beside is not None:
         given = without(given, beside)
@@ -147,7 +154,7 @@ def search(
     if found[0].evidence > PAIRED:
         pairs = _tried(given, found, healthy, names, temperature, bank)
         better = _unstuck(given, found, pairs, healthy, temperature)
-        if better != found:  # a single was in a worse optimum: what goes with it may have been, too
+        if better is not found:  # a single was in a worse optimum: what goes with it may have been, too
             found = better
             pairs = _tried(given, found, healthy, names, temperature, bank)
         found = sorted([*found, *_worthwhile(given, found, pairs, healthy, bank)], key=lambda c: -c.evidence)
@@ -167,19 +174,20 @@ def _single(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> C
 
 
 def _recurring(given: Problem, found: Candidate, without: Fitted, temperature: float) -> Candidate:
-    """A candidate less what it gains over a fit `without` in one subtask of one trial, if that is most of it.
+    """A candidate less what it gains over a fit `without` in one place, if that is most of it: effects recur.
 
-    How far pads slide is free in every grip: a candidate that may slide explains any one jump. An effect
-    would recur.
+    How far pads slide is free in every grip: what may slide explains any one jump, in one subtask of one
+    trial. Whatever else a hand has, it has with every block: it does not show in one subtask alone.
     """
     f = found.fitted
     added = set(f.effects) - set(without.effects)
-    if given.frame.num_trials < RECURS or not any(catalogue()[name].switched for name in added):
+    if given.frame.num_trials < RECURS:
         return found
     gain = (without.square - f.square) / 2
-    most, total = float(gain.max()), float(gain.sum())
-    once = most if total - most < ALONE * total else 0.0
-    return replace(found, evidence=found.evidence - once / temperature)
+    once = gain if any(catalogue()[name].switched for name in added) else gain.sum(0)
+    most, total = float(once.max()), float(gain.sum())
+    excess = most if total - most < ALONE * total else 0.0
+    return replace(found, evidence=found.evidence - excess / temperature)
 
 
 def _tried(

@@ -1,0 +1,77 @@
+"""Evidence of a candidate against numerical integration, and starts that a search cannot do without."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from simgap.effects import catalogue
+from simgap.gap.fit import Fitted, Problem, limits, slots
+from simgap.gap.judge import SCALES, log_evidence
+
+NOTHING = object.__new__(Problem)  # a problem of no blocks: evidence reads no more of it
+object.__setattr__(NOTHING, "centre", np.zeros((0, 3)))
+
+
+def _columns(effect: str) -> np.ndarray:
+    slot = next(s for s in slots(0)[0] if s.effect.name == effect)
+    return np.arange(slot.start, slot.stop)
+
+
+def _fitted(effect: str, bend: np.ndarray, centre: np.ndarray, floor: float) -> Fitted:
+    """A candidate whose likelihood is exp(-floor - (u - centre)' bend (u - centre) / 2)."""
+    columns, u = _columns(effect), np.zeros(slots(0)[1])
+    low, high = limits(NOTHING)
+    best = np.linalg.solve(bend + np.eye(len(columns)), bend @ centre)
+    u[columns] = np.clip(best, low[columns], high[columns])
+    at = u[columns]
+    square = 2 * floor + (at - centre) @ bend @ (at - centre)
+    cost = 0.5 * square + 0.5 * at @ at
+    gradient = bend @ (at - centre)
+    return Fitted((effect,), u, columns, bend[None, None], gradient[None, None], np.array([[square]]), cost)
+
+
+def _none() -> Fitted:
+    empty = np.zeros((1, 1, 0))
+    return Fitted((), np.zeros(slots(0)[1]), np.arange(0), empty[..., None], empty, np.zeros((1, 1)), 0.0)
+
+
+@pytest.mark.parametrize(("centre", "precision"), [(0.02, 400.0), (0.3, 2500.0), (2.0, 100.0)])
+def test_one_amplitude_of_unknown_size(centre, precision):
+    found = _fitted("force_gain", np.array([[precision]]), np.array([centre]), -3.0)
+    u = np.linspace(-6, 6, 400_001)
+    prior = np.mean([np.exp(-0.5 * (u / s) ** 2) / s / np.sqrt(2 * np.pi) for s in SCALES], axis=0)
+    expected = np.log(trapezoid(np.exp(3.0 - 0.5 * precision * (u - centre) ** 2) * prior, u))
+    assert log_evidence(NOTHING, found, _none()) == pytest.approx(expected, abs=1e-3)
+
+
+def test_four_amplitudes_share_their_size():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(4, 4))
+    bend, centre = 300 * (root @ root.T + np.eye(4)), np.array([0.1, -0.05, 0.08, 0.02])
+    found = _fitted("force_bias", bend, centre, -5.0)
+    each = []
+    for s in SCALES:  # the normal density of the centre, measured with precision bend, drawn at size s
+        cov = np.linalg.inv(bend) + s**2 * np.eye(4)
+        inside = -0.5 * centre @ np.linalg.solve(cov, centre)
+        each.append(inside - 0.5 * (np.linalg.slogdet(cov)[1] + np.linalg.slogdet(bend)[1]))
+    expected = 5.0 + np.log(np.mean(np.exp(each)))
+    assert log_evidence(NOTHING, found, _none()) == pytest.approx(expected, abs=1e-6)
+
+
+def test_small_amplitudes_cost_less_than_their_prior_would_have_it():
+    count = len(_columns("structural_vibration"))
+    bend, centre = np.eye(count) * 2500.0, np.full(count, 0.05)
+    found = _fitted("structural_vibration", bend, centre, -40.0)
+    alone = 40.0 - 0.5 * np.linalg.slogdet(np.eye(count) + bend)[1]
+    assert log_evidence(NOTHING, found, _none()) > alone + 20
+
+
+def test_what_a_limit_keeps_out_gains_nothing():
+    delay = _columns("force_lag")
+    assert limits(NOTHING)[0][delay] == 0.0 and catalogue()["force_lag"].parameters[0].amplitude
+    found = _fitted("force_lag", np.array([[400.0]]), np.array([-0.5]), 0.0)
+    assert found.u[delay] == 0.0
+    nothing = -0.5 * 400.0 * 0.5**2
+    assert log_evidence(NOTHING, found, _none()) <= nothing + 1e-6
