@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+import commands
+from hmmseg.rig import read_rig
+from hmmseg.task import read_task
+from hmmseg.trial import Trial, read_trial
 from simgap.effects import catalogue
+from simgap.gap.diagnose import diagnose
 from simgap.gap.fit import Fitted, Problem, limits, slots
 from simgap.gap.judge import SCALES, log_evidence
 
@@ -75,3 +83,24 @@ def test_what_a_limit_keeps_out_gains_nothing():
     assert found.u[delay] == 0.0
     nothing = -0.5 * 400.0 * 0.5**2
     assert log_evidence(NOTHING, found, _none()) <= nothing + 1e-6
+
+
+def _ringing(trial: Trial) -> Trial:
+    """A mode of 3.2 Hz, rung by every grip and release."""
+    held = np.abs(trial.channels["fx1"]) > 0.5
+    since = trial.t[:, None] - trial.t[1:][np.diff(held.astype(int)) != 0]
+    omega = 2 * np.pi * 3.2
+    ring = np.where(since >= 0, np.exp(-0.08 * omega * since.clip(0)) * np.sin(omega * since), 0.0).sum(1)
+    changed = {c: trial.channels[c] + 0.2 * ring for c in ("fy1", "fy2")}
+    return replace(trial, channels=trial.channels | changed)
+
+
+def test_a_vibration_is_sought_with_its_amplitudes():
+    # Without amplitudes a frequency has no slope: searches ended 2 Hz away.
+    folder = Path(commands.__file__).parent / "demo_data"
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    trials = [_ringing(read_trial(folder / f"trial_{k:02d}.csv", rig)) for k in (1, 2, 3, 4)]
+    body = diagnose(trials, task, rig).body
+    assert body["causes"] == ["structural_vibration"]
+    found = body["effects"]["structural_vibration"]["parameters"]["frequency"]
+    assert found["mean"] == pytest.approx(3.2, rel=0.03)

@@ -44,12 +44,19 @@ def test_what_one_subtask_of_one_trial_gains_is_no_slip(quiet):
     assert _recurring(quiet.problem, _slip(quiet, gain), quiet.healthy, 1.5).evidence == 20.0
 
 
-def test_other_effects_may_gain_anywhere(quiet):
+def test_what_one_block_shows_in_one_subtask_alone_is_no_effect_of_the_hand(quiet):
     gain = np.zeros(quiet.healthy.square.shape)
-    gain[1, 3] = 30.0
-    found = replace(_slip(quiet, gain), name="force_bias")
-    found = replace(found, fitted=replace(found.fitted, effects=("force_bias",)))
-    assert _recurring(quiet.problem, found, quiet.healthy, 1.5).evidence == 20.0
+    gain[1:3, 1] = 30.0
+
+    def found():
+        slip = _slip(quiet, gain)
+        return replace(slip, name="force_bias", fitted=replace(slip.fitted, effects=("force_bias",)))
+
+    assert _recurring(quiet.problem, found(), quiet.healthy, 1.5).evidence == pytest.approx(20.0 - 60.0 / 1.5)
+    gain[0, 5] = 20.0  # in one trial, but with the other block as well
+    assert _recurring(quiet.problem, found(), quiet.healthy, 1.5).evidence == 20.0
+    gain[:, 1] = 900.0  # a displaced boundary outweighs what else there is
+    assert _recurring(quiet.problem, found(), quiet.healthy, 1.5).evidence == 20.0
 
 
 def test_a_single_in_a_worse_optimum_is_freed_by_its_pair(quiet):
