@@ -46,9 +46,8 @@ COARSE = 0.005  # more if that is coarse
 FITTING = 0.01  # and still more if nothing but noise seems left,
 LEAST = 10.0  # and so many nats
 STUCK = 2.0  # nats at T = 1 by which a half of a pair, taken alone, may do better than as a single so far
-ALONE = (
-    0.2  # share of its gain that an effect must keep without the place that it gains most in; LEAST will do
-)
+ALONE = 0.2  # share of its gain that an effect must keep without the place that it gains most in
+EVERY = 0.1  # share of the mean trial's gain in one subtask that it must have in every trial to recur
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 WILD, LOUD = 5.0, 3.0  # sd; an event reaches the first and goes on while samples exceed the second
 BESIDE = 0.015  # share of residuals beside contact changes that may be left out of the fits
@@ -179,8 +178,8 @@ def _recurring(given: Problem, found: Candidate, without: Fitted, temperature: f
     """A candidate less what it gains over a fit `without` in one place, if that is most of it: effects recur.
 
     How far pads slide is free in every grip: what may slide explains any one jump, in one subtask of one
-    trial. Whatever else a hand has, it has with every block: of what shows in one subtask, something shows in
-    others, be it little beside a boundary that was displaced.
+    trial. Whatever else a hand has, it has with every block or in every trial: what shows in one subtask of
+    some trials alone was an accident of theirs.
     """
     f = found.fitted
     added = set(f.effects) - set(without.effects)
@@ -190,7 +189,9 @@ def _recurring(given: Problem, found: Candidate, without: Fitted, temperature: f
     slides = any(catalogue()[name].switched for name in added)
     most, total = float((gain if slides else gain.sum(0)).max()), float(gain.sum())
     enough = ALONE * total if slides else min(ALONE * total, LEAST)
-    excess = most if total - most < enough else 0.0
+    by_trial = gain[: given.frame.num_trials, gain.sum(0).argmax()]
+    every = not slides and by_trial.min() > EVERY * by_trial.mean()
+    excess = most if total - most < enough and not every else 0.0
     return replace(found, evidence=found.evidence - excess / temperature)
 
 

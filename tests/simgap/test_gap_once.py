@@ -53,6 +53,9 @@ def test_what_one_block_shows_in_one_subtask_alone_is_no_effect_of_the_hand(quie
         return replace(slip, name="force_bias", fitted=replace(slip.fitted, effects=("force_bias",)))
 
     assert _recurring(quiet.problem, found(), quiet.healthy, 1.5).evidence == pytest.approx(20.0 - 60.0 / 1.5)
+    gain[:, 1] = (20.0, 30.0, 10.0, 15.0)  # with one block, but in every trial
+    assert _recurring(quiet.problem, found(), quiet.healthy, 1.5).evidence == 20.0
+    gain[:, 1] = (0.0, 30.0, 30.0, 0.0)
     gain[0, 5] = 20.0  # in one trial, but with the other block as well
     assert _recurring(quiet.problem, found(), quiet.healthy, 1.5).evidence == 20.0
     gain[:, 1] = 900.0  # a displaced boundary outweighs what else there is
