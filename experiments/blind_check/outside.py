@@ -157,6 +157,44 @@ def _tacky(v: Values) -> Stage:
     return _force(shift)
 
 
+def _flickering(v: Values) -> Stage:
+    """A broken strand in one finger's plug: for moments its supply sags, and so does what it reads."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        share, k = np.zeros((len(s.t), 1)), 0.0
+        while (k := k + rng.exponential(v["apart"])) < s.t[-1]:
+            until = k + rng.exponential(v["lasting"])
+            share[(s.t >= k) & (s.t < until)] = v["loss"] * rng.uniform(0.5, 1.0)
+            k = until
+        finger = np.repeat(np.arange(2) == int(v["finger"]), 2)
+        return replace(s, force=s.force * (1 - share * finger))
+
+    return stage
+
+
+def _uncounted(v: Values) -> Stage:
+    """Incremental encoders that miss counts of joints that turn fast; homed before each trial."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None and s.dq is not None
+        lost = v["missed"] * np.sign(s.dq) * np.maximum(np.abs(s.dq) - v["speed"], 0.0)
+        return replace(s, q=s.q - np.cumsum(lost, 0) * (s.t[1] - s.t[0]), dq=s.dq - lost)
+
+    return stage
+
+
+def _curtained(v: Values) -> Stage:
+    """A soft guard right of the workspace: the second finger pushes into it and rubs along it."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        out = np.zeros_like(s.force)
+        out[:, 2] = v["stiffness"] * np.maximum(s.motion.position[:, 2] - v["place"], 0.0)
+        out[:, 3] = v["friction"] * out[:, 2] * np.tanh(s.motion.velocity[:, 3] / 0.004)
+        return out
+
+    return _force(shift)
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -186,5 +224,14 @@ OUTSIDE = {
         _made("late_board", lambda r, s: {"age": 0.015 * s}, READOUT, _behind),
         _made("tacky_pads", lambda r, s: {"pull": 0.8 * s, "reach": r.uniform(0.003, 0.006)},
               HAND, _tacky),
+        _made("flickering_supply", lambda r, s: {"loss": 0.5 * s, "finger": float(r.integers(2)),
+                                                 "apart": r.uniform(0.3, 0.6),
+                                                 "lasting": r.uniform(0.06, 0.15)},
+              SCALE, _flickering),
+        _made("missed_counts", lambda r, s: {"missed": 0.08 * s, "speed": r.uniform(0.25, 0.5)},
+              ENCODER, _uncounted),
+        _made("soft_guard", lambda r, s: {"stiffness": 45 * s, "place": r.uniform(0.138, 0.15),
+                                          "friction": r.uniform(0.2, 0.5)},
+              HAND, _curtained),
     )
 }  # fmt: skip
