@@ -56,7 +56,7 @@ def others(task: BlockTask, rig: Rig) -> dict[str, tuple[BlockTask, Rig]]:
 
 def p_value(found: Search, bank: Bank) -> float:
     """The p value of a diagnosis."""
-    p = bank.detection.p_values(found.statistics | {"gain": found.candidates[0].evidence})
+    p = bank.detection.p_values(found.statistics)
     return min(1.0, len(p) * min(p.values()))
 
 

@@ -97,7 +97,8 @@ class Parameter:
     """A parameter: prior normal about `neutral` with `sd`, in `unit`; `low`, `high` bound it.
 
     `starts` are the values a search starts from. `log`: the prior is of the logarithm, with median
-    `neutral` and `sd` in natural units. `hidden` parameters are fitted but not reported.
+    `neutral` and `sd` in natural units. `hidden` parameters are fitted but not reported. `shape`: it bends
+    what others amplify and is nothing by itself.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Parameter:
     high: float = np.inf
     log: bool = False
     hidden: bool = False
+    shape: bool = False
 
     def value(self, u: Array) -> Array:
         """The parameter from its standard normal coordinate."""
@@ -121,7 +123,7 @@ class Parameter:
     @property
     def amplitude(self) -> bool:
         """Whether it says how strong an effect is: it is zero where there is none."""
-        return not self.log and self.neutral == 0.0
+        return not self.log and not self.shape and self.neutral == 0.0
 
     @property
     def gridded(self) -> bool:
@@ -150,6 +152,7 @@ class Effect:
     effects change the equations at their neutral values already. `coarse`
     effects act between samples: their form holds to a per cent or so, the others' to far less. `form` is the
     share, `blur` the amount, by which parameters of real parts are off what our own simulator can show.
+    `ties`: patterns (rows that span a space of amplitudes) that independent parts fall into by chance alone.
     """
 
     name: str
@@ -169,6 +172,7 @@ class Effect:
     blur: float = 0.0
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
     coarse: bool = False
+    ties: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""
@@ -219,6 +223,19 @@ def per_channel(values: Values, names: tuple[str, ...]) -> Array:
 
 
 FORCES = ("fx1", "fy1", "fx2", "fy2")
+# Both fingers alike, and as mirror images: of what points along x and y, and of what turns.
+FORCE_TIES = (
+    ((1.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
+    ((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
+    ((1.0, 0.0, -1.0, 0.0),),
+    ((0.0, 1.0, 0.0, 1.0),),
+)
+JOINT_TIES = (
+    ((1.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
+    ((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, -1.0)),
+    ((1.0, 1.0, 1.0, 1.0),),
+    ((1.0, 1.0, -1.0, -1.0),),
+)
 
 
 def flat(performance: Performance) -> np.ndarray:

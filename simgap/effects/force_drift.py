@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from simgap.effects.base import (
+    FORCE_TIES,
     FORCES,
     READOUT,
     Effect,
@@ -45,9 +46,10 @@ EFFECT = Effect(
     mistaken_for=("fingertip_creep", "force_bias"),
     parameters=(
         *(Parameter(c, "N/s", 0.015) for c in FORCES),
-        Parameter("bend", "1", 0.15, low=-0.6, high=0.6, hidden=True),
+        Parameter("bend", "1", 0.15, low=-0.6, high=0.6, hidden=True, shape=True),
     ),
     stage=READOUT,
+    ties=FORCE_TIES,
     correct=_correct,
     apply=_apply,
 )

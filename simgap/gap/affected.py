@@ -8,9 +8,9 @@ import numpy as np
 
 from simgap.effects import fitted
 from simgap.effects.base import World, gradient, tips
+from simgap.gap.candidate import Candidate
 from simgap.gap.fit import Problem, raw_residual_at, world_without
 from simgap.gap.frame import CHANNELS
-from simgap.gap.search import Candidate
 
 YIELDS = frozenset({"grip_slip", "table_compliance"})  # effects that show as a path from where a grip began
 

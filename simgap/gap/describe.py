@@ -10,11 +10,11 @@ import numpy as np
 from simgap.effects import catalogue
 from simgap.gap import judge
 from simgap.gap.affected import shifts
+from simgap.gap.candidate import Candidate
 from simgap.gap.fit import Fitted, Problem, slots
 from simgap.gap.frame import CHANNELS
 from simgap.gap.judge import Calibration
 from simgap.gap.locate import BANDS, Cell, normal_score, subtask_name
-from simgap.gap.search import Candidate
 from simgap.gap.shrinkage import folds_of
 
 PROPERTIES = ("weight", "width", "height")

@@ -15,11 +15,12 @@ from simgap.effects import decoys
 from simgap.gap import judge
 from simgap.gap.adapt import adapted
 from simgap.gap.bank import Bank, load_bank
+from simgap.gap.candidate import Candidate, left, remainder
 from simgap.gap.describe import describe, property_values, where
 from simgap.gap.experiments import next_experiment
 from simgap.gap.fit import Fitted, Problem, residual_at
-from simgap.gap.locate import Cell, cells
-from simgap.gap.search import ALARM, Candidate, Search, left, remainder, search
+from simgap.gap.locate import ALARM, Cell, cells
+from simgap.gap.search import Search, search
 from simgap.gap.shrinkage import shrinkage
 from simgap.gap.verdict import choose, likelihoods, listed
 
@@ -72,7 +73,7 @@ def diagnose(
     bank = adapted(bank, found.problem, found.healthy, trials)
     tell("held-out trials")
     given, best = found.problem, found.candidates[0]
-    p = bank.detection.p_values(found.statistics | {"gain": best.evidence})
+    p = bank.detection.p_values(found.statistics)
     p_value = min(1.0, len(p) * min(p.values()))
     rest, p_left = left(given, best, found.healthy, bank)
     scores = {
@@ -86,7 +87,7 @@ def diagnose(
     every = cells(given, before)
     among = {*causes, *partners}
     alike = [c for c in found.candidates if len(c.effects) == len(causes) and among >= set(c.effects)]
-    named = [c for c in found.candidates if c.name not in decoys()]
+    named = [c for c in found.candidates if not judge.nameless(c.name)]
     shown = [c for k, c in enumerate(named) if k < LISTED or c in alike]
     effects = {c.name: describe(given, c, found.healthy, bank.calibration, seed) for c in shown}
     following = None
@@ -94,9 +95,8 @@ def diagnose(
         tell("the next experiment")
         following = _following(found, alike, effects, bank, seed)
     warnings = found.warnings
-    if verdict == "unknown" and best.name in decoys():
-        warnings = (*warnings, f"{best.name} explains the gap better than any effect of the catalogue: "
-                    f"{decoys()[best.name].says}")  # fmt: skip
+    if verdict == "unknown":
+        warnings = (*warnings, *_why_unknown(best))
     if given.frame.num_trials == 1:
         warnings = (*warnings, "one trial: held out by moves, which is weaker than by trials")
     body = {
@@ -113,6 +113,19 @@ def diagnose(
     residual = before if chosen is None else remainder(given, chosen)
     return Diagnosis(body, given, found.healthy, found.candidates, before, residual, tuple(every), CELL,
                      scores, warnings)  # fmt: skip
+
+
+def _why_unknown(best: Candidate) -> list[str]:
+    """What explains the gap better than any effect of the catalogue, if something does."""
+    if best.name.endswith(judge.ALIKE):
+        return [
+            f"{'+'.join(best.effects)} would explain the gap, but in its both fingers err alike, as "
+            "independent parts do not: one cause that the catalogue does not have is behind it"
+        ]
+    if best.name in decoys():
+        says = decoys()[best.name].says
+        return [f"{best.name} explains the gap better than any effect of the catalogue: {says}"]
+    return []
 
 
 def _following(

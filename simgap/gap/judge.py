@@ -22,6 +22,9 @@ from simgap.gap.fit import Fitted, Problem, limits, slots
 DEFAULT_MISFIT = 0.03  # of an effect that the bank never had
 SCALES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of an effect's amplitudes, in sds of their priors
 EDGE = 1e-6
+ALIKE = " alike"  # end of the name of a candidate whose independent parts err alike
+TIED = 0.05  # of the amplitudes' scale: how exactly they follow the pattern then
+STAYS = 0.8  # of the decades by which a gap exceeds noise: what still does was not explained
 USUAL = 10.0  # decades by which what a wrong cause leaves usually exceeds noise
 
 
@@ -63,8 +66,33 @@ def log_evidence(given: Problem, found: Fitted, healthy: Fitted, temperature: fl
     return _log_integral(given, found, temperature) - _log_integral(given, healthy, temperature)
 
 
-def _log_integral(given: Problem, found: Fitted, temperature: float) -> float:
-    """Log of likelihood times prior, integrated over a candidate's parameters and its effects' scales."""
+def coincidence(given: Problem, found: Fitted, temperature: float = 1.0) -> float:
+    """Log Bayes factor [nats] of parts that err alike over parts that err each by itself.
+
+    What is offered as independent (channels, joints) falls into a pattern of both fingers (`Effect.ties`) by
+    chance alone: if it does, one cause is behind it, and that is another effect. The largest factor over the
+    candidate's effects; minus infinity where none of them has ties.
+    """
+    plain, best = _log_integral(given, found, temperature), -np.inf
+    for name in found.effects:
+        each = []
+        for rows in known_effects()[name].ties:
+            basis = np.linalg.qr(np.array(rows).T)[0]
+            inside = basis @ basis.T
+            tie = inside + (np.eye(len(basis)) - inside) / TIED**2
+            each.append(_log_integral(given, found, temperature, (name, tie)))
+        if each:
+            best = max(best, float(logsumexp(each) - np.log(len(each))) - plain)
+    return best
+
+
+def _log_integral(
+    given: Problem, found: Fitted, temperature: float, tied: tuple[str, np.ndarray] | None = None
+) -> float:
+    """Log of likelihood times prior, integrated over a candidate's parameters and its effects' scales.
+
+    `tied`: an effect and the precision of its amplitudes at scale 1, instead of the identity.
+    """
     u = found.u[found.columns]
     bend = found.hessian.sum((0, 1)) / temperature
     slope = found.gradient.sum((0, 1)) / temperature
@@ -72,27 +100,29 @@ def _log_integral(given: Problem, found: Fitted, temperature: float) -> float:
     low, high = (edge[found.columns] for edge in limits(given))
     down = slope + u < 0
     free = np.where(down, u < high - EDGE, u > low + EDGE)  # a coordinate at its limit stays there
+    inside = np.ix_(free, free)
     each = []
     for scales in itertools.product(SCALES, repeat=len(groups)):
-        sure = np.ones(u.size)  # precision of the prior
-        for group, scale in zip(groups, scales, strict=True):
-            sure[group] = scale**-2.0
-        total = bend + np.diag(sure)
-        pull = (slope + sure * u)[free]
-        gain = 0.5 * (pull @ np.linalg.solve(total[np.ix_(free, free)], pull) - sure @ u**2)
-        each.append(gain + 0.5 * (np.log(sure).sum() - np.linalg.slogdet(total)[1]))
+        sure = np.eye(u.size)  # precision of the prior
+        for (name, group), scale in zip(groups.items(), scales, strict=True):
+            own = tied[1] if tied is not None and name == tied[0] else np.eye(group.size)
+            sure[np.ix_(group, group)] = own * scale**-2.0
+        total = bend + sure
+        pull = (slope + sure @ u)[free]
+        gain = 0.5 * (pull @ np.linalg.solve(total[inside], pull) - u @ sure @ u)
+        each.append(gain + 0.5 * (np.linalg.slogdet(sure)[1] - np.linalg.slogdet(total)[1]))
     fitted_part = (found.cost - 0.5 * u @ u) / temperature
     return float(logsumexp(each) - np.log(len(each)) - fitted_part)
 
 
-def _amplitudes(given: Problem, found: Fitted) -> list[np.ndarray]:
-    """For every effect of a candidate which of its columns are amplitudes."""
-    out = []
+def _amplitudes(given: Problem, found: Fitted) -> dict[str, np.ndarray]:
+    """For every effect of a candidate that has some: which of its columns are amplitudes."""
+    out = {}
     for slot in slots(given.num_properties)[0]:
         if slot.effect.name in found.effects:
             at = [slot.start + j for j, p in enumerate(slot.effect.parameters) if p.amplitude]
             if at:
-                out.append(np.flatnonzero(np.isin(found.columns, at)))
+                out[slot.effect.name] = np.flatnonzero(np.isin(found.columns, at))
     return out
 
 
@@ -126,34 +156,41 @@ def heldout(found: Fitted, labels: np.ndarray, num_trials: int) -> np.ndarray:
     return np.maximum(out[real], 0.0)
 
 
-def alien(best: str, left: float, p_left: float, c: Calibration) -> float:
+def alien(best: str, left: float, p_left: float, c: Calibration, p: float = 0.0) -> float:
     """Probability that no candidate of the catalogue is the cause.
 
     `left`: share of the gap that the `best` candidate leaves; `p_left`: chance of noise to look like what it
-    leaves. Logistic in both logarithms, and nothing where the remainder may well be noise.
+    leaves, `p`: like what there was. Logistic in both logarithms, and nothing where the remainder may well be
+    noise; near 1 where what raised the alarm is still there.
     """
-    surprise = -np.log10(max(p_left, 1e-300))
+    surprise, alarm = (-np.log10(max(chance, 1e-300)) for chance in (p_left, p))
     coarse = any(known_effects()[name].coarse for name in best.split("+") if name in known_effects())
     usual = c.unknown_at * (c.unknown_coarse if coarse else 1.0)
     odds = np.log(max(left, 1e-6) / usual) / c.unknown_width
     odds += c.unknown_slope * np.log(max(surprise, 1.0) / USUAL)
-    return float(expit(odds) * expit(2 * (surprise - 2)))
+    stays = expit((surprise / max(alarm, 1.0) - STAYS) / 0.1)
+    return float(max(expit(odds), stays) * expit(2 * (surprise - 2)))
 
 
 def probabilities(
-    evidence: Mapping[str, float], left: float, p_left: float, c: Calibration
+    evidence: Mapping[str, float], left: float, p_left: float, c: Calibration, p: float = 0.0
 ) -> dict[str, float]:
-    """Probabilities of none, unknown and every candidate; sums to 1. What decoys have goes to unknown.
+    """Probabilities of none, unknown and every candidate; sums to 1. What is `nameless` goes to unknown.
 
-    `evidence` [nats, tempered] over none; `left` and `p_left` as `alien` takes them.
+    `evidence` [nats, tempered] over none; `left`, `p_left` and `p` as `alien` takes them.
     """
     names = ["none", *evidence]
     score = np.array([0.0, *(value + c.prior for value in evidence.values())])
     share = np.exp(score - logsumexp(score))
-    unknown = alien(max(evidence, key=lambda n: evidence[n]), left, p_left, c) if evidence else 0.0
-    out = {n: float(p * (1 - unknown)) for n, p in zip(names, share, strict=True)}
-    unknown += sum(out.pop(n) for n in decoys() if n in out)
+    unknown = alien(max(evidence, key=lambda n: evidence[n]), left, p_left, c, p) if evidence else 0.0
+    out = {n: float(part * (1 - unknown)) for n, part in zip(names, share, strict=True)}
+    unknown += sum(out.pop(n) for n in evidence if nameless(n))
     return {"none": out.pop("none"), "unknown": unknown, **out}
+
+
+def nameless(name: str) -> bool:
+    """Whether a candidate can only win the verdict "unknown": a decoy, or parts that err alike."""
+    return name in decoys() or name.endswith(ALIKE)
 
 
 def ranked(evidence: dict[str, float]) -> list[str]:

@@ -14,6 +14,7 @@ from simgap.gap.fit import Problem
 from simgap.gap.frame import CHANNELS
 
 BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges, the last band ends at half the sampling rate
+ALARM = 0.01  # chance that a healthy recording is called otherwise
 EVIDENCE = 1.4  # times the scale of a healthy recording's largest evidence: see docs/gap.md
 BESIDE = 3.0  # sd; no sample beside a contact change counts for more, its contact may be the other one
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, YIELDING, World, gradient, tips
+from simgap.effects.filters import faded, lowpass
 from simgap.gap.frame import CHANNELS, Arrays
 
 TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
@@ -161,7 +162,7 @@ def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
     """Values (T, N, C) read `steps` samples later (a fraction allowed): cubic Catmull-Rom.
 
     Where they have a corner between two samples, as at a contact change, both sides go straight on to it:
-    before a contact there is no force yet.
+    before a contact there is no force yet. Sides that would not meet between the two are joined straight.
     """
     n = values.shape[1]
     whole = jnp.floor(steps)
@@ -169,8 +170,14 @@ def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
     index = jnp.arange(n) + whole.astype(int)
     p0, p1, p2, p3 = (values[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2))
     cubic = ((-p0 + 3 * p1 - 3 * p2 + p3) * s + (2 * p0 - 5 * p1 + 4 * p2 - p3)) * s + (p2 - p0)
-    left, right = p1 + s * (p1 - p0), p2 - (1 - s) * (p3 - p2)
-    corner = jnp.where(p3 - p2 > p1 - p0, jnp.maximum(left, right), jnp.minimum(left, right))
+    before, across, after = p1 - p0, p2 - p1, p3 - p2
+    convex = after > before
+    before, after = (
+        jnp.where(convex, one(side, across), other(side, across))
+        for side, one, other in ((before, jnp.minimum, jnp.maximum), (after, jnp.maximum, jnp.minimum))
+    )
+    left, right = p1 + s * before, p2 - (1 - s) * after
+    corner = jnp.where(convex, jnp.maximum(left, right), jnp.minimum(left, right))
     corner = jnp.clip(corner, jnp.minimum(p1, p2), jnp.maximum(p1, p2))
     smooth = p1 + 0.5 * s * cubic
     return smooth + _sharp(p1 - p0, p3 - p2, EVEN) * (corner - smooth)
@@ -216,7 +223,7 @@ def _filtered(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
     of what is read between two samples: a contact may have changed before or after."""
 
     def slow(f: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _lowpass(f, world.smoothing, _step(world)), _unsure(f, world.smoothing, _step(world))
+        return lowpass(f, world.smoothing, _step(world)), _unsure(f, world.smoothing, _step(world))
 
     def late(f: jax.Array) -> tuple[jax.Array, jax.Array]:
         steps = world.delay / _step(world)
@@ -267,38 +274,19 @@ def _when(world: World, mode: int, change: Callable[[jax.Array], jax.Array], val
     return jax.lax.cond(jnp.asarray(world.modes)[mode] > 0, change, lambda v: v, values)
 
 
-def _lowpass(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
-    """First-order low-pass of (T, N, C) along N, started at rest; linear between samples."""
-    ratio = step / jnp.maximum(time, 1e-4)
-    keep = jnp.exp(-ratio)
-    new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep
-    before = jnp.concatenate([values[:, :1], values[:, :-1]], 1)
-    drive = new * values + old * before
-    return _faded(jnp.concatenate([values[:, :1], drive[:, 1:]], 1), ratio)
-
-
 def _unsure(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
     """Variance (T, N, C) behind a low-pass of what may have changed at any moment between two samples."""
     ratio = step / jnp.maximum(time, 1e-4)
     share = (1 - jnp.exp(-2 * ratio)) / (2 * ratio) - jnp.square((1 - jnp.exp(-ratio)) / ratio)
     change = jnp.concatenate([jnp.zeros_like(values[:, :1]), values[:, 1:] - values[:, :-1]], 1)
-    return _faded(share * jnp.square(EITHER * change), 2 * ratio)
-
-
-def _faded(drive: jax.Array, ratio: jax.Array) -> jax.Array:
-    """y[k] = exp(-ratio) y[k-1] + drive[k] along N, by doubling: after j rounds y holds the last 2^j."""
-    out, reach = drive, 1
-    while reach < drive.shape[1]:
-        before = jnp.concatenate([jnp.zeros_like(out[:, :reach]), out[:, :-reach]], 1)
-        out, reach = out + jnp.exp(-ratio * reach) * before, 2 * reach
-    return out
+    return faded(share * jnp.square(EITHER * change), 2 * ratio)
 
 
 def _relaxed(world: World, force: jax.Array) -> jax.Array:
     """Forces (T, N, 4) that would give the pads' displacement at once, for pads that creep."""
 
     def crept(f: jax.Array) -> jax.Array:
-        return f + world.creep * (_lowpass(f, world.creep_time, _step(world)) - f)
+        return f + world.creep * (lowpass(f, world.creep_time, _step(world)) - f)
 
     return _when(world, CREEPING, crept, force)
 
@@ -311,10 +299,15 @@ def _between(world: World) -> jax.Array:
     """Variance (T, N, 4) [N^2] of forces before delay and low-pass, from how sharply they bend."""
 
     def rough(f: jax.Array) -> jax.Array:
-        bend = jnp.abs(jnp.pad(f[:, 2:] - 2 * f[:, 1:-1] + f[:, :-2], ((0, 0), (2, 2), (0, 0))))
-        share = world.delay / _step(world) % 1.0
-        sd = BETWEEN * share * (1 - share)
-        return jnp.square(sd * jnp.maximum(jnp.maximum(bend[:, :-2], bend[:, 1:-1]), bend[:, 2:]))
+        steps, n = world.delay / _step(world), f.shape[1]
+        whole = jnp.floor(steps)
+        share = (steps - whole) * (1 - steps + whole)
+        index = jnp.arange(n) + whole.astype(int)
+        p0, p1, p2, p3 = (f[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2))
+        bend = jnp.maximum(jnp.abs(p2 - 2 * p1 + p0), jnp.abs(p3 - 2 * p2 + p1))
+        # A change that neither side goes on with may have come at any moment between the two samples.
+        jump = jnp.maximum(jnp.abs(p2 - p1) - jnp.maximum(jnp.abs(p1 - p0), jnp.abs(p3 - p2)), 0.0)
+        return jnp.square(BETWEEN * share * bend) + share * jnp.square(EITHER * jump)
 
     def steep(f: jax.Array) -> jax.Array:
         return jnp.square(CURVED * world.smoothing * _slope(world, f)[1])

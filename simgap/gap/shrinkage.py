@@ -6,10 +6,10 @@ import numpy as np
 
 from simgap.gap import judge
 from simgap.gap.bank import Bank
+from simgap.gap.candidate import Candidate, remainder
 from simgap.gap.fit import Fitted, Problem, residual_at
 from simgap.gap.freeform import heldout_square
 from simgap.gap.locate import normal_score, subtask_name
-from simgap.gap.search import Candidate, remainder
 
 
 def folds_of(given: Problem, f: Fitted) -> np.ndarray:

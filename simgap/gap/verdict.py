@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from simgap.effects import decoys, fitted
+from simgap.effects import fitted
 from simgap.gap import judge
+from simgap.gap.candidate import Candidate
 from simgap.gap.judge import Calibration
-from simgap.gap.search import ALARM, Candidate, Search
+from simgap.gap.locate import ALARM
+from simgap.gap.search import Search
 
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
 FORM = 0.002  # nor those within this share of its evidence that differ by a coarse effect,
@@ -21,7 +23,7 @@ def likelihoods(
 
     With a gap, what names no cause is unknown; without one, all but a little is none.
     """
-    out = judge.probabilities(evidence, left, p_left, c)
+    out = judge.probabilities(evidence, left, p_left, c, p_value)
     if p_value < ALARM:
         none = min(out["none"], p_value)
         return out | {"none": none, "unknown": out["unknown"] + out["none"] - none}
@@ -35,7 +37,7 @@ def choose(
     probability: Mapping[str, float], found: Search, gap: bool, forced: bool
 ) -> tuple[str, list[str], list[str]]:
     """Verdict, causes and the effects that cannot be told from them."""
-    best, *others = [k for k in found.candidates if k.name not in decoys()]
+    best, *others = [k for k in found.candidates if not judge.nameless(k.name)]
     if forced:
         return "named", sorted(best.effects), []
     if not gap:

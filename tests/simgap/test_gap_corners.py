@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter, lsim
 
 from hmmseg import jaxconfig  # noqa: F401
-from simgap.effects.base import SMOOTH, YIELDING
+from simgap.effects.base import LATE, SMOOTH, YIELDING
 from simgap.gap.residuals import _between, _sunk, contact, shifted
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
@@ -80,6 +80,32 @@ def test_a_contact_between_two_samples_is_read_on_either_side_of_it(share):
     found = np.asarray(shifted(jnp.asarray(force)[None, :, None], jnp.asarray(share)))[0, :, 0]
     true = 0.8 * np.maximum(t + share - 19.6, 0.0)
     assert np.abs(found - true)[:-3].max() < 0.03
+
+
+def test_values_at_their_own_samples_are_themselves():
+    # A grip that closes within one sample and goes on to close: its sides meet nowhere between the two.
+    force = np.repeat([0.0, 0.01, 2.7, 3.1, 3.1, 0.4, 0.0], 2)
+    for share in (0.0, 1e-9):
+        found = np.asarray(shifted(jnp.asarray(force)[None, :, None], jnp.asarray(share)))[0, :, 0]
+        np.testing.assert_allclose(found, force, atol=1e-6)
+    jump = np.array([0.0, 0.0, 0.0, 2.7, 3.1, 3.1])
+    found = np.asarray(shifted(jnp.asarray(jump)[None, :, None], jnp.asarray(0.2)))[0, 2, 0]
+    assert found == pytest.approx(0.2 * 2.7, abs=0.05)
+
+
+@pytest.mark.parametrize("steps", [0.4, 2.4])
+def test_a_late_force_is_in_doubt_where_it_is_read(steps):
+    world = as_jax(world_of(performance(600)))
+    force = jnp.where(jnp.arange(60) >= 30, 2.0, 0.0)
+    world = world._replace(
+        force=jnp.repeat(force[None, :, None], 4, axis=2),
+        delay=jnp.asarray(steps) * jnp.median(world.t[:, 1:] - world.t[:, :-1]),
+        modes=jnp.asarray(world.modes).at[LATE].set(1.0),
+    )
+    variance = np.asarray(_between(world))[0, :, 0]
+    assert variance.argmax() == 29 - int(steps)
+    # It came at any moment between the two samples: at least the variance of one that came midway.
+    assert variance.max() > 0.3**2 and variance[:20].max() == 0.0
 
 
 def test_smooth_values_between_samples_are_cubic():

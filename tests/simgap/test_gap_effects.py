@@ -11,7 +11,7 @@ from hmmseg import jaxconfig  # noqa: F401
 from hmmseg.errors import InputError
 from hmmseg.rig import Finger, Fingertip, Rig
 from simgap.effects import catalogue, decoys, effect_named, fitted
-from simgap.effects.base import Performance, World, flat, tips
+from simgap.effects.base import FORCES, Performance, World, flat, tips
 from simgap.gap.residuals import contact
 from simgap.hand import inverse
 
@@ -171,6 +171,9 @@ PLANTED = {
     "contact_impact": {"impulse": 0.02},
     "force_nonlinearity": {"curve": 0.05, "gain": -0.03},
     "gain_drift": {"rate": 0.03, "gain": -0.02},
+    "force_memory": {"share_0.1": 0.0, "share_0.4": 0.02, "share_1.6": 0.03, "share_6.4": 0.0},
+    "force_mixing": {f"{to}_from_{of}": 0.02 * (k - 1) for to in FORCES for k, of in enumerate(FORCES)},
+    "motion_load": {p.name: 0.04 * (-1) ** k for k, p in enumerate(fitted()["motion_load"].parameters)},
 }
 
 

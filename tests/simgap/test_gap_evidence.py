@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
+from scipy.special import logsumexp
 
 import commands
 from hmmseg.rig import read_rig
@@ -16,7 +17,7 @@ from hmmseg.trial import Trial, read_trial
 from simgap.effects import catalogue
 from simgap.gap.diagnose import diagnose
 from simgap.gap.fit import Fitted, Problem, limits, slots
-from simgap.gap.judge import SCALES, log_evidence
+from simgap.gap.judge import SCALES, TIED, coincidence, log_evidence
 
 NOTHING = object.__new__(Problem)  # a problem of no blocks: evidence reads no more of it
 object.__setattr__(NOTHING, "centre", np.zeros((0, 3)))
@@ -74,6 +75,46 @@ def test_small_amplitudes_cost_less_than_their_prior_would_have_it():
     found = _fitted("structural_vibration", bend, centre, -40.0)
     alone = 40.0 - 0.5 * np.linalg.slogdet(np.eye(count) + bend)[1]
     assert log_evidence(NOTHING, found, _none()) > alone + 20
+
+
+def _tied(rows, bend, centre):
+    """Log density of a centre measured with precision `bend`, of amplitudes in the space of `rows`."""
+    basis = np.linalg.qr(np.array(rows).T)[0]
+    inside = basis @ basis.T
+    each = []
+    for s in SCALES:
+        cov = np.linalg.inv(bend) + s**2 * (inside + TIED**2 * (np.eye(len(centre)) - inside))
+        each.append(-0.5 * centre @ np.linalg.solve(cov, centre) - 0.5 * np.linalg.slogdet(cov)[1])
+    return logsumexp(each) - np.log(len(each))
+
+
+@pytest.mark.parametrize(
+    ("name", "centre", "alike"),
+    [
+        ("joint_offset", (1.5, 1.5, 1.5, 1.5), True),
+        ("joint_offset", (0.15, 0.05, 0.16, 0.04), True),
+        ("joint_offset", (1.5, 0.3, -0.8, 0.4), False),
+        ("force_drift", (-0.4, 0.0, 0.4, 0.0), True),
+        ("force_bias", (0.5, 0.0, 0.0, 0.3), False),
+    ],
+)
+def test_parts_that_err_alike_against_their_closed_form(name, centre, alike):
+    rng = np.random.default_rng(5)
+    root, centre = rng.normal(size=(4, 4)), np.array(centre)
+    precise = 2000 * (root @ root.T / 4 + np.eye(4))
+    columns = _columns(name)
+    bend, at = np.eye(len(columns)), np.zeros(len(columns))  # a drift's bend is of its own
+    bend[:4, :4], at[:4] = precise, centre
+    found = _fitted(name, bend, at, -50.0)
+    ties = [_tied(rows, precise, centre) for rows in catalogue()[name].ties]
+    expected = logsumexp(ties) - np.log(len(ties)) - _tied(np.eye(4), precise, centre)
+    assert coincidence(NOTHING, found) == pytest.approx(expected, abs=1e-6)
+    assert (expected > 1.5) == alike and (expected < -5) != alike
+
+
+def test_an_effect_of_one_part_cannot_err_alike():
+    found = _fitted("force_gain", np.array([[900.0]]), np.array([1.0]), 0.0)
+    assert coincidence(NOTHING, found) == -np.inf
 
 
 def test_what_a_limit_keeps_out_gains_nothing():

@@ -1,0 +1,45 @@
+"""Force channels that remember: the reading lags its load by parts of many lengths."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.signal import lfilter
+
+from simgap.effects.base import FILTER, Effect, Parameter, Performance, World, flat, with_force
+from simgap.effects.filters import lowpass
+
+TIMES = (0.1, 0.4, 1.6, 6.4)  # s
+NAMES = tuple(f"share_{time:g}" for time in TIMES)
+
+
+def _correct(world: World, values, on) -> World:
+    force = jnp.asarray(world.force)
+    step = jnp.median(world.t[:, 1:] - world.t[:, :-1])
+    late = sum(
+        values[name] * (lowpass(force, jnp.asarray(time), step) - force)
+        for name, time in zip(NAMES, TIMES, strict=True)
+    )
+    return world._replace(force=force - late)
+
+
+def _apply(performance: Performance, values, rng) -> Performance:
+    force, step = flat(performance), float(np.median(np.diff(performance.t)))
+    late = np.zeros_like(force)
+    for name, time in zip(NAMES, TIMES, strict=True):
+        keep = np.exp(-step / time)
+        late += values[name] * (lfilter([1 - keep], [1, -keep], force - force[0], axis=0) + force[0] - force)
+    return with_force(performance, force + late)
+
+
+DECOY = Effect(
+    name="force_memory",
+    acts_on="sensing",
+    says="recorded F = F + shares of F smoothed over 0.1, 0.4, 1.6 and 6.4 s",
+    shows="after every change of load, for long",
+    mistaken_for=("force_drift", "force_lowpass", "fingertip_creep"),
+    parameters=tuple(Parameter(n, "1", 0.1, low=-0.5, high=0.5) for n in NAMES),
+    stage=FILTER,
+    correct=_correct,
+    apply=_apply,
+)

@@ -1,0 +1,120 @@
+"""One explanation of a gap: its evidence, and what it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from simgap.effects import decoys, fitted
+from simgap.gap import judge
+from simgap.gap.bank import Bank
+from simgap.gap.events import RECURS
+from simgap.gap.fit import Fitted, Problem, residual_at
+from simgap.gap.locate import cells, largest, tamed
+from simgap.gap.spread import Spread
+
+ALONE = 0.2  # share of its gain that an effect must keep without the place that it gains most in
+EVERY = 0.1  # share of the mean trial's gain in one subtask that it must have in every trial to recur
+LEAST = 10.0  # nats
+KEPT = 0.3  # share of its evidence that a candidate must gain on held-out trials
+STRANGE = 3.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue,
+PATTERN = 1.5  # and parts that err alike better than parts that each err by themselves
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One explanation: its effects, tempered log evidence over none, and its fit or spread.
+
+    `claimed`: evidence on all trials, before held-out trials and recurrence had a say.
+    """
+
+    name: str
+    evidence: float
+    fitted: Fitted
+    spread: Spread | None = None
+    claimed: float = -np.inf
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of its effects."""
+        return tuple(self.name.removesuffix(judge.ALIKE).split("+"))
+
+
+def temperature_of(
+    given: Problem, fits: Sequence[Fitted], spread: Sequence[Spread], healthy: Fitted, bank: Bank
+) -> float:
+    """How far the best candidate misses the healthy floor, in mean square; a floor learned on the bank."""
+    z = residual_at(given, (), healthy.u)
+    least = min(
+        [healthy.square.sum(), *(f.square.sum() for f in fits), *(((z / s.scale) ** 2).sum() for s in spread)]
+    )
+    return max(bank.calibration.temperature, float(least) / (given.size * bank.calibration.floor))
+
+
+def scored(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Candidate:
+    """A fitted candidate with its evidence, which counts for no more than other trials bear out.
+
+    A fit to all trials may owe its evidence to one of them. Right explanations gain about as much on trials
+    that they were not fitted to.
+    """
+    evidence = claimed = judge.log_evidence(given, f, healthy, temperature)
+    n = given.frame.num_trials
+    if n >= RECURS:
+        labels = judge.folds(f, n, np.zeros(0))
+        kept = 0.5 * float((judge.heldout(healthy, labels, n) - judge.heldout(f, labels, n)).sum())
+        if kept < KEPT * evidence:
+            evidence = min(evidence, max(kept, 0.0) / temperature)
+    return Candidate(judge.joined(f.effects), evidence, f, claimed=claimed)
+
+
+def single(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Candidate:
+    """A single effect; decoys hold what others are and more, so they are thought less likely."""
+    found = recurring(given, scored(given, f, healthy, temperature), healthy, temperature)
+    return replace(found, evidence=found.evidence - STRANGE) if found.name in decoys() else found
+
+
+def recurring(given: Problem, found: Candidate, without: Fitted, temperature: float) -> Candidate:
+    """A candidate less what it gains over a fit `without` in one place, if that is most of it: effects recur.
+
+    How far pads slide is free in every grip: what may slide explains any one jump, in one subtask of one
+    trial. Whatever else a hand has, it has with every block or in every trial: what shows in one subtask of
+    some trials alone was an accident of theirs.
+    """
+    f = found.fitted
+    added = set(f.effects) - set(without.effects)
+    if given.frame.num_trials < RECURS:
+        return found
+    gain = (without.square - f.square) / 2
+    slides = any(fitted()[name].switched for name in added)
+    most, total = float((gain if slides else gain.sum(0)).max()), float(gain.sum())
+    enough = ALONE * total if slides else min(ALONE * total, LEAST)
+    by_trial = gain[: given.frame.num_trials, gain.sum(0).argmax()]
+    every = not slides and by_trial.min() > EVERY * by_trial.mean()
+    excess = most if total - most < enough and not every else 0.0
+    return replace(found, evidence=found.evidence - excess / temperature)
+
+
+def alike(given: Problem, found: Candidate, temperature: float) -> Candidate | None:
+    """The candidate as one whose parts err alike, a decoy; None where it has no such parts."""
+    factor = judge.coincidence(given, found.fitted, temperature)
+    if not np.isfinite(factor):
+        return None
+    return replace(found, name=found.name + judge.ALIKE, evidence=found.evidence + factor - PATTERN)
+
+
+def remainder(given: Problem, candidate: Candidate) -> np.ndarray:
+    """Whitened residuals (T, N, C) that a candidate leaves."""
+    z = residual_at(given, candidate.fitted.effects, candidate.fitted.u)
+    return z if candidate.spread is None else z / candidate.spread.scale
+
+
+def left(given: Problem, candidate: Candidate, healthy: Fitted, bank: Bank) -> tuple[float, float]:
+    """Share of the excess square that a candidate leaves, and the chance of noise to look like that."""
+    floor = bank.calibration.floor * given.size
+    before = max(float((tamed(given, residual_at(given, (), healthy.u)) ** 2).sum()) - floor, 1.0)
+    z = remainder(given, candidate)
+    rest = float((tamed(given, z) ** 2).sum()) - floor
+    p = min(bank.detection.p_values(largest(cells(given, z))).values())
+    return float(np.clip(rest / before, 0.0, 1.0)), p
