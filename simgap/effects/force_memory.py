@@ -10,17 +10,25 @@ from simgap.effects.base import FILTER, Effect, Parameter, Performance, World, f
 from simgap.effects.filters import lowpass
 
 TIMES = (0.1, 0.4, 1.6, 6.4)  # s
+LONG = 64  # samples after which a click is forgotten but for little
 NAMES = tuple(f"share_{time:g}" for time in TIMES)
+
+
+def _remembered(force, values, step):
+    """What the readings (T, N, C) owe to loads of before."""
+    return sum(
+        values[name] * (lowpass(force, jnp.asarray(time), step) - force)
+        for name, time in zip(NAMES, TIMES, strict=True)
+    )
 
 
 def _correct(world: World, values, on) -> World:
     force = jnp.asarray(world.force)
     step = jnp.median(world.t[:, 1:] - world.t[:, :-1])
-    late = sum(
-        values[name] * (lowpass(force, jnp.asarray(time), step) - force)
-        for name, time in zip(NAMES, TIMES, strict=True)
-    )
-    return world._replace(force=force - late)
+    # A correction that smooths would have less noise than was recorded.
+    click = jnp.zeros((1, LONG, 1)).at[0, 1, 0].set(1.0)
+    noise = jnp.sqrt(jnp.square(click - _remembered(click, values, step)).sum())
+    return world._replace(force=force - _remembered(force, values, step), loudness=world.loudness / noise)
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

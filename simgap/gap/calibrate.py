@@ -13,12 +13,11 @@ from hmmseg.segmentation import align_trials
 from hmmseg.signals import task_space
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
-from simgap.effects import catalogue, decoys
+from simgap.effects import catalogue
 from simgap.gap import judge
 from simgap.gap.adapt import fingerprint
 from simgap.gap.bank import Bank, Reference
 from simgap.gap.bootstrap import TAIL, distribution, gumbel, statistics
-from simgap.gap.candidate import STRANGE
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, raw_residual_at, residual_at
 from simgap.gap.frame import Frame, build
@@ -124,11 +123,9 @@ def detection(
         best = ""
         if k < catalogued:
             names = [n for n, e in catalogue().items() if e.chosen]
-            fits = best_fits(task, [(n,) for n in (*deterministic(names), *decoys())], found)
+            fits = best_fits(task, [(n,) for n in deterministic(names)], found)
             scores = {
-                f.effects[0]: judge.log_evidence(task, f, found, Calibration().temperature)
-                - (STRANGE if f.effects[0] in decoys() else 0.0)
-                for f in fits
+                f.effects[0]: judge.log_evidence(task, f, found, Calibration().temperature) for f in fits
             }
             scores |= {s.effect: s.evidence / Calibration().temperature for s in spreads(task, found)}
             leading = max(scores, key=lambda n: scores[n])
