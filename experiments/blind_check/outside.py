@@ -8,7 +8,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from experiments.blind_check.effects import Change, Made, Rng, Values, _force, _sign
-from experiments.blind_check.signals import ENCODER, HAND, READOUT, SCALE, Signals, Stage
+from experiments.blind_check.hand import jacobians
+from experiments.blind_check.signals import ENCODER, HAND, MIX, READOUT, SCALE, Signals, Stage
 
 
 def _lazy(v: Values) -> Stage:
@@ -195,6 +196,50 @@ def _curtained(v: Values) -> Stage:
     return _force(shift)
 
 
+def _clinging(v: Values) -> Stage:
+    """Gummy feet: a block that is lifted peels off what it stood on and holds the fingers back."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        out = np.zeros_like(s.force)
+        for block, leave in enumerate(s.motion.boundaries[1::4]):
+            height = s.motion.centres[:, block, 1]
+            way = np.maximum(height - height[np.searchsorted(s.t, leave)], 0.0) * (s.t > leave)
+            peeled = np.exp(-np.maximum.accumulate(way) / v["reach"])  # what has come off stays off
+            drawn = np.clip(1 + (s.t - leave) / v["build"], 0, 1)
+            pull = v["pull"] * rng.uniform(0.85, 1.15) * drawn * peeled
+            out[:, [1, 3]] += pull[:, None] / 2
+        return out
+
+    return _force(shift)
+
+
+def _tendons(v: Values) -> Stage:
+    """Tendons to the outer links led over the inner joints: their motors' encoders count these turns too."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None and s.dq is not None
+        share = np.array([v["share1"], v["share2"]])
+        q, dq = s.q.copy(), s.dq.copy()
+        q[:, 1::2] += share * (s.q[:, 0::2] - s.q[0, 0::2])
+        dq[:, 1::2] += share * s.dq[:, 0::2]
+        return replace(s, q=q, dq=dq)
+
+    return stage
+
+
+def _cogging(v: Values) -> Stage:
+    """Forces told from the joints' torques, which ripple with every tooth that the gears turn on."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None
+        torque = v["torque"] * np.sin(v["teeth"] * s.q + np.array([0.8, 2.9, 5.0, 1.4]))
+        turned = np.swapaxes(jacobians(s.rig, s.q), 2, 3)
+        force = np.linalg.solve(turned, torque.reshape(-1, 2, 2)[..., None])[..., 0]
+        return replace(s, force=s.force + force.reshape(-1, 4))
+
+    return stage
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -233,5 +278,13 @@ OUTSIDE = {
         _made("soft_guard", lambda r, s: {"stiffness": 45 * s, "place": r.uniform(0.138, 0.15),
                                           "friction": r.uniform(0.2, 0.5)},
               HAND, _curtained),
+        _made("clinging_feet", lambda r, s: {"pull": 1.6 * s, "reach": r.uniform(0.003, 0.008),
+                                             "build": r.uniform(0.1, 0.2)},
+              HAND, _clinging),
+        _made("tendon_coupling", lambda r, s: {"share1": 0.04 * s * _sign(r),
+                                               "share2": 0.04 * s * _sign(r) * r.uniform(0.5, 1)},
+              ENCODER, _tendons),
+        _made("gear_cogging", lambda r, s: {"torque": 0.018 * s, "teeth": float(r.integers(20, 41))},
+              MIX, _cogging),
     )
 }  # fmt: skip
