@@ -13,5 +13,5 @@ EFFECT = Effect(
     parameters=(Parameter("sd", "s", 1.0, neutral=0.004, log=True, low=1e-4, high=0.05),),
     stage=READOUT,
     coarse=True,
-    form=0.2,  # changes of speed within a sample count as well, and errors of time need not be normal
+    form=0.12,  # changes of speed within a sample count as well, and errors of time need not be normal
 )

@@ -35,7 +35,7 @@ EFFECT = Effect(
         Parameter("give_shear", "m/N", 4e-4, low=-3.8e-4),
     ),
     stage=CONTACT,
-    form=0.05,  # real pads are no linear springs: their secant changes with the grip
+    form=0.035,  # real pads are no linear springs: their secant changes with the grip
     correct=_correct,
     report=_report,
     scene=lambda v: {"normal_stiffness": v["normal_stiffness"], "shear_stiffness": v["shear_stiffness"]},

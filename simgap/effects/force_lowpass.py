@@ -26,5 +26,5 @@ EFFECT = Effect(
     correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(smoothing=w.smoothing + v["time_constant"]),
     apply=_apply,
     coarse=True,
-    blur=4e-3,  # a contact that changes between two samples: less than a tenth of them
+    blur=2.5e-3,  # a contact that changes between two samples: a twentieth of them
 )

@@ -11,16 +11,21 @@ from simgap.effects.base import World, gradient, tips
 from simgap.gap.candidate import Candidate
 from simgap.gap.fit import Problem, raw_residual_at, world_without
 from simgap.gap.frame import CHANNELS
+from simgap.operator import OperatorSettings
 
 YIELDS = frozenset({"grip_slip", "table_compliance"})  # effects that show as a path from where a grip began
+PUSHES = frozenset({"cable_force", "viscous_drag"})  # those that displace the hand that bears them
+SOFT = frozenset({"fingertip_compliance", "fingertip_creep"})  # those with which a hand closes farther
+HAND = float(np.mean(OperatorSettings().hand_stiffness))  # N/m of a finger; no recording tells it
 
 
 def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
     """Mean shift (T, S, C) of a cell under a candidate's effects, in noise of one sample.
 
     A sensor's or a joint's effect shifts what is recorded. What acts on contact shows in the equations of
-    the contact as well; the larger of the two counts. Times that are off at random shift the mean of a cell
-    by so much in root mean square.
+    the contact as well; the larger of the two counts. A hand is as stiff as HAND: it gives way to what pushes
+    it, and grips the less the farther pads give. Times that are off at random shift the mean of a cell by so
+    much in root mean square.
     """
     frame, effects, u = given.frame, candidate.fitted.effects, candidate.fitted.u
     without = world_without(given, effects, u)
@@ -28,6 +33,9 @@ def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
     change = recorded - _channels(without)
     change[..., CHANNELS.index("shear")] += _couple(given, without, u)
     change[..., CHANNELS.index("y")] += _inclined(given, without)
+    if not PUSHES.isdisjoint(effects):
+        for path, force in (("x", "fx"), ("y", "fy")):
+            change[..., CHANNELS.index(path)] -= change[..., CHANNELS.index(force)] / (2 * HAND)
     there = given.whitening.weight > 0
     mechanical = [
         e for e in effects if fitted()[e].acts_on not in ("sensing", "kinematics") and e != "table_tilt"
@@ -40,6 +48,9 @@ def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
         )
         if not YIELDS.isdisjoint(mechanical):
             _from_pickup(given, violated)
+        if not SOFT.isdisjoint(mechanical):
+            grip, nearer = CHANNELS.index("grip"), np.abs(violated[..., CHANNELS.index("distance")]) / 2
+            violated[..., grip] = np.maximum(np.abs(violated[..., grip]), HAND * nearer)
     jitter = np.zeros_like(change)
     if candidate.spread is not None and candidate.spread.effect == "clock_jitter":
         jitter = candidate.spread.value * np.asarray(gradient(frame.world.t, recorded))

@@ -25,16 +25,12 @@ PATTERN = 1.5  # and parts that err alike better than parts that each err by the
 
 @dataclass(frozen=True)
 class Candidate:
-    """One explanation: its effects, tempered log evidence over none, and its fit or spread.
-
-    `claimed`: evidence on all trials, before held-out trials and recurrence had a say.
-    """
+    """One explanation: its effects, tempered log evidence over none, and its fit or spread."""
 
     name: str
     evidence: float
     fitted: Fitted
     spread: Spread | None = None
-    claimed: float = -np.inf
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -57,16 +53,22 @@ def scored(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Ca
     """A fitted candidate with its evidence, which counts for no more than other trials bear out.
 
     A fit to all trials may owe its evidence to one of them. Right explanations gain about as much on trials
-    that they were not fitted to.
+    that they were not fitted to, and by agreeing with properties that were measured apart.
     """
-    evidence = claimed = judge.log_evidence(given, f, healthy, temperature)
+    evidence = judge.log_evidence(given, f, healthy, temperature)
     n = given.frame.num_trials
     if n >= RECURS:
         labels = judge.folds(f, n, np.zeros(0))
         kept = 0.5 * float((judge.heldout(healthy, labels, n) - judge.heldout(f, labels, n)).sum())
+        kept += _believed(given, f) - _believed(given, healthy)
         if kept < KEPT * evidence:
             evidence = min(evidence, max(kept, 0.0) / temperature)
-    return Candidate(judge.joined(f.effects), evidence, f, claimed=claimed)
+    return Candidate(judge.joined(f.effects), evidence, f)
+
+
+def _believed(given: Problem, f: Fitted) -> float:
+    """Log prior density [nats], less a constant, of the properties that a candidate asks for."""
+    return -0.5 * float((f.u[: given.num_properties] ** 2).sum())
 
 
 def single(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Candidate:

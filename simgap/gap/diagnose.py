@@ -119,8 +119,8 @@ def _why_unknown(best: Candidate) -> list[str]:
     """What explains the gap better than any effect of the catalogue, if something does."""
     if best.name.endswith(judge.ALIKE):
         return [
-            f"{'+'.join(best.effects)} would explain the gap, but in its both fingers err alike, as "
-            "independent parts do not: one cause that the catalogue does not have is behind it"
+            f"{'+'.join(best.effects)} would explain the gap, but both fingers would have to err alike, "
+            "which independent parts do not: the cause is one that the catalogue does not have"
         ]
     if best.name in decoys():
         says = decoys()[best.name].says

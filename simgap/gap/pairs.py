@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from simgap.effects import catalogue, decoys
 from simgap.gap import judge
@@ -11,14 +12,15 @@ from simgap.gap.candidate import LEAST, Candidate, left, recurring, scored, sing
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import LARGE, Fitted, Problem, Start, fit, slots
 from simgap.gap.locate import ALARM
-from simgap.gap.spread import spreads
+from simgap.gap.spread import Spread, spreads
 
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
 SWAPS = 2  # times that a half of the best pair is exchanged
-WORTH = 0.7  # a pair must leave no more than this share of what its better half leaves,
-PLENTY = 0.02  # or gain this share of its evidence over that half,
-MORE = 0.0003  # and must gain this share at least,
-COARSE = 0.005  # more if that is coarse
+MORE, COARSE = 3e-4, 5e-3  # share of its evidence that a pair must gain over its better half, a coarse one;
+CALM, CALMER = 0.1, 1e-4  # what that half leaves must look less like noise than this, even less if coarse,
+AMPLE = 0.2  # unless the pair gains so large a share;
+WORTH = 0.7  # and the pair must leave no more than this share of what its better half leaves,
+PLENTY = 0.03  # or gain this share
 STUCK = 2.0  # nats at T = 1 by which a half of a pair, taken alone, may do better than as a single so far
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 # What shifts or smooths samples in time.
@@ -88,13 +90,15 @@ def worthwhile(
     out = []
     for pair in pairs:
         better = max((c for c in singles if c.name in pair.effects), key=lambda c: c.evidence)
-        rest = left(given, better, healthy, bank)[0]
         coarse = better.spread is None and any(catalogue()[name].coarse for name in better.effects)
-        share = COARSE if coarse else MORE
         gain = pair.evidence - better.evidence
-        if gain < max(share * pair.evidence, LEAST):
+        share = gain / max(pair.evidence, LEAST)
+        if gain < LEAST or share < (COARSE if coarse else MORE):
             continue
-        if gain > PLENTY * pair.evidence or left(given, pair, healthy, bank)[0] < max(WORTH * rest, LITTLE):
+        rest, p_rest = left(given, better, healthy, bank)
+        if share < AMPLE and p_rest > (CALMER if coarse else CALM):
+            continue
+        if share > PLENTY or left(given, pair, healthy, bank)[0] < max(WORTH * rest, LITTLE):
             out.append(pair)
     return out
 
@@ -124,8 +128,19 @@ def _pairs(
             if name not in out or candidate.evidence > out[name].evidence:
                 out[name] = candidate
         for s in spreads(given, half.fitted):
-            if {s.effect, half.name} <= SHAPING:
+            if s.effect not in names or {s.effect, half.name} <= SHAPING:
                 continue
             name = judge.joined((half.name, s.effect))
-            out[name] = Candidate(name, half.evidence + s.evidence / temperature, half.fitted, s)
+            shown = half.evidence
+            if s.effect == "quantisation" and s.evidence > 0:
+                shown = _above(given, half, healthy, s, temperature)
+            out[name] = Candidate(name, shown + s.evidence / temperature, half.fitted, s)
     return out
+
+
+def _above(given: Problem, half: Candidate, healthy: Fitted, rounding: Spread, temperature: float) -> float:
+    """Evidence [nats, tempered] of a half of a pair above the noise that rounded forces have."""
+    w = given.whitening
+    noisy = replace(given, whitening=w._replace(weight=w.weight / rounding.scale))
+    none, found = fit(noisy, [Start((), healthy.u), Start(half.effects, half.fitted.u)])
+    return single(noisy, found, none, temperature).evidence

@@ -121,7 +121,7 @@ def search(
     found += [c for c in (alike(given, k, temperature) for k in found) if c is not None]
     found.sort(key=lambda c: -c.evidence)
     # Decoys are so free that they gain on healthy recordings as well: they raise no alarm.
-    statistics["gain"] = max(max(c.evidence, c.claimed) for c in found if not judge.nameless(c.name))
+    statistics["gain"] = max(c.evidence for c in found if not judge.nameless(c.name))
     return Search(given, healthy, tuple(found), statistics, temperature, tuple(warnings))
 
 

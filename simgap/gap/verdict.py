@@ -12,8 +12,9 @@ from simgap.gap.locate import ALARM
 from simgap.gap.search import Search
 
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
-FORM = 0.002  # nor those within this share of its evidence that differ by a coarse effect,
-EXACT = 1e-4  # or within this one by others: no form is exact to that
+BOTH = 0.006  # nor those within this share of its evidence that differ by coarse effects alone,
+FORM = 0.002  # by a coarse effect and another,
+EXACT = 1e-4  # or by others: no form is exact to that
 
 
 def likelihoods(
@@ -55,8 +56,9 @@ def choose(
 def _tie(best: Candidate, other: Candidate) -> float:
     """Nats (tempered) by which a candidate must be behind the best to be told from it."""
     differ = set(best.effects) ^ set(other.effects)
-    coarse = any(fitted()[name].coarse for name in differ)
-    return max(TIE, (FORM if coarse else EXACT) * best.evidence)
+    coarse = [fitted()[name].coarse for name in differ]
+    share = BOTH if all(coarse) else FORM if any(coarse) else EXACT
+    return max(TIE, share * best.evidence)
 
 
 def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:

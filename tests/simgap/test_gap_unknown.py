@@ -16,7 +16,7 @@ from hmmseg.task import BlockTask, read_task
 from hmmseg.trial import Trial, read_trial
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import diagnose
-from simgap.gap.judge import ALIKE, alien
+from simgap.gap.judge import ALIKE, alien, log_evidence
 
 FOLDER = Path(commands.__file__).parent / "demo_data"
 RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
@@ -36,7 +36,8 @@ def test_what_one_trial_alone_bears_out_is_not_named():
     off = {"fx1": 0.03, "fy1": -0.06, "fx2": 0.05, "fy2": 0.08}
     found = diagnose([changed(TRIALS[0], **off), *TRIALS[1:]], TASK, RIG)
     bias = next(c for c in found.candidates if c.name == "force_bias")
-    assert bias.claimed > 20 > bias.evidence
+    claimed = log_evidence(found.problem, bias.fitted, found.healthy, temperature=3.0)
+    assert claimed > 20 > bias.evidence
     assert found.body["verdict"] == "unknown"
     every = diagnose([changed(t, **off) for t in TRIALS], TASK, RIG)
     assert every.body["causes"] == ["force_bias"]
