@@ -15,7 +15,7 @@ NAMES = tuple(f"share_{time:g}" for time in TIMES)
 
 
 def _remembered(force, values, step):
-    """What the readings (T, N, C) owe to loads of before."""
+    """What the readings (T, N, C) owe to loads of before, to first order: readings stand for the loads."""
     return sum(
         values[name] * (lowpass(force, jnp.asarray(time), step) - force)
         for name, time in zip(NAMES, TIMES, strict=True)

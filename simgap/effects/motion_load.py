@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import (
+    FORCES,
     HAND,
     Effect,
     Parameter,
@@ -22,12 +23,11 @@ from simgap.effects.cable_force import MIDDLE
 USUAL = (0.03, 0.1, 0.5)  # m, m/s, m/s^2: what they work with
 MOTIONS = ("x", "y", "vx", "vy", "ax", "ay")
 NAMES = tuple(f"{axis}_of_{motion}" for axis in ("fx", "fy") for motion in MOTIONS)
-STEADY = ("fx1", "fy1", "fx2", "fy2")
 
 
 def _load(position, velocity, acceleration, values, xp):
     """Forces (..., 4) [N] of motions (..., 4)."""
-    steady = xp.stack([xp.asarray(values[n], float) for n in STEADY])
+    steady = xp.stack([xp.asarray(values[n], float) for n in FORCES])
     matrix = xp.stack([xp.asarray(values[n], float) for n in NAMES]).reshape(2, 6)
     out = []
     for finger in (0, 1):
@@ -58,7 +58,7 @@ DECOY = Effect(
     says="a force on both fingers, linear in position, velocity and acceleration",
     shows="free motion too",
     mistaken_for=("cable_force", "viscous_drag", "fingertip_mass", "force_bias"),
-    parameters=tuple(Parameter(n, "N", 0.05) for n in (*STEADY, *NAMES)),
+    parameters=tuple(Parameter(n, "N", 0.05) for n in (*FORCES, *NAMES)),
     stage=HAND,
     correct=_correct,
     apply=_apply,

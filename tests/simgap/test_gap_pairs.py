@@ -1,0 +1,87 @@
+"""Which second effects are offered and which pay; what measured blocks bear out; what pushes a hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import commands
+from estimation.actual import read_actual
+from hmmseg.rig import read_rig
+from hmmseg.task import BlockTask, read_task
+from hmmseg.trial import Trial, read_trial
+from simgap.gap.affected import HAND, shifts
+from simgap.gap.diagnose import diagnose
+from simgap.gap.fit import slots
+from simgap.gap.frame import CHANNELS
+
+FOLDER = Path(commands.__file__).parent / "demo_data"
+RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
+assert isinstance(TASK, BlockTask)
+TRIALS = [read_trial(FOLDER / f"trial_{k:02d}.csv", RIG) for k in (1, 2, 3, 4)]
+STEP = 0.05  # N; rounding to it has the standard deviation of the sensors' noise
+FORCES = ("fx1", "fy1", "fx2", "fy2")
+
+
+def changed(trial: Trial, change) -> Trial:
+    """A trial with its forces changed."""
+    return replace(trial, channels=trial.channels | {c: change(trial.channels[c]) for c in FORCES})
+
+
+def rounded(trial: Trial) -> Trial:
+    """A trial with a small bias whose forces are rounded."""
+    return changed(trial, lambda f: np.round((f + 0.008) / STEP) * STEP)
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return diagnose([rounded(t) for t in TRIALS], TASK, RIG)
+
+
+def test_rounding_is_noise_to_what_goes_with_it(coarse):
+    assert coarse.body["causes"] == ["quantisation"]
+    evidence = {c.name: c.evidence for c in coarse.candidates}
+    alone = max(v for k, v in evidence.items() if "quantisation" not in k and "+" not in k)
+    beside = [v - evidence["quantisation"] for k, v in evidence.items() if k.endswith("+quantisation")]
+    assert all(gain < 0.7 * alone for gain in beside)
+
+
+def test_what_is_excluded_is_no_half_of_a_pair():
+    found = diagnose([rounded(t) for t in TRIALS], TASK, RIG, excluded=["quantisation"])
+    assert not any("quantisation" in c.name for c in found.candidates)
+    assert found.body["verdict"] == "unknown"
+
+
+def test_measured_blocks_bear_out_a_length_that_no_trial_shows():
+    # Links that are 1 % longer than the rig says make every width and height as much too small.
+    shorter = {
+        n: f.model_copy(update={"links": tuple(v / 1.01 for v in f.links)}) for n, f in RIG.fingers.items()
+    }
+    wrong = RIG.model_copy(update={"fingers": shorter})
+    found = diagnose(TRIALS, TASK, wrong, read_actual(FOLDER / "actual.toml", TASK.objects))
+    assert found.body["causes"] == ["link_length"]
+    assert (
+        found.body["effects"]["link_length"]["heldout_score"]
+        < 0.3 * found.body["effects"]["link_length"]["log_evidence"]
+    )
+
+
+def test_a_cable_displaces_the_hand_that_bears_it():
+    found = diagnose(TRIALS, TASK, RIG, forced=["cable_force"])
+    (cable,) = found.candidates
+    slot = next(s for s in slots(found.problem.num_properties)[0] if s.effect.name == "cable_force")
+    u = cable.fitted.u.copy()
+    u[slot.start : slot.stop] = [
+        p.coordinate(v) for p, v in zip(slot.effect.parameters, (0.0, 0.1, -0.2), strict=True)
+    ]
+    mean = shifts(found.problem, replace(cable, fitted=replace(cable.fitted, u=u)))[
+        0, 0
+    ]  # before any contact
+    noise = found.problem.frame.arrays.sample[0]
+    for path, force, pull in (("x", "fx", 0.1), ("y", "fy", 0.2)):
+        p, f = CHANNELS.index(path), CHANNELS.index(force)
+        assert mean[f] * noise[f] == pytest.approx(2 * pull)
+        assert mean[p] * noise[p] == pytest.approx(pull / HAND)
