@@ -255,7 +255,8 @@ def tables(body: dict[str, Any]) -> list[Table]:
             values.add_column(head, no_wrap=True)
         for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
             low, high = p["interval_90"]
-            values.add_row(name, f"{p['mean']:.4g} +- {p['sd']:.2g} {p['unit']}", f"{low:.4g} to {high:.4g}")
+            unit = "" if p["unit"] == "1" else f" {p['unit']}"
+            values.add_row(name, f"{p['mean']:.4g} +- {p['sd']:.2g}{unit}", f"{low:.4g} to {high:.4g}")
         out.append(values)
     if body["next_experiment"] is not None:
         following = Table(title="next experiment", title_justify="left", show_header=False)
