@@ -47,6 +47,7 @@ def follow(folder: Path, results: Path, progress=None, first: int | None = None)
         right = sorted(after.get("causes", [])) == sorted(entry["effects"])
         out.append({
             "case": entry["case"], "true": sorted(entry["effects"]), "do": found["next_experiment"]["do"],
+            "expected_gain_nats": found["next_experiment"]["expected_gain_nats"],
             "said": after.get("causes", []), "verdict": after.get("verdict", "error"),
             "separated": right and after.get("verdict") == "named",
         })  # fmt: skip

@@ -90,7 +90,8 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any], oracle: Oracle | No
         "said": said,
         "partners": sorted(found["indistinguishable"]),
         "gain": gain,
-        "above": gain is not None and gain >= FLOOR and seen_each(entry, found),
+        # What makes a recording be refused is not too small to see: a refusal counts, and is wrong.
+        "above": failed or (gain is not None and gain >= FLOOR and seen_each(entry, found)),
         "right": said == true and found["verdict"] in ("none", "named", "set"),
         "right_set": set(true) <= together and len(said) == max(len(true), 1),
         "probability": found["probabilities"].get(label(entry), 0.0),
@@ -246,7 +247,7 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
             for e in sorted({r["true"][0] for r in tier.get("single", [])})
         },
         "by_size": _by(tier.get("single", []), lambda r: max(r["sizes"].values()), SIZES),
-        "by_gain": _by(single, lambda r: r["gain"], GAINS),
+        "by_gain": _by([r for r in single if r["gain"] is not None], lambda r: r["gain"], GAINS),
         "rivals": {k: _rival(k, healthy, single, outside) for k in RIVALS},
         "confusion": confusion([*healthy, *single, *pairs, *outside]),
         "reliability": calibration(seen)["bins"],

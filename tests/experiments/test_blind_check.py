@@ -240,3 +240,21 @@ def test_the_scorer_counts_hand_made_results():
     assert top["said"] == pytest.approx(0.95) and top["right"]["count"] == 10
     low, high = table["false_alarms"]["interval_95"]
     assert low == pytest.approx(0.0126, abs=1e-3) and high == pytest.approx(0.9874, abs=1e-3)
+
+
+def test_a_recording_that_is_refused_counts_and_is_wrong():
+    refused = {"error": "does not fit its task", "seconds": 1.0}
+    one, two = {"force_bias": {"fy1": 0.1}}, {"force_bias": {}, "force_lag": {}}
+    tiers = (
+        ("healthy", {}),
+        ("single", one),
+        ("pair", two),
+        ("outside", {"mains_hum": {}}),
+        ("withheld", one),
+    )
+    found = figures([judge_case(entry(tier, tier, effects), refused) for tier, effects in tiers])
+    table = found["table"]
+    assert found["above_floor"] == {"single": 1, "pair": 1}
+    assert table["false_alarms"]["value"] == 1.0
+    for name in ("named_right", "set_right", "outside_unknown", "withheld_right", "pair_exact"):
+        assert table[name]["count"] == 1 and table[name]["hits"] == 0

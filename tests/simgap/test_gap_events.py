@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from demo_recordings import RIG, TASK, TRIALS
 
-import commands
-from hmmseg.rig import read_rig
-from hmmseg.task import read_task
-from hmmseg.trial import Trial, read_trial
+from hmmseg.trial import Trial
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import alien
 from simgap.gap.locate import BESIDE, tamed
-
-FOLDER = Path(commands.__file__).parent / "demo_data"
-RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
-TRIALS = [read_trial(FOLDER / f"trial_{k:02d}.csv", RIG) for k in (1, 2, 3, 4)]
 
 
 def pressed(trial: Trial) -> Trial:

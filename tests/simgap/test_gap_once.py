@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from demo_recordings import RIG, TASK, TRIALS
 
-import commands
-from hmmseg.rig import read_rig
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import read_trial
 from simgap.gap.affected import shifts
 from simgap.gap.candidate import Candidate, recurring
 from simgap.gap.diagnose import diagnose
 from simgap.gap.fit import Start, fit, slots
 from simgap.gap.frame import CHANNELS
 from simgap.gap.pairs import unstuck
-
-FOLDER = Path(commands.__file__).parent / "demo_data"
-RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
-assert isinstance(TASK, BlockTask)
-TRIALS = [read_trial(FOLDER / f"trial_{k:02d}.csv", RIG) for k in (1, 2, 3, 4)]
 
 
 @pytest.fixture(scope="module")

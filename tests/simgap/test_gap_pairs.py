@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from demo_recordings import FOLDER, RIG, TASK, TRIALS
 
-import commands
 from estimation.actual import read_actual
-from hmmseg.rig import read_rig
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import Trial, read_trial
+from hmmseg.trial import Trial
+from simgap.effects.base import FORCES
 from simgap.gap.affected import HAND, shifts
 from simgap.gap.diagnose import diagnose
 from simgap.gap.fit import slots
 from simgap.gap.frame import CHANNELS
 
-FOLDER = Path(commands.__file__).parent / "demo_data"
-RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
-assert isinstance(TASK, BlockTask)
-TRIALS = [read_trial(FOLDER / f"trial_{k:02d}.csv", RIG) for k in (1, 2, 3, 4)]
-STEP = 0.03  # N; rounding to it scatters by 0.009, as much again as the sensors' noise
-FORCES = ("fx1", "fy1", "fx2", "fy2")
+STEP = 0.03  # N; rounding to it scatters by 0.009, where the sensors' noise is 0.012
 
 
 def changed(trial: Trial, change) -> Trial:
@@ -63,10 +56,8 @@ def test_measured_blocks_bear_out_a_length_that_no_trial_shows():
     wrong = RIG.model_copy(update={"fingers": shorter})
     found = diagnose(TRIALS, TASK, wrong, read_actual(FOLDER / "actual.toml", TASK.objects))
     assert found.body["causes"] == ["link_length"]
-    assert (
-        found.body["effects"]["link_length"]["heldout_score"]
-        < 0.3 * found.body["effects"]["link_length"]["log_evidence"]
-    )
+    length = found.body["effects"]["link_length"]
+    assert length["heldout_score"] < 0.3 * length["log_evidence"]
 
 
 def test_a_cable_displaces_the_hand_that_bears_it():
@@ -77,9 +68,8 @@ def test_a_cable_displaces_the_hand_that_bears_it():
     u[slot.start : slot.stop] = [
         p.coordinate(v) for p, v in zip(slot.effect.parameters, (0.0, 0.1, -0.2), strict=True)
     ]
-    mean = shifts(found.problem, replace(cable, fitted=replace(cable.fitted, u=u)))[
-        0, 0
-    ]  # before any contact
+    mean = shifts(found.problem, replace(cable, fitted=replace(cable.fitted, u=u)))
+    mean = mean[0, 0]  # before any contact
     noise = found.problem.frame.arrays.sample[0]
     for path, force, pull in (("x", "fx", 0.1), ("y", "fy", 0.2)):
         p, f = CHANNELS.index(path), CHANNELS.index(force)

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from demo_recordings import RIG, TASK, TRIALS
 
-import commands
 from experiments.gap_cases import draw_case
 from hmmseg.errors import InputError
-from hmmseg.rig import read_rig
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import Trial, read_trial
+from hmmseg.trial import Trial
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import ALIKE, alien, log_evidence
-
-FOLDER = Path(commands.__file__).parent / "demo_data"
-RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")
-assert isinstance(TASK, BlockTask)
-TRIALS = [read_trial(FOLDER / f"trial_{k:02d}.csv", RIG) for k in (1, 2, 3, 4)]
 
 
 def changed(trial: Trial, **added) -> Trial:
