@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from experiments.blind_check.effects import Change, Made, Rng, Values, _force, _sign
 from experiments.blind_check.hand import jacobians
-from experiments.blind_check.signals import ENCODER, HAND, MIX, READOUT, SCALE, Signals, Stage
+from experiments.blind_check.signals import ENCODER, HAND, LINKS, MIX, READOUT, SCALE, Signals, Stage
 
 
 def _lazy(v: Values) -> Stage:
@@ -240,6 +240,45 @@ def _cogging(v: Values) -> Stage:
     return stage
 
 
+def _rectified(v: Values) -> Stage:
+    """Strain amplifiers rectify what the motors' drives emit: zeros shift with speed, either way alike."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        assert s.dq is not None
+        speed = np.repeat(np.hypot(s.dq[:, 0::2], s.dq[:, 1::2]), 2, axis=1)
+        share = np.array([1.0, v["share"], -0.7, 0.8])
+        return v["height"] * share * speed**2 / (speed**2 + v["speed"] ** 2)
+
+    return _force(shift)
+
+
+def _bending(v: Values) -> Stage:
+    """Unsymmetrical bending: a finger that presses sideways gives way in height, past its encoders."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        keep = np.exp(-(s.t[1] - s.t[0]) / 0.005)
+        load = np.abs(s.motion.force[:, 0::2])
+        load = np.asarray(lfilter([1 - keep], [1, -keep], load, axis=0, zi=keep * load[:1])[0])
+        give = np.repeat(load, 2, axis=1) * np.array([0, v["give1"], 0, v["give2"]])
+        place, rate = s.motion.position + give, s.motion.velocity + np.gradient(give, s.t, axis=0)
+        return replace(s, motion=replace(s.motion, position=place, velocity=rate))
+
+    return stage
+
+
+def _nozzle(v: Values) -> Stage:
+    """A cooling nozzle above the workspace: its gusty jet presses on a finger that passes below it."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        keep = np.exp(-(s.t[1] - s.t[0]) / 0.15)
+        steps = np.sqrt(1 - keep**2) * rng.standard_normal(len(s.t))
+        gusts = 1 + 0.15 * np.asarray(lfilter([1.0], [1.0, -keep], steps))
+        jet = v["push"] * np.exp(-(((s.motion.position[:, 0::2] - v["place"]) / v["radius"]) ** 2))
+        return np.repeat(jet * gusts[:, None], 2, axis=1) * np.array([v["slant"], 1.0] * 2)
+
+    return _force(shift)
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -286,5 +325,15 @@ OUTSIDE = {
               ENCODER, _tendons),
         _made("gear_cogging", lambda r, s: {"torque": 0.018 * s, "teeth": float(r.integers(20, 41))},
               MIX, _cogging),
+        _made("rectified_drives", lambda r, s: {"height": 0.45 * s * _sign(r), "share": r.uniform(-1, 1),
+                                                "speed": r.uniform(0.3, 0.6)},
+              READOUT, _rectified),
+        _made("skewed_bending", lambda r, s: {"give1": 2e-4 * s * _sign(r),
+                                              "give2": 2e-4 * s * r.uniform(-1, 1)},
+              LINKS, _bending),
+        _made("jet_from_above", lambda r, s: {"push": 0.5 * s, "place": r.uniform(0.09, 0.15),
+                                              "radius": r.uniform(0.012, 0.025),
+                                              "slant": r.uniform(-0.6, 0.6)},
+              HAND, _nozzle),
     )
 }  # fmt: skip
