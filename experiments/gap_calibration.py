@@ -30,6 +30,7 @@ from hmmseg.task import BlockTask, read_task
 from simgap.gap import bank as store
 from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import DEFAULT_MISFIT, Calibration
+from simgap.gap.locate import together
 from simgap.gap.verdict import likelihoods
 
 RARE = 0.4  # weight of a case from outside: the bank has as many as of the catalogue, the world fewer
@@ -120,7 +121,7 @@ def unknown(rows: Sequence[dict[str, Any]], start: Calibration) -> Calibration:
             if "scores" not in row:
                 continue
             s = row["scores"]
-            p = likelihoods(s["evidence"], min(1.0, 3 * min(s["p"].values())), s["left"], s["p_left"], c)
+            p = likelihoods(s["evidence"], together(s["p"]), s["left"], s["p_left"], c)
             alien = row["excluded"] or any(n.startswith("outside:") for n in row["effects"])
             right = "unknown" if alien else "+".join(row["effects"]) or "none"
             total += (RARE if alien else 1.0) * np.log(max(p.get(right, 0.0), 0.01))

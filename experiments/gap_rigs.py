@@ -56,8 +56,7 @@ def others(task: BlockTask, rig: Rig) -> dict[str, tuple[BlockTask, Rig]]:
 
 def p_value(found: Search, bank: Bank) -> float:
     """The p value of a diagnosis."""
-    p = bank.detection.p_values(found.statistics)
-    return min(1.0, len(p) * min(p.values()))
+    return bank.detection.p_value(found.statistics)
 
 
 def p_values(

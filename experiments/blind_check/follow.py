@@ -25,19 +25,26 @@ KNOWN = {f.name for f in fields(Style)}
 def follow(folder: Path, results: Path, progress=None, first: int | None = None) -> list[dict[str, Any]]:
     """One entry for every set (of the `first` cases) that holds the true cause; written case by case.
 
-    `separated`: old and new recordings together are given the true cause and no other.
+    `separated`: old and new recordings together are given the true cause, and nothing is left beside it of
+    what the experiment was to tell from it. None where the diagnosis knew of no experiment.
     """
     out = []
     for entry in unseal(folder)["cases"][:first]:
         found = json.loads((results / f"{entry['case']}.json").read_text(encoding="utf-8"))
-        if found.get("verdict") != "set" or found["next_experiment"] is None:
+        if found.get("verdict") != "set" or not entry["effects"]:
             continue
         if not set(entry["effects"]) <= {*found["causes"], *found["indistinguishable"]}:
+            continue
+        asked = found["next_experiment"]
+        if asked is None:
+            out.append(
+                {"case": entry["case"], "true": sorted(entry["effects"]), "do": None, "separated": None}
+            )
             continue
         place = results / "follow" / entry["case"]
         file = place / "diagnosis.json"
         if not file.exists():
-            _record(entry, found["next_experiment"], place)
+            _record(entry, asked, place)
             for old in sorted((folder / "cases" / entry["case"]).glob("trial_*.csv")):
                 shutil.copy(old, place / old.name.replace("trial_", "trial_1"))
             file.write_text(json.dumps(diagnose_folder(place)) + "\n", encoding="utf-8")
@@ -45,11 +52,12 @@ def follow(folder: Path, results: Path, progress=None, first: int | None = None)
                 progress(entry["case"])
         after = json.loads(file.read_text(encoding="utf-8"))
         right = sorted(after.get("causes", [])) == sorted(entry["effects"])
+        beside = set(after.get("indistinguishable", [])) & set(asked["separates"])
         out.append({
-            "case": entry["case"], "true": sorted(entry["effects"]), "do": found["next_experiment"]["do"],
-            "expected_gain_nats": found["next_experiment"]["expected_gain_nats"],
+            "case": entry["case"], "true": sorted(entry["effects"]), "do": asked["do"],
+            "expected_gain_nats": asked["expected_gain_nats"],
             "said": after.get("causes", []), "verdict": after.get("verdict", "error"),
-            "separated": right and after.get("verdict") == "named",
+            "separated": right and not beside,
         })  # fmt: skip
     return out
 

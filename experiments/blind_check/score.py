@@ -65,7 +65,8 @@ def score(
     seal = json.loads((folder / "seal.json").read_text(encoding="utf-8"))
     followed = follow(folder, results) if follow is not None else []
     out = {"seal": seal, "code": code, **figures(rows), "followed": followed}
-    out["table"]["next_separates"] = proportion([f["separated"] for f in followed])
+    out["table"]["next_separates"] = proportion([f["separated"] for f in followed if f["do"]])
+    out["table"]["next_asked"] = proportion([f["do"] is not None for f in followed])
     return out
 
 

@@ -18,7 +18,7 @@ from simgap.gap.spread import Spread
 ALONE = 0.2  # share of its gain that an effect must keep without the place that it gains most in
 EVERY = 0.1  # share of the mean trial's gain in one subtask that it must have in every trial to recur
 LEAST = 10.0  # nats
-KEPT = 0.3  # share of its evidence that a candidate must gain on held-out trials
+KEPT = 0.6  # share of its evidence that a candidate must gain on held-out trials
 STRANGE = 3.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue,
 PATTERN = 1.5  # and parts that err alike better than parts that each err by themselves
 
@@ -60,13 +60,13 @@ def scored(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Ca
     if n >= RECURS:
         labels = judge.folds(f, n, np.zeros(0))
         kept = 0.5 * float((judge.heldout(healthy, labels, n) - judge.heldout(f, labels, n)).sum())
-        kept += _believed(given, f) - _believed(given, healthy)
+        kept += believed(given, f) - believed(given, healthy)
         if kept < KEPT * evidence:
             evidence = min(evidence, max(kept, 0.0) / temperature)
     return Candidate(judge.joined(f.effects), evidence, f)
 
 
-def _believed(given: Problem, f: Fitted) -> float:
+def believed(given: Problem, f: Fitted) -> float:
     """Log prior density [nats], less a constant, of the properties that a candidate asks for."""
     return -0.5 * float((f.u[: given.num_properties] ** 2).sum())
 

@@ -19,7 +19,7 @@ from simgap.gap.candidate import Candidate, left, remainder
 from simgap.gap.describe import describe, property_values, where
 from simgap.gap.experiments import next_experiment
 from simgap.gap.fit import Fitted, Problem, residual_at
-from simgap.gap.locate import ALARM, Cell, cells
+from simgap.gap.locate import ALARM, Cell, cells, together
 from simgap.gap.search import Search, search
 from simgap.gap.shrinkage import shrinkage
 from simgap.gap.verdict import choose, likelihoods, listed
@@ -74,7 +74,7 @@ def diagnose(
     tell("held-out trials")
     given, best = found.problem, found.candidates[0]
     p = bank.detection.p_values(found.statistics)
-    p_value = min(1.0, len(p) * min(p.values()))
+    p_value = together(p)
     rest, p_left = left(given, best, found.healthy, bank)
     scores = {
         "evidence": {c.name: c.evidence for c in found.candidates},
@@ -93,8 +93,10 @@ def diagnose(
     following = None
     if verdict == "set":
         tell("the next experiment")
-        following = _following(found, alike, effects, bank, seed)
+        following = _following(found, alike, effects, bank, seed, actual)
     warnings = found.warnings
+    if verdict == "set":
+        warnings = (*warnings, *_inseparable(causes, partners, following))
     if verdict == "unknown":
         warnings = (*warnings, *_why_unknown(best))
     if given.frame.num_trials == 1:
@@ -128,8 +130,25 @@ def _why_unknown(best: Candidate) -> list[str]:
     return []
 
 
+def _inseparable(
+    causes: Sequence[str], partners: Sequence[str], following: dict[str, Any] | None
+) -> list[str]:
+    """What no experiment is expected to tell from the causes, if there is any."""
+    left = sorted(set(partners) - set([] if following is None else following["separates"]))
+    return (
+        [f"no experiment of the list is expected to tell {', '.join(left)} from {' + '.join(causes)}"]
+        if left
+        else []
+    )
+
+
 def _following(
-    found: Search, alike: Sequence[Candidate], effects: dict[str, Any], bank: Bank, seed: int
+    found: Search,
+    alike: Sequence[Candidate],
+    effects: dict[str, Any],
+    bank: Bank,
+    seed: int,
+    actual: dict | None,
 ) -> dict[str, Any] | None:
     """The experiment that would best tell the first of some candidates from the others."""
     cause, *partners = alike
@@ -138,4 +157,13 @@ def _following(
         *prefix, name = key.split(".")  # those of a pair are written effect.parameter
         values[prefix[0] if prefix else cause.name][name] = p["mean"]
     properties = property_values(found.problem, cause.fitted)
-    return next_experiment(found.problem, values, [c.effects for c in partners], properties, bank, seed)
+    return next_experiment(
+        found.problem,
+        values,
+        [c.effects for c in partners],
+        properties,
+        bank,
+        seed,
+        actual,
+        found.temperature,
+    )

@@ -16,6 +16,7 @@ from simgap.gap.frame import CHANNELS
 BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges, the last band ends at half the sampling rate
 ALARM = 0.01  # chance that a healthy recording is called otherwise
 EVIDENCE = 1.4  # times the scale of a healthy recording's largest evidence: see docs/gap.md
+SHARES = {"cell": 0.2, "pooled": 0.2, "gain": 0.6}  # of that chance; effects raise the evidence first
 BESIDE = 3.0  # sd; no sample beside a contact change counts for more, its contact may be the other one
 
 
@@ -116,6 +117,10 @@ class Detection:
             out[name] = float(gumbel_r.sf(value / margin, location, scale))
         return out
 
+    def p_value(self, largest: dict[str, float]) -> float:
+        """Chance of a healthy recording to exceed any of them: Bonferroni's bound, weighted by SHARES."""
+        return together(self.p_values(largest))
+
     def _of(self, name: str) -> tuple[float, float, float]:
         location, scale = getattr(self, name)
         return (location, scale * EVIDENCE, 1.0) if name == "gain" else (location, scale, self.margin)
@@ -124,6 +129,11 @@ class Detection:
         """Value that a healthy recording exceeds with probability `level`."""
         location, scale, margin = self._of(name)
         return float(gumbel_r.isf(level, location, scale)) * margin
+
+
+def together(p_values: dict[str, float]) -> float:
+    """One chance of several: a weighted Bonferroni bound (Genovese et al., Biometrika 93, 2006)."""
+    return min(1.0, sum(SHARES[n] for n in p_values) * min(p / SHARES[n] for n, p in p_values.items()))
 
 
 def largest(found: list[Cell]) -> dict[str, float]:

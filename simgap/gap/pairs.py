@@ -8,7 +8,7 @@ from dataclasses import replace
 from simgap.effects import catalogue, decoys
 from simgap.gap import judge
 from simgap.gap.bank import Bank
-from simgap.gap.candidate import LEAST, Candidate, left, recurring, scored, single
+from simgap.gap.candidate import LEAST, Candidate, believed, left, recurring, scored, single
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import LARGE, Fitted, Problem, Start, fit, slots
 from simgap.gap.locate import ALARM
@@ -21,6 +21,10 @@ CALM, CALMER = 0.1, 1e-4  # what that half leaves must look less like noise than
 AMPLE = 0.2  # unless the pair gains so large a share;
 WORTH = 0.7  # and the pair must leave no more than this share of what its better half leaves,
 PLENTY = 0.03  # or gain this share
+STRAINED = 10.0  # nats by which its half bends what was measured of the blocks: no residual shows that;
+SOLVED = (
+    0.3  # share of what a coarse half leaves that a pair may leave, like noise, to gain as little as MORE
+)
 STUCK = 2.0  # nats at T = 1 by which a half of a pair, taken alone, may do better than as a single so far
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 # What shifts or smooths samples in time.
@@ -93,12 +97,19 @@ def worthwhile(
         coarse = better.spread is None and any(catalogue()[name].coarse for name in better.effects)
         gain = pair.evidence - better.evidence
         share = gain / max(pair.evidence, LEAST)
-        if gain < LEAST or share < (COARSE if coarse else MORE):
+        if gain < LEAST or share < MORE:
+            continue
+        if believed(given, pair.fitted) - believed(given, better.fitted) > STRAINED:
+            out.append(pair)
             continue
         rest, p_rest = left(given, better, healthy, bank)
+        after, p_after = left(given, pair, healthy, bank)
+        solved = p_after > ALARM and after < SOLVED * rest
+        if share < (COARSE if coarse and not solved else MORE):
+            continue
         if share < AMPLE and p_rest > (CALMER if coarse else CALM):
             continue
-        if share > PLENTY or left(given, pair, healthy, bank)[0] < max(WORTH * rest, LITTLE):
+        if share > PLENTY or after < max(WORTH * rest, LITTLE):
             out.append(pair)
     return out
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from simgap.effects import fitted
 from simgap.gap import judge
 from simgap.gap.candidate import Candidate
 from simgap.gap.judge import Calibration
 from simgap.gap.locate import ALARM
+from simgap.gap.pairs import SHAPING
 from simgap.gap.search import Search
 
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
-BOTH = 0.006  # nor those within this share of its evidence that differ by coarse effects alone,
+SHAPED = 0.012  # nor those within this share of its evidence, twice TIE at least, that differ by effects
+BOTH = 0.006  # which reshape signals in time; by coarse effects alone,
 FORM = 0.002  # by a coarse effect and another,
 EXACT = 1e-4  # or by others: no form is exact to that
 
@@ -22,11 +24,15 @@ def likelihoods(
 ) -> dict[str, float]:
     """Probabilities of none, unknown and every candidate, given whether there is a gap at all.
 
-    With a gap, what names no cause is unknown; without one, all but a little is none.
+    With a gap, what names no cause is unknown if anything but noise is left; without one, all but a little is
+    none.
     """
     out = judge.probabilities(evidence, left, p_left, c, p_value)
     if p_value < ALARM:
         none = min(out["none"], p_value)
+        rest = 1 - out["none"]
+        if p_left > ALARM and rest > 0:
+            return {k: v * (1 - none) / rest for k, v in out.items()} | {"none": none}
         return out | {"none": none, "unknown": out["unknown"] + out["none"] - none}
     none = 1 - 0.1 * (1 - p_value) ** 4
     rest = sum(v for k, v in out.items() if k != "none")
@@ -53,12 +59,19 @@ def choose(
     return ("set" if partners else "named"), sorted(best.effects), partners
 
 
+def form_share(one: Iterable[str], other: Iterable[str]) -> float:
+    """Share of their evidence by which two sets of effects must differ to be told apart: no form is exact."""
+    differ = set(one) ^ set(other)
+    coarse = [fitted()[name].coarse for name in differ]
+    if differ <= SHAPING:
+        return SHAPED
+    return BOTH if all(coarse) else FORM if any(coarse) else EXACT
+
+
 def _tie(best: Candidate, other: Candidate) -> float:
     """Nats (tempered) by which a candidate must be behind the best to be told from it."""
-    differ = set(best.effects) ^ set(other.effects)
-    coarse = [fitted()[name].coarse for name in differ]
-    share = BOTH if all(coarse) else FORM if any(coarse) else EXACT
-    return max(TIE, share * best.evidence)
+    share = form_share(best.effects, other.effects)
+    return max(2 * TIE if share == SHAPED else TIE, share * best.evidence)
 
 
 def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:

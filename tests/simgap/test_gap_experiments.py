@@ -1,0 +1,69 @@
+"""The next experiment: what it promises to tell apart, and that it promises nothing it cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from demo_recordings import RIG, TASK, TRIALS
+
+from hmmseg.segmentation import align_trials
+from hmmseg.signals import task_space
+from simgap.gap.bank import load_bank
+from simgap.gap.diagnose import _inseparable
+from simgap.gap.experiments import ENOUGH, next_experiment
+from simgap.gap.fit import problem
+from simgap.gap.frame import build
+from simgap.gap.verdict import SHAPED, form_share
+
+BLOCKS = np.array([[0.5, 0.018, 0.016], [0.6, 0.026, 0.016]])  # weight [N], width and height [m]
+MEASURED = {
+    name: {"weight": (w, 5e-4), "width": (a, 1e-4), "height": (h, 1e-4)}
+    for name, (w, a, h) in zip(TASK.objects, BLOCKS.tolist(), strict=True)
+}
+GAIN, CROSSTALK = {"gain": 0.08}, {"fy_from_fx": 0.01, "fx_from_fy": 0.0}
+SOFTER = ("fingertip_compliance",)
+
+
+@pytest.fixture(scope="module")
+def given():
+    aligned = align_trials([t.file for t in TRIALS], [task_space(t, RIG) for t in TRIALS], TASK, RIG)
+    return problem(build(TRIALS, aligned, RIG), load_bank().noise)
+
+
+def asked(given, cause, partners, actual=None):
+    return next_experiment(given, cause, partners, BLOCKS, load_bank(), 0, actual, 1.5)
+
+
+def test_a_balance_and_calipers_tell_a_gain_from_softer_pads(given):
+    found = asked(given, {"force_gain": GAIN}, [SOFTER])
+    assert found is not None
+    assert found["do"].startswith("weigh the blocks") and not found["operator"]
+    assert found["separates"] == ["fingertip_compliance", "force_gain"]
+    assert found["expected_gain_nats"] > 10 * ENOUGH
+
+
+def test_blocks_that_were_measured_need_not_be_measured_again(given):
+    found = asked(given, {"force_lowpass": {"time_constant": 0.03}}, [("force_lag",)], MEASURED)
+    assert found is not None and found["operator"]
+
+
+def test_what_no_trial_shows_no_experiment_tells_apart(given):
+    assert asked(given, {"force_gain": {"gain": 1e-4}}, [SOFTER]) is None
+
+
+def test_an_experiment_names_only_what_it_tells_apart(given):
+    cause = {"force_crosstalk": CROSSTALK, "force_gain": GAIN}
+    partners = [("fingertip_compliance", "force_crosstalk"), ("force_gain", "sensor_rotation")]
+    found = asked(given, cause, partners)
+    assert found is not None
+    assert found["separates"] == ["fingertip_compliance", "force_crosstalk", "force_gain"]
+    assert _inseparable(list(cause), ["fingertip_compliance", "sensor_rotation"], found) == [
+        "no experiment of the list is expected to tell sensor_rotation from force_crosstalk + force_gain"
+    ]
+    assert not _inseparable(list(cause), ["fingertip_compliance"], found)
+
+
+def test_what_reshapes_signals_in_time_has_the_least_exact_forms():
+    assert form_share(["force_lag"], ["force_lowpass"]) == SHAPED
+    pads = form_share(["force_lag", "force_gain"], ["force_lag", *SOFTER])
+    assert pads < form_share(["force_lag"], ["force_gain"]) < SHAPED
