@@ -260,7 +260,10 @@ def tables(body: dict[str, Any]) -> list[Table]:
         out.append(values)
     if body["next_experiment"] is not None:
         following = Table(title="next experiment", title_justify="left", show_header=False)
-        following.add_row(body["next_experiment"]["do"])
+        told = body["next_experiment"]
+        gain = f"by {told['expected_gain_nats']:.0f} nats at least"
+        following.add_row(told["do"])
+        following.add_row(f"expected to tell {', '.join(told['separates'])} apart, {gain}")
         out.append(following)
     if body["where"]:
         cells = Table(title=cells_title(body), title_justify="left")

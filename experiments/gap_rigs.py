@@ -29,7 +29,7 @@ from hmmseg.trial import Trial
 from simgap.gap.adapt import adapted
 from simgap.gap.bank import Bank, load_bank
 from simgap.gap.calibrate import healthy_cases, learned
-from simgap.gap.search import Search, search
+from simgap.gap.search import search
 
 TRIALS = 4
 FIRST = 500  # no bank is learned on cases from this one on
@@ -54,11 +54,6 @@ def others(task: BlockTask, rig: Rig) -> dict[str, tuple[BlockTask, Rig]]:
     }
 
 
-def p_value(found: Search, bank: Bank) -> float:
-    """The p value of a diagnosis."""
-    return bank.detection.p_value(found.statistics)
-
-
 def p_values(
     trials: Sequence[Trial], task: BlockTask, rig: Rig, nominal: Bank, own: Bank
 ) -> dict[str, float]:
@@ -68,9 +63,9 @@ def p_values(
     here = adapted(nominal, found.problem, found.healthy, trials)
     again = search(trials, task, rig, own, None, (), (), tell)
     return {
-        "nominal": p_value(found, nominal),
-        "bootstrap": p_value(found, here),
-        "calibrated": p_value(again, own),
+        "nominal": nominal.detection.p_value(found.statistics),
+        "bootstrap": here.detection.p_value(found.statistics),
+        "calibrated": own.detection.p_value(again.statistics),
     }
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from dataclasses import replace
 
 import pytest
+from rich.console import Console
 
+from commands.diagnose import tables
 from commands.main import main
 
 
@@ -128,3 +131,20 @@ def test_recordings_are_diagnosed(shared, tmp_path, case, verdict, cause):
     if cause:
         assert document["shrinkage"]["fraction"] > 0.9
         assert document["where"]
+
+
+def test_the_next_experiment_says_what_it_promises():
+    asked = {
+        "do": "work twice as fast",
+        "separates": ["force_lag", "force_lowpass"],
+        "expected_gain_nats": 41.3,
+    }
+    body = {"probabilities": {"force_lag": 1.0}, "causes": [], "where": [], "next_experiment": asked}
+    sink = io.StringIO()
+    console = Console(width=120, file=sink)
+    for table in tables(body):
+        console.print(table)
+    said = sink.getvalue()
+    assert "work twice as fast" in said
+    assert "expected to tell force_lag, force_lowpass apart, by 41 nats at least" in said
+    assert len(tables(body | {"next_experiment": None})) == len(tables(body)) - 1
