@@ -59,7 +59,8 @@ CalibrateOption = Annotated[
 BANKS = {
     "nominal": "Judged by healthy simulations of the paper's hand.",
     "bootstrap": "Judged by healthy simulations of the paper's hand, thresholds moved to this rig and task "
-    "by a linearised bootstrap; --calibrate simulates them instead.",
+    "by a linearised bootstrap, which may raise false alarms with soft pads or another task; "
+    "--calibrate simulates them instead.",
     "calibrated": "Judged by healthy simulations of this rig and task.",
 }
 
