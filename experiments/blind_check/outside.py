@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from experiments.blind_check.effects import Change, Made, Rng, Values, _force, _sign
-from experiments.blind_check.hand import jacobians
+from experiments.blind_check.hand import angles, jacobians
 from experiments.blind_check.signals import ENCODER, HAND, LINKS, MIX, READOUT, SCALE, Signals, Stage
 
 
@@ -279,6 +279,46 @@ def _nozzle(v: Values) -> Stage:
     return _force(shift)
 
 
+def _tared(v: Values) -> Stage:
+    """Sensors tared as they hang at the start: what they weigh turns up again as their links turn."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None
+        turned = s.q[:, 1::2] - s.q[0, 1::2]
+        shift = np.stack([np.sin(turned), 1 - np.cos(turned)], 2) * np.array([[v["weight1"]], [v["weight2"]]])
+        return replace(s, force=s.force + shift.reshape(-1, 4))
+
+    return stage
+
+
+def _rolling(v: Values) -> Stage:
+    """Round fingertips that roll as their links turn: the point that touches leaves the one assumed."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        made_for = np.array([[v["x"] - 0.01, v["y"], v["x"] + 0.01, v["y"]]])
+        true, place = s.motion.position, s.motion.position
+        for _ in range(6):
+            turned = angles(s.rig, place)[:, 1::2] - angles(s.rig, made_for)[:, 1::2]
+            way = np.stack([np.cos(turned) - 1, np.sin(turned)], 2) * np.array([[1.0], [-1.0]])
+            place = true + v["radius"] * way.reshape(-1, 4)
+        rate = s.motion.velocity + np.gradient(place - true, s.t, axis=0)
+        return replace(s, motion=replace(s.motion, position=place, velocity=rate))
+
+    return stage
+
+
+def _tied(v: Values) -> Stage:
+    """Wiring tied across both fingers: slack while they are close, it pulls them together when they open."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        way = s.motion.position[:, 2:] - s.motion.position[:, :2]
+        apart = np.hypot(*way.T)[:, None]
+        pull = v["stiffness"] * np.maximum(apart - v["slack"], 0.0) * way / apart
+        return np.concatenate([-pull, pull], 1)
+
+    return _force(shift)
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -335,5 +375,13 @@ OUTSIDE = {
                                               "radius": r.uniform(0.012, 0.025),
                                               "slant": r.uniform(-0.6, 0.6)},
               HAND, _nozzle),
+        _made("turning_tare", lambda r, s: {"weight1": 0.9 * s * r.uniform(0.6, 1),
+                                            "weight2": 0.9 * s * r.uniform(0.6, 1)},
+              MIX, _tared),
+        _made("rolling_tips", lambda r, s: {"radius": 0.004 * s, "x": r.uniform(0.1, 0.14),
+                                            "y": r.uniform(0.01, 0.04)},
+              LINKS, _rolling),
+        _made("tied_wiring", lambda r, s: {"stiffness": 30 * s, "slack": r.uniform(0.022, 0.028)},
+              HAND, _tied),
     )
 }  # fmt: skip
