@@ -15,7 +15,7 @@ from simgap.operator import OperatorSettings
 
 YIELDS = frozenset({"grip_slip", "table_compliance"})  # effects that show as a path from where a grip began
 PUSHES = frozenset({"cable_force", "viscous_drag"})  # those that displace the hand that bears them
-SOFT = frozenset({"fingertip_compliance", "fingertip_creep"})  # those with which a hand closes farther
+RELAXES = "fingertip_creep"  # pads that give way while they are held: the hand grips the less
 HAND = float(np.mean(OperatorSettings().hand_stiffness))  # N/m of a finger; no recording tells it
 
 
@@ -24,7 +24,7 @@ def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
 
     A sensor's or a joint's effect shifts what is recorded. What acts on contact shows in the equations of
     the contact as well; the larger of the two counts. A hand is as stiff as HAND: it gives way to what pushes
-    it, and grips the less the farther pads give. Times that are off at random shift the mean of a cell by so
+    it, and grips the less the farther pads creep. Times that are off at random shift the mean of a cell by so
     much in root mean square.
     """
     frame, effects, u = given.frame, candidate.fitted.effects, candidate.fitted.u
@@ -48,9 +48,11 @@ def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
         )
         if not YIELDS.isdisjoint(mechanical):
             _from_pickup(given, violated)
-        if not SOFT.isdisjoint(mechanical):
-            grip, nearer = CHANNELS.index("grip"), np.abs(violated[..., CHANNELS.index("distance")]) / 2
-            violated[..., grip] = np.maximum(np.abs(violated[..., grip]), HAND * nearer)
+        if RELAXES in mechanical:
+            grip, distance = CHANNELS.index("grip"), CHANNELS.index("distance")
+            violated[..., grip] = HAND * np.abs(violated[..., distance]) / 2
+            there = there.copy()
+            there[..., grip] = there[..., distance]
     jitter = np.zeros_like(change)
     if candidate.spread is not None and candidate.spread.effect == "clock_jitter":
         jitter = candidate.spread.value * np.asarray(gradient(frame.world.t, recorded))

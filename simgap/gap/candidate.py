@@ -20,7 +20,7 @@ EVERY = 0.1  # share of the mean trial's gain in one subtask that it must have i
 LEAST = 10.0  # nats
 KEPT = 0.6  # share of its evidence that a candidate must gain on held-out trials
 STRANGE = 3.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue,
-PATTERN = 1.5  # and parts that err alike better than parts that each err by themselves
+PATTERN = 3.0  # and parts that err alike better than parts that each err by themselves
 
 
 @dataclass(frozen=True)

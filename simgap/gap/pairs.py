@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 
 from simgap.effects import catalogue, decoys
 from simgap.gap import judge
@@ -12,7 +11,7 @@ from simgap.gap.candidate import LEAST, Candidate, believed, left, recurring, sc
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import LARGE, Fitted, Problem, Start, fit, slots
 from simgap.gap.locate import ALARM
-from simgap.gap.spread import Spread, spreads
+from simgap.gap.spread import spreads
 
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
 SWAPS = 2  # times that a half of the best pair is exchanged
@@ -48,9 +47,10 @@ def tried(
     beam = [c for c in singles if c.spread is None and c.name not in decoys()][: 1 if enough else BEAM]
     sought = {c.name for c in beam}
     found = _pairs(given, beam, healthy, names, temperature)
+    leading = max((c.evidence for c in singles if c.spread is None), default=0.0)
     for _ in range(SWAPS):
-        best = max(found.values(), key=lambda c: c.evidence, default=None)
-        if best is None or best.evidence < singles[0].evidence + LEAST or best.spread is not None:
+        best = _shifting(found.values())
+        if best is None or best.evidence < leading + LEAST:
             break
         for name in set(best.effects) - sought:
             half = next((c for c in singles if c.name == name), None)
@@ -72,11 +72,11 @@ def unstuck(
     temperature: float,
 ) -> list[Candidate]:
     """The singles, best first, fitted again from the values that they have in the best pair."""
-    if not pairs:
+    best = _shifting(pairs)
+    if best is None:
         return singles
-    best = max(pairs, key=lambda c: c.evidence)
-    stuck = [c for c in singles if c.name in best.fitted.effects]
-    if best.spread is not None or best.evidence < max(c.evidence for c in stuck) + LEAST:
+    stuck = [c for c in singles if c.name in best.effects]
+    if best.evidence < max(c.evidence for c in stuck) + LEAST:
         return singles
     again = {f.effects: f for f in fit(given, [Start(c.effects, best.fitted.u) for c in stuck])}
     freed = {
@@ -85,6 +85,11 @@ def unstuck(
         if again[c.effects].cost < c.fitted.cost - STUCK
     }
     return sorted((freed.get(c.name, c) for c in singles), key=lambda c: -c.evidence) if freed else singles
+
+
+def _shifting(pairs: Iterable[Candidate]) -> Candidate | None:
+    """The best of those pairs that shift the mean with both halves."""
+    return max((c for c in pairs if c.spread is None), key=lambda c: c.evidence, default=None)
 
 
 def worthwhile(
@@ -142,16 +147,5 @@ def _pairs(
             if s.effect not in names or {s.effect, half.name} <= SHAPING:
                 continue
             name = judge.joined((half.name, s.effect))
-            shown = half.evidence
-            if s.effect == "quantisation" and s.evidence > 0:
-                shown = _above(given, half, healthy, s, temperature)
-            out[name] = Candidate(name, shown + s.evidence / temperature, half.fitted, s)
+            out[name] = Candidate(name, half.evidence + s.evidence / temperature, half.fitted, s)
     return out
-
-
-def _above(given: Problem, half: Candidate, healthy: Fitted, rounding: Spread, temperature: float) -> float:
-    """Evidence [nats, tempered] of a half of a pair above the noise that rounded forces have."""
-    w = given.whitening
-    noisy = replace(given, whitening=w._replace(weight=w.weight / rounding.scale))
-    none, found = fit(noisy, [Start((), healthy.u), Start(half.effects, half.fitted.u)])
-    return single(noisy, found, none, temperature).evidence

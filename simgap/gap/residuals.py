@@ -71,7 +71,7 @@ def residuals(
     x = _centred(x, arrays, still * _known(arrays, "x"), place)
     y, loose_y = _in_grip(y, onground, "y", arrays, noise, world)
 
-    acceleration = gradient(world.t, velocity)
+    acceleration, _ = _fivepoint(world, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
     mass = weight / world.gravity * world.inertia
     ground, carry = world.ground, world.carry
@@ -199,6 +199,14 @@ def contact(world: World) -> jax.Array:
     return _when(world, SMOOTH, lambda f: f + world.smoothing * _slope(world, f)[0], force) - world.load
 
 
+def _fivepoint(world: World, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Rate of change (T, N, C) from five samples, exact to fourth order, and from three."""
+    near = gradient(world.t, values)
+    far = (values[:, 4:] - values[:, :-4]) / jnp.maximum(world.t[:, 4:] - world.t[:, :-4], 1e-6)[..., None]
+    far = jnp.concatenate([near[:, :2], far, near[:, -2:]], 1)
+    return (4 * near - far) / 3, near
+
+
 def _slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Rate of change (T, N, C) of forces from five samples, and by how much it is in doubt.
 
@@ -206,10 +214,7 @@ def _slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
     bends too sharply for either, at a contact change, the flatter side counts (a minmod limiter: Sweby, SIAM
     J. Numer. Anal. 21, 1984): before a contact there is no force yet.
     """
-    near = gradient(world.t, force)
-    far = (force[:, 4:] - force[:, :-4]) / jnp.maximum(world.t[:, 4:] - world.t[:, :-4], 1e-6)[..., None]
-    far = jnp.concatenate([near[:, :2], far, near[:, -2:]], 1)
-    smooth = (4 * near - far) / 3
+    smooth, near = _fivepoint(world, force)
     side = (force[:, 1:] - force[:, :-1]) / jnp.maximum(world.t[:, 1:] - world.t[:, :-1], 1e-6)[..., None]
     left, right = jnp.concatenate([side[:, :1], side], 1), jnp.concatenate([side, side[:, -1:]], 1)
     sharp = _sharp(left, right, EVEN / _step(world))

@@ -10,6 +10,8 @@ from hmmseg.signals import Signals
 
 MISFIT = 0.03  # share of a force's change between samples that no model of 20 Hz samples can tell
 FADED, FADING = 0.1, 0.5  # the same of what is recorded in free motion, so many seconds from a grip
+BENT = 0.025  # share of a speed's fourth difference by which the rule for differences of positions is off
+SEEN = 2.0  # sds of that difference below which it is noise
 NUDGE = 1e-4  # m; fingers that push unequally move a resting block by about as much
 
 
@@ -44,7 +46,10 @@ def channel_noise(one: dict[str, float]) -> np.ndarray:
 
 def residual_noise(s: Signals, one: dict[str, float], rig: Rig, step: float) -> np.ndarray:
     """Noise (N, C) of each channel's residual: positions with the pads' yielding taken out, velocities less
-    differences of positions `step` s apart."""
+    differences of positions `step` s apart.
+
+    Where the speed changes within a sample, as that of a pressed fingertip that is let go, no rule gives it.
+    """
     pad, root2 = rig.fingertip, np.sqrt(2.0)
     x, y, vx, vy, f = (one[k] for k in ("x", "y", "vx", "vy", "force"))
     gn, gs = f / pad.normal_stiffness, f / pad.shear_stiffness
@@ -54,7 +59,18 @@ def residual_noise(s: Signals, one: dict[str, float], rig: Rig, step: float) -> 
         np.hypot(0.5 * vx, 0.5 * x / step), np.hypot(0.5 * vy, 0.5 * y / step),
         root2 * f, root2 * f, f / root2, f / root2,
     ]  # fmt: skip
-    return np.tile(row, (s.t.size, 1))
+    out = np.tile(row, (s.t.size, 1))
+    for channel, mean, noise in ((4, s.vx, vx), (5, s.vy, vy)):
+        out[:, channel] = np.hypot(out[:, channel], _unresolved(mean, noise / root2))
+    return out
+
+
+def _unresolved(speed: np.ndarray, noise: float) -> np.ndarray:
+    """How far (N,) a mean speed is off from differences of positions, told from its fourth difference."""
+    bend = np.zeros_like(speed)
+    bend[2:-2] = np.abs(np.convolve(speed, (1, -4, 6, -4, 1), "valid"))
+    usual = SEEN * np.sqrt(70.0) * noise  # 70: the squares of these weights
+    return BENT * np.maximum(np.nan_to_num(bend) - usual, 0.0)
 
 
 def misfit(t: np.ndarray, force: np.ndarray, free: np.ndarray, boundaries: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from simgap.gap.locate import tamed
 
 SPREADS = ("clock_jitter", "quantisation")
 REPEATED = 0.5  # share of repeated values that only a lattice has
+WRITTEN = 1e-5  # N; how finely forces are written that were not rounded before
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,13 @@ def _rates(given: Problem) -> np.ndarray:
     return out * given.whitening.weight * np.sqrt((1 + rho2) / (1 - rho2))
 
 
-def quantised(given: Problem) -> Spread:
+def quantised(given: Problem, fitted: Fitted) -> Spread:
     """Whether forces repeat the same values: levels of a lattice through zero.
 
-    Rounded to 1e-5 N, as files are, one sample in ten repeats another's value by chance; on a lattice
-    most do. The step is the usual gap between neighbouring levels, refined on all samples.
+    Written to 1e-5 N, as files are, one sample in ten repeats another's value by chance; on a lattice
+    most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
+    were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each; and what
+    rounding adds to the noise explains what a fit leaves.
     """
     frame = given.frame
     force = frame.world.force[: frame.num_trials]
@@ -106,9 +109,12 @@ def quantised(given: Problem) -> Spread:
     for channel, share in parts.items():
         c = CHANNELS.index(channel)
         scale[..., c] = np.sqrt(1 + share * step**2 / 12 * given.whitening.weight[..., c] ** 2)
-    return Spread("quantisation", repeated * values.size, step, 1e-3, scale)
+    lattice = values.size * np.log(step / WRITTEN)
+    z2 = residual_at(given, fitted.effects, fitted.u) ** 2
+    noise = (0.5 * z2 * (1 - scale**-2) - np.log(scale)).sum()
+    return Spread("quantisation", float(lattice + noise), step, 1e-3, scale)
 
 
 def spreads(given: Problem, fitted: Fitted) -> list[Spread]:
     """Both spread effects, tried on top of a fit."""
-    return [clock(given, fitted, np.geomspace(5e-4, 0.03, 40)), quantised(given)]
+    return [clock(given, fitted, np.geomspace(5e-4, 0.03, 40)), quantised(given, fitted)]

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 from simgap.effects import fitted
 from simgap.gap import judge
 from simgap.gap.candidate import Candidate
+from simgap.gap.fit import Problem, slots
 from simgap.gap.judge import Calibration
 from simgap.gap.locate import ALARM
 from simgap.gap.pairs import SHAPING
 from simgap.gap.search import Search
 
+DELAYING = frozenset({"force_lag", "force_lowpass"})
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
 SHAPED = 0.012  # nor those within this share of its evidence, twice TIE at least, that differ by effects
+BRIEF, ALIKE = 0.25, 0.25  # the same share for what delays by less than this many samples
 BOTH = 0.006  # which reshape signals in time; by coarse effects alone,
 FORM = 0.002  # by a coarse effect and another,
 EXACT = 1e-4  # or by others: no form is exact to that
@@ -53,7 +58,9 @@ def choose(
         return "unknown", [], []
     alike = [k for k in others if len(k.effects) == len(best.effects)]
     near = [
-        k for k in alike if best.evidence - k.evidence < _tie(best, k) or _as_good(best, k, found.temperature)
+        k
+        for k in alike
+        if best.evidence - k.evidence < _tie(best, k, found.problem) or _as_good(best, k, found.temperature)
     ]
     partners = sorted({e for k in near for e in k.effects} - set(best.effects))
     return ("set" if partners else "named"), sorted(best.effects), partners
@@ -68,10 +75,27 @@ def form_share(one: Iterable[str], other: Iterable[str]) -> float:
     return BOTH if all(coarse) else FORM if any(coarse) else EXACT
 
 
-def _tie(best: Candidate, other: Candidate) -> float:
+def _tie(best: Candidate, other: Candidate, given: Problem) -> float:
     """Nats (tempered) by which a candidate must be behind the best to be told from it."""
     share = form_share(best.effects, other.effects)
-    return max(2 * TIE if share == SHAPED else TIE, share * best.evidence)
+    if share == SHAPED:
+        brief = _brief(best, given) and _brief(other, given)
+        return max(2 * TIE, (ALIKE if brief else SHAPED) * best.evidence)
+    return max(TIE, share * best.evidence)
+
+
+def _brief(candidate: Candidate, given: Problem) -> bool:
+    """Whether forces are late by a part of a sample only: then contacts within one are all that tells."""
+    slowest = max(
+        (
+            float(p.value(candidate.fitted.u[slot.start + j]))
+            for slot in slots(given.num_properties)[0]
+            if slot.effect.name in DELAYING and slot.effect.name in candidate.effects
+            for j, p in enumerate(slot.effect.parameters)
+        ),
+        default=np.inf,
+    )
+    return slowest < BRIEF * float(np.median(np.diff(given.frame.world.t[0])))
 
 
 def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:

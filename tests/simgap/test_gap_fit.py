@@ -80,11 +80,11 @@ def test_held_out_squares_agree_with_refitting(healthy):
 
 
 def test_quantisation_is_seen_and_not_imagined(healthy):
-    given, _ = healthy
-    assert quantised(given).evidence < 0
+    given, found = healthy
+    assert quantised(given, found).evidence < 0
     coarse = given.frame.world._replace(force=0.04 * np.round(given.frame.world.force / 0.04))
     frame = type(given.frame)(**{**vars(given.frame), "world": coarse})
-    seen = quantised(type(given)(frame, given.whitening, given.centre, given.spread))
+    seen = quantised(type(given)(frame, given.whitening, given.centre, given.spread), found)
     assert seen.evidence > 100
     assert seen.value == pytest.approx(0.04, rel=1e-6)
 
