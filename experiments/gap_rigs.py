@@ -30,6 +30,7 @@ from simgap.gap.adapt import adapted
 from simgap.gap.bank import Bank, load_bank
 from simgap.gap.calibrate import healthy_cases, learned
 from simgap.gap.search import search
+from simgap.operator import OperatorSettings
 
 TRIALS = 4
 FIRST = 500  # no bank is learned on cases from this one on
@@ -38,19 +39,20 @@ ONE_MOVE = BlockTask({"a": GROUND}, (Move("a", GROUND),))
 ONE_SLIDE = BlockTask({"a": GROUND}, (Move("a", GROUND, slide=True),))
 
 
-def others(task: BlockTask, rig: Rig) -> dict[str, tuple[BlockTask, Rig]]:
-    """Tasks and rigs that differ from the nominal ones, by what is different."""
+def others(task: BlockTask, rig: Rig) -> dict[str, tuple[BlockTask, Rig, OperatorSettings | None]]:
+    """Tasks, rigs and operators that differ from the nominal ones, by what is different."""
     noise = {k: 4 * v for k, v in rig.noise.model_dump().items() if v is not None}
     loud = rig.model_copy(update={"noise": rig.noise.model_copy(update=noise)})
     share = 1500.0 / rig.fingertip.normal_stiffness
     give = {k: share * v for k, v in rig.fingertip.model_dump().items()}
     soft = rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=give)})
     return {
-        "four times the noise": (task, loud),
-        "100 Hz": (task, rig.model_copy(update={"rate": 100.0})),
-        "pads of 1500 N/m": (task, soft),
-        "one move": (ONE_MOVE, rig),
-        "one slide": (ONE_SLIDE, rig),
+        "four times the noise": (task, loud, None),
+        "100 Hz": (task, rig.model_copy(update={"rate": 100.0}), None),
+        "pads of 1500 N/m": (task, soft, None),
+        "one move": (ONE_MOVE, rig, None),
+        "one slide": (ONE_SLIDE, rig, None),
+        "twice the pace": (task, rig, OperatorSettings(pace=(1.8, 2.0))),
     }
 
 
@@ -69,12 +71,14 @@ def p_values(
     }
 
 
-def rig_row(name: str, task: BlockTask, rig: Rig, number: int) -> dict[str, Any]:
-    """Everything found on one rig."""
+def rig_row(
+    name: str, task: BlockTask, rig: Rig, operator: OperatorSettings | None, number: int
+) -> dict[str, Any]:
+    """Everything found on one rig; a bank of its own is learned on the usual operator's work."""
     tell = partial(print, f"{name}:", flush=True)
     own = learned(task, rig, TRIALS, load_bank().calibration, tell)
     rows = []
-    for trials in healthy_cases(task, rig, TRIALS, number, tell, FIRST):
+    for trials in healthy_cases(task, rig, TRIALS, number, tell, FIRST, operator):
         rows.append(p_values(trials, task, rig, load_bank(), own))
         tell(" ".join(f"{bank} {p:.2g}" for bank, p in rows[-1].items()))
     found = {bank: np.array([row[bank] for row in rows]) for bank in rows[0]}
@@ -98,9 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SystemExit("simgap/gap/bank.json has no reference: run experiments.gap_bank first")
     file = RESULTS / "gap_rigs.json"
     done = json.loads(file.read_text(encoding="utf-8"))["rigs"] if given.only and file.exists() else {}
-    for name, (moves, rig) in others(task, read_rig(given.case / "rig.toml")).items():
+    for name, (moves, rig, operator) in others(task, read_rig(given.case / "rig.toml")).items():
         if not given.only or name in given.only:
-            done[name] = rig_row(name, moves, rig, given.cases)
+            done[name] = rig_row(name, moves, rig, operator, given.cases)
             jax.clear_caches()  # of no use to the next one, and memory for programs is not without end
             table = {"levels": LEVELS, "rigs": done}
             file.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")

@@ -26,6 +26,7 @@ from simgap.gap.locate import Detection, cells, largest
 from simgap.gap.noise import NoiseModel, learn
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import performed, recorded
+from simgap.operator import OperatorSettings
 from simgap.properties import random_properties
 
 HEALTHY, CATALOGUED = 24, 12  # cases, and those of them that the whole catalogue is fitted to
@@ -61,7 +62,13 @@ def learned(
 
 
 def healthy_cases(
-    task: BlockTask, rig: Rig, trials: int, number: int, tell: Progress, first: int = 0
+    task: BlockTask,
+    rig: Rig,
+    trials: int,
+    number: int,
+    tell: Progress,
+    first: int = 0,
+    operator: OperatorSettings | None = None,
 ) -> list[list[Trial]]:
     """Healthy cases of so many trials each, from the `first` on; blocks are drawn anew for every case."""
     out: list[list[Trial]] = []
@@ -69,7 +76,7 @@ def healthy_cases(
         batch = range(start, min(start + BATCH, first + number))
         blocks = [random_properties(task, 1000 + k) for k in batch for _ in range(trials)]
         seeds = [100_000 + trials * k + j for k in batch for j in range(trials)]
-        every = [recorded(s, task, rig, {}) for s in performed(task, rig, blocks, seeds, {})]
+        every = [recorded(s, task, rig, {}) for s in performed(task, rig, blocks, seeds, {}, operator)]
         out += [every[k : k + trials] for k in range(0, len(every), trials)]
         tell(f"{len(out)} of {number} healthy cases simulated")
     return out

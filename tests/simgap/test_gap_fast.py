@@ -1,0 +1,94 @@
+"""What changes within a sample: fast work is no irregular clock, and brief delays are told with care."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from demo_recordings import RIG, TASK
+
+from hmmseg.segmentation import align_trials
+from hmmseg.signals import task_space
+from simgap.gap.bank import load_bank
+from simgap.gap.candidate import Candidate
+from simgap.gap.diagnose import diagnose
+from simgap.gap.fit import Start, fit, neutral, problem, residual_at, slots
+from simgap.gap.frame import CHANNELS, build
+from simgap.gap.residuals import _fivepoint
+from simgap.gap.sensor_noise import _unresolved
+from simgap.gap.spread import clock
+from simgap.gap.synthetic import performed, recorded
+from simgap.gap.verdict import ALIKE, TIE, _tie
+from simgap.operator import OperatorSettings
+from simgap.properties import Block
+from tests.simgap.test_gap_effects import as_jax, performance, world_of
+
+BLOCKS = {"block1": Block(0.5, 0.018, 0.016), "block2": Block(0.6, 0.026, 0.016)}
+TWICE = OperatorSettings(pace=(1.8, 2.0))
+
+
+def trials(effects, operator=None):
+    """Four trials of our own simulator."""
+    done = performed(TASK, RIG, [BLOCKS] * 4, [31, 32, 33, 34], effects, operator)
+    return [recorded(s, TASK, RIG, effects) for s in done]
+
+
+@pytest.fixture(scope="module")
+def fast():
+    """The problem of healthy work twice as fast as usual, and its fit."""
+    made = trials({}, TWICE)
+    aligned = align_trials([t.file for t in made], [task_space(t, RIG) for t in made], TASK, RIG)
+    given = problem(build(made, aligned, RIG), load_bank().noise)
+    return given, fit(given, [Start((), neutral(given))])[0]
+
+
+def test_fast_work_shows_no_irregular_clock(fast):
+    given, healthy = fast
+    assert clock(given, healthy, np.geomspace(5e-4, 0.03, 40)).evidence < 0
+
+
+def test_speeds_and_loads_of_fast_work_are_no_more_than_noise(fast):
+    given, healthy = fast
+    z = residual_at(given, (), healthy.u)
+    for channel, phase in (("vx", 0), ("vy", 0), ("fy", 2)):
+        c = CHANNELS.index(channel)
+        mine = (given.whitening.weight[..., c] > 0) & (given.frame.arrays.kind // 2 == phase)
+        assert (z[..., c][mine] ** 2).mean() < 1.3
+
+
+def test_five_samples_give_slopes_to_fourth_order():
+    world = as_jax(world_of(performance(400)))
+    t = np.asarray(world.t)
+    found, three = _fivepoint(world, jnp.asarray(t**4)[..., None])
+    exact = 4 * t**3
+    assert np.abs(found[..., 0] - exact)[:, 2:-2].max() < 1e-9 * np.abs(exact).max()
+    assert np.abs(three[..., 0] - exact)[:, 2:-2].max() > 1e-6 * np.abs(exact).max()
+
+
+def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
+    rng = np.random.default_rng(0)
+    noise = 0.002 * rng.standard_normal(4000)
+    assert (_unresolved(noise, 0.002) > 0).mean() < 0.06
+    speed = np.where(np.arange(40) < 20, 0.0, 0.2)
+    doubt = _unresolved(speed, 0.002)
+    assert doubt[19] > 0.01 and doubt[20] > 0.01 and not doubt[:17].any() and not doubt[23:].any()
+    assert (_unresolved(np.full(40, np.nan), 0.002) == 0).all()
+
+
+def test_what_rounding_hides_beside_a_drag_is_named():
+    acts = {"quantisation": {"step": 0.1}, "viscous_drag": {"coefficient": 1.4}}
+    found = diagnose(trials(acts), TASK, RIG)
+    assert found.body["causes"] == ["quantisation", "viscous_drag"]
+
+
+@pytest.mark.parametrize(("late", "share"), [(0.008, ALIKE), (0.1, None)])
+def test_a_delay_within_a_sample_may_be_a_low_pass(fast, late, share):
+    given, healthy = fast
+    u = neutral(given)
+    for slot in slots(given.num_properties)[0]:
+        if slot.effect.name in ("force_lag", "force_lowpass"):
+            u[slot.start] = slot.effect.parameters[0].coordinate(late)
+    best, other = (Candidate(n, 100.0, replace(healthy, u=u)) for n in ("force_lag", "force_lowpass"))
+    assert _tie(best, other, given) == pytest.approx(100 * share if share else 2 * TIE)
