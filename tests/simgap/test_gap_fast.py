@@ -49,13 +49,17 @@ def test_fast_work_shows_no_irregular_clock(fast):
     assert clock(given, healthy, np.geomspace(5e-4, 0.03, 40)).evidence < 0
 
 
-def test_speeds_and_loads_of_fast_work_are_no_more_than_noise(fast):
+@pytest.mark.parametrize(
+    ("channel", "phase", "most"),
+    [("vx", 0, 1.3), ("vy", 0, 1.3), ("vx", 2, 1.3), ("vy", 2, 1.3), ("fy", 2, 1.8)],
+)
+def test_fast_work_leaves_little_but_noise_away_from_contact_changes(fast, channel, phase, most):
+    # Differences without their doubt leave 1.4 to 2.1 here, accelerations from three samples 2.5. Beside a
+    # touchdown much more is left still (docs/gap.md).
     given, healthy = fast
-    z = residual_at(given, (), healthy.u)
-    for channel, phase in (("vx", 0), ("vy", 0), ("fy", 2)):
-        c = CHANNELS.index(channel)
-        mine = (given.whitening.weight[..., c] > 0) & (given.frame.arrays.kind // 2 == phase)
-        assert (z[..., c][mine] ** 2).mean() < 1.3
+    z, c = residual_at(given, (), healthy.u), CHANNELS.index(channel)
+    mine = (given.whitening.weight[..., c] > 0) & (given.frame.arrays.kind == 2 * phase)
+    assert (z[..., c][mine] ** 2).mean() < most
 
 
 def test_five_samples_give_slopes_to_fourth_order():
