@@ -75,3 +75,24 @@ def test_a_cable_displaces_the_hand_that_bears_it():
         p, f = CHANNELS.index(path), CHANNELS.index(force)
         assert mean[f] * noise[f] == pytest.approx(2 * pull)
         assert mean[p] * noise[p] == pytest.approx(pull / HAND)
+
+
+@pytest.mark.parametrize("effect", ["fingertip_creep", "fingertip_compliance"])
+def test_a_hand_grips_the_less_the_farther_pads_creep(effect):
+    found = diagnose(TRIALS, TASK, RIG, forced=[effect])
+    (pads,) = found.candidates
+    values = {"ratio": 0.8, "time_constant": 0.5, "give_normal": 2.5e-4}
+    slot = next(s for s in slots(found.problem.num_properties)[0] if s.effect.name == effect)
+    u = pads.fitted.u.copy()
+    u[slot.start : slot.stop] = [
+        p.coordinate(values[p.name]) if p.name in values else u[slot.start + j]
+        for j, p in enumerate(slot.effect.parameters)
+    ]
+    mean = shifts(found.problem, replace(pads, fitted=replace(pads.fitted, u=u)))
+    noise = found.problem.frame.arrays.sample[0]
+    grip, distance = (mean[0, 1, k] * noise[k] for k in map(CHANNELS.index, ("grip", "distance")))
+    assert distance > 1e-4
+    if effect == "fingertip_creep":
+        assert grip == pytest.approx(HAND * distance / 2, rel=0.05)
+    else:  # people close their fingers until they feel the grip that they want
+        assert grip < 0.1 * HAND * distance / 2
