@@ -319,6 +319,55 @@ def _tied(v: Values) -> Stage:
     return _force(shift)
 
 
+def _frozen(v: Values) -> Stage:
+    """A bus that loses frames in bursts: one finger's last numbers are written until new ones come."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None and s.dq is not None
+        last, k = np.arange(len(s.t)), 0.0
+        while (k := k + rng.exponential(v["apart"])) < s.t[-1]:
+            until = k + v["lasting"] * rng.uniform(0.5, 1.5)
+            lost = (s.t >= k) & (s.t < until)
+            last[lost] = np.searchsorted(s.t, k) - 1
+            k = until
+        finger = np.repeat(np.arange(2) == int(v["finger"]), 2)
+        q, dq, force = (np.where(finger, values[last], values) for values in (s.q, s.dq, s.force))
+        return replace(s, q=q, dq=dq, force=force)
+
+    return stage
+
+
+def _loosened(v: Values) -> Stage:
+    """A set screw come loose: a link slips on its shaft when a grip loads it most, past its encoder."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.q is not None and s.dq is not None
+        joint, q, dq = int(v["joint"]), s.q.copy(), s.dq.copy()
+        load = np.einsum("nfxj,nfx->nfj", jacobians(s.rig, s.q), s.motion.force.reshape(-1, 2, 2))
+        torque = load.reshape(-1, 4)[:, joint]
+        for touch, part in zip(s.motion.boundaries[0::4], s.motion.boundaries[3::4], strict=True):
+            begin, end = np.searchsorted(s.t, [touch, part])
+            most = begin + int(np.abs(torque[begin:end]).argmax())
+            slip = v["angle"] * rng.uniform(0.7, 1.3) * np.sign(torque[most])
+            way = slip * np.clip((s.t - s.t[most]) / 0.04, 0, 1)
+            q[:, joint] += way
+            dq[:, joint] += np.gradient(way, s.t)
+        return replace(s, q=q, dq=dq)
+
+    return stage
+
+
+def _capacitive(v: Values) -> Stage:
+    """Capacitive sensors zeroed in an open hand: they feel the other finger come near as if it pressed."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        near = 0.016 / np.hypot(*(s.motion.position[:, 2:] - s.motion.position[:, :2]).T)
+        share = np.array([1.0, v["lean1"], -v["share"], v["lean2"]])
+        return v["height"] * (near - near[0])[:, None] * share
+
+    return _force(shift)
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -383,5 +432,13 @@ OUTSIDE = {
               LINKS, _rolling),
         _made("tied_wiring", lambda r, s: {"stiffness": 30 * s, "slack": r.uniform(0.022, 0.028)},
               HAND, _tied),
+        _made("lost_frames", lambda r, s: {"lasting": 0.25 * s, "apart": r.uniform(0.4, 0.8),
+                                           "finger": float(r.integers(2))},
+              READOUT, _frozen),
+        _made("slipping_hub", lambda r, s: {"angle": 0.02 * s, "joint": float(r.integers(4))},
+              ENCODER, _loosened),
+        _made("near_field", lambda r, s: {"height": 0.8 * s, "share": r.uniform(0.2, 1),
+                                          "lean1": r.uniform(-0.6, 0.6), "lean2": r.uniform(-0.6, 0.6)},
+              READOUT, _capacitive),
     )
 }  # fmt: skip
