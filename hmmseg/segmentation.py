@@ -47,25 +47,26 @@ class AlignedTrials:
 
 
 def align_trials(
-    files: Sequence[str], signals: Sequence[Signals], task: BlockTask, rig: Rig
+    files: Sequence[str], signals: Sequence[Signals], task: BlockTask, rig: Rig, insist: bool = False
 ) -> AlignedTrials:
     """Fit the switching model to the trials, pooled, and align each of them.
 
     A trial that does not fit its task is kept out of the pool and aligned with the order that it
     shows instead: its subtasks before `failed` are the task's, boundaries after it are not. Its
-    log evidence is that of the order it shows. `task` of the result has its number of rounds.
+    log evidence is that of the order it shows. `task` of the result has its number of rounds. `insist`: all
+    are taken to fit, whatever they show.
     """
     thinned = [thin(s, window=WINDOW) for s in signals]
     tables = [features(s, rig) for s in thinned]
     task, verdicts = judge([features(thin(s, MAX_RATE), rig) for s in signals], task)
     steps = subtasks(task)
-    fitting = [i for i, verdict in enumerate(verdicts) if verdict.failing is None]
+    fitting = [i for i, verdict in enumerate(verdicts) if insist or verdict.failing is None]
     pooled = fit([tables[i] for i in fitting], steps) if fitting else _unfitted(verdicts)
     aligned = []
     for i, (name, s, f) in enumerate(zip(files, thinned, tables, strict=True)):
         first, last = float(signals[i].t[0]), float(signals[i].t[-1])
         verdict, failed = verdicts[i], None
-        if verdict.failing is None:
+        if insist or verdict.failing is None:
             j = fitting.index(i)
             boundaries = boundary_posteriors(s, rig, steps, pooled, j)
             evidence = float(pooled.posteriors[j].log_evidence)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,19 +12,26 @@ from simgap.hand import forward, inverse, joint_velocity, tip_velocity
 Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def moved_joints(performance: Performance, change: Change, scale: float = 0.0) -> Performance:
+def moved_joints(
+    performance: Performance,
+    change: Change,
+    scale: float | Sequence[float] = 0.0,
+    base: Sequence[float] = (0.0, 0.0),
+) -> Performance:
     """Tips as read by a nominal hand whose angles and rates (n, 4) pass through `change`.
 
-    The true links are longer than nominal by `scale`.
+    The true links are longer than nominal by `scale`, all or each (4,), the second finger stands beside its
+    place by `base` (2,) [m].
     """
     rig = performance.rig
     if not rig.jointed:
         raise ValueError("a Cartesian hand has no joints")
     q, dq = [], []
+    longer, shift = np.broadcast_to(np.asarray(scale, float), 4).reshape(2, 2), np.array([[0.0, 0.0], base])
     for i in (1, 2):
         nominal = rig.finger(i)
-        true = nominal.model_copy(update={"links": tuple(length * (1 + scale) for length in nominal.links)})
-        angles = inverse(true, i, performance.position[:, i - 1])
+        true = nominal.model_copy(update={"links": tuple(nominal.links * (1 + longer[i - 1]))})
+        angles = inverse(true, i, performance.position[:, i - 1] - shift[i - 1])
         q.append(angles)
         dq.append(joint_velocity(true, angles, performance.velocity[:, i - 1]))
     q, dq = change(np.concatenate(q, 1), np.concatenate(dq, 1))

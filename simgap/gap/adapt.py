@@ -15,7 +15,7 @@ from hmmseg.trial import Trial
 from simgap.gap.bank import BOOTSTRAP, Bank
 from simgap.gap.bootstrap import distribution, statistics
 from simgap.gap.fit import Fitted, Problem
-from simgap.gap.locate import Detection
+from simgap.gap.locate import STATISTICS, Detection
 
 FARTHEST = 2.0  # factor by which a scale may change: beyond it the draws are not to be trusted
 
@@ -63,4 +63,4 @@ def moved(learned: Detection, there: Detection, here: Detection) -> Detection:
         (location, scale), (a, b), (c, d) = (getattr(x, name) for x in (learned, there, here))
         return location + c - a, scale * float(np.clip(d / b, 1 / FARTHEST, FARTHEST))
 
-    return Detection(one("cell"), one("pooled"), one("gain"), learned.margin)
+    return Detection(**{name: one(name) for name in STATISTICS}, margin=learned.margin)

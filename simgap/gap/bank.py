@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from simgap.gap.judge import Calibration
-from simgap.gap.locate import Detection
+from simgap.gap.locate import STATISTICS, Detection
 from simgap.gap.noise import NoiseModel
 
 FILE = Path(__file__).with_name("bank.json")
@@ -64,8 +64,7 @@ def parse_bank(text: str) -> Bank:
 
 
 def _detection(table: dict[str, Any]) -> Detection:
-    cell, pooled, gain = (tuple(table[name]) for name in ("cell", "pooled", "gain"))
-    return Detection(cell, pooled, gain, float(table["margin"]))
+    return Detection(**{name: tuple(table[name]) for name in STATISTICS}, margin=float(table["margin"]))
 
 
 @cache

@@ -15,7 +15,7 @@ from simgap.effects import catalogue
 from simgap.gap.fit import Fitted, Problem, derivatives
 from simgap.gap.frame import CHANNELS
 from simgap.gap.judge import Calibration
-from simgap.gap.locate import BANDS, Detection, normal_score, tamed
+from simgap.gap.locate import BANDS, STATISTICS, Detection, coherent, normal_score, tamed
 
 DRAWS = 400
 NARROWEST = 0.3  # scale of a Gumbel distribution at least: a few values may lie close by chance
@@ -33,11 +33,13 @@ def gumbel(values: np.ndarray, least: float = NARROWEST) -> tuple[float, float]:
 
 def distribution(drawn: dict[str, np.ndarray]) -> Detection:
     """Gumbel distributions of the draws of every statistic."""
-    return Detection(gumbel(drawn["cell"]), gumbel(drawn["pooled"]), gumbel(drawn["gain"], TAIL))
+    least = {name: TAIL if name == "gain" else NARROWEST for name in STATISTICS}
+    learned = {name: gumbel(drawn[name], least[name]) for name in STATISTICS}
+    return Detection(**learned, margin=Detection.margin)
 
 
 def statistics(given: Problem, healthy: Fitted, draws: int = DRAWS, seed: int = 0) -> dict[str, np.ndarray]:
-    """Draws (D,) of the statistics `cell`, `pooled` and `gain` of healthy recordings.
+    """Draws (D,) of every one of STATISTICS of healthy recordings.
 
     `healthy` is the fit of properties alone, about which everything is linearised.
     """
@@ -56,10 +58,11 @@ def refitted(z: np.ndarray, push: np.ndarray) -> np.ndarray:
 
 
 def largest_scores(given: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
-    """`locate.largest` of many draws (D, n) of the residuals that exist: each statistic (D,)."""
+    """`locate.largest` and the largest `coherent` score of many draws (D, n) of the residuals that exist."""
     frame, there = given.frame, given.whitening.weight > 0
     every = np.zeros((len(z), *there.shape))
     every[:, there] = z
+    again = coherent(given, every)
     every = tamed(given, every)
     single: list[np.ndarray] = []
     together: dict[tuple[int, int, int], list] = {}
@@ -80,7 +83,7 @@ def largest_scores(given: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
                     entry = together.setdefault((c, subtask, int(b)), [0.0, 0])
                     entry[0], entry[1] = entry[0] + energy, entry[1] + number
     pooled = [normal_score(energy, number) for energy, number in together.values()]
-    return {"cell": np.max(single, axis=0), "pooled": np.max(pooled, axis=0)}
+    return {"cell": np.max(single, axis=0), "pooled": np.max(pooled, axis=0), "coherent": again.max(-1)}
 
 
 def _largest_evidence(given: Problem, healthy: Fitted, z: np.ndarray, own: np.ndarray) -> np.ndarray:

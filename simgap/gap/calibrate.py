@@ -22,7 +22,7 @@ from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, raw_residual_at, residual_at
 from simgap.gap.frame import Frame, build
 from simgap.gap.judge import Calibration
-from simgap.gap.locate import Detection, cells, largest
+from simgap.gap.locate import Detection, raised
 from simgap.gap.noise import NoiseModel, learn
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import performed, recorded
@@ -125,7 +125,7 @@ def detection(
     """
     rows, floors, gains = [], [], []
     for k, (task, found) in enumerate(given):
-        rows.append(list(largest(cells(task, residual_at(task, (), found.u))).values()))
+        rows.append(list(raised(task, residual_at(task, (), found.u)).values()))
         floors.append(found.square.sum() / task.size)
         best = ""
         if k < catalogued:
@@ -139,8 +139,8 @@ def detection(
             gains.append(scores[leading])
             best = f", best of the catalogue: {leading} {scores[leading]:.2f}"
         tell(f"case {k + 1}: largest scores {np.round(rows[-1], 2)}{best}")
-    cell, pooled = (gumbel(np.array(column)) for column in zip(*rows, strict=True))
-    return Detection(cell, pooled, gumbel(np.array(gains), TAIL)), float(np.mean(floors))
+    cell, pooled, coherent = (gumbel(np.array(column)) for column in zip(*rows, strict=True))
+    return Detection(cell, pooled, coherent, gumbel(np.array(gains), TAIL)), float(np.mean(floors))
 
 
 def reference(given: Sequence[tuple[Problem, Fitted]], rate: float) -> Reference:

@@ -16,7 +16,8 @@ from simgap.gap.locate import cells, largest, tamed
 from simgap.gap.spread import Spread
 
 ALONE = 0.2  # share of its gain that an effect must keep without the place that it gains most in
-EVERY = 0.1  # share of the mean trial's gain in one subtask that it must have in every trial to recur
+EVERY = 0.1  # share of the mean trial's gain in one subtask that it must have in every trial to recur,
+BUT_ONE = 4  # or in all but one of so many: noise hides what is small
 LEAST = 10.0  # nats
 KEPT = 0.6  # share of its evidence that a candidate must gain on held-out trials
 STRANGE = 3.0  # nats (tempered) by which a decoy must do better than an effect of the catalogue,
@@ -92,8 +93,9 @@ def recurring(given: Problem, found: Candidate, without: Fitted, temperature: fl
     slides = any(fitted()[name].switched for name in added)
     most, total = float((gain if slides else gain.sum(0)).max()), float(gain.sum())
     enough = ALONE * total if slides else min(ALONE * total, LEAST)
-    by_trial = gain[: given.frame.num_trials, gain.sum(0).argmax()]
-    every = not slides and by_trial.min() > EVERY * by_trial.mean()
+    by_trial = np.sort(gain[: given.frame.num_trials, gain.sum(0).argmax()])
+    least = by_trial[1 if by_trial.size >= BUT_ONE else 0]
+    every = not slides and least > EVERY * by_trial.mean()
     excess = most if total - most < enough and not every else 0.0
     return replace(found, evidence=found.evidence - excess / temperature)
 

@@ -16,7 +16,11 @@ from simgap.gap.frame import CHANNELS
 BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges, the last band ends at half the sampling rate
 ALARM = 0.01  # chance that a healthy recording is called otherwise
 EVIDENCE = 1.4  # times the scale of a healthy recording's largest evidence: see docs/gap.md
-SHARES = {"cell": 0.2, "pooled": 0.2, "gain": 0.6}  # of that chance; effects raise the evidence first
+# Of that chance; effects raise the evidence first.
+SHARES = {"cell": 0.15, "pooled": 0.1, "coherent": 0.15, "gain": 0.6}
+STATISTICS = tuple(SHARES)
+RECURRING = 1.1  # margin of what recurs, as `Detection.margin` of the others
+WAVES = 3  # cosines over a subtask, the mean the first, in which trials may err alike
 BESIDE = 3.0  # sd; no sample beside a contact change counts for more, its contact may be the other one
 
 
@@ -95,17 +99,38 @@ def pooled(found: list[Cell]) -> np.ndarray:
     return normal_score(energy, count)
 
 
+def coherent(given: Problem, z: np.ndarray) -> np.ndarray:
+    """Scores (..., cells) of what recurs in whitened residuals z (..., T, N, C): the trials' sum, not their
+    squares'.
+
+    A cell is a channel in a subtask, its residuals in each trial WAVES cosines over the subtask's length.
+    """
+    frame, there, z = given.frame, given.whitening.weight > 0, tamed(given, z)
+    out = []
+    for subtask in range(len(frame.steps)):
+        inside = frame.arrays.subtask[: frame.num_trials] == subtask
+        for c in range(len(CHANNELS)):
+            rows = [z[..., r, inside[r] & there[r, :, c], c] for r in range(frame.num_trials)]
+            waves = [
+                np.asarray(dct(v, norm="ortho", axis=-1))[..., :WAVES] for v in rows if v.shape[-1] > WAVES
+            ]
+            if waves:
+                out.append(normal_score((np.sum(waves, axis=0) ** 2).sum(-1) / len(waves), WAVES))
+    return np.stack(out, -1)
+
+
 @dataclass(frozen=True)
 class Detection:
     """Gumbel distributions (location, scale) of the largest score of healthy recordings.
 
-    `cell`: single cells; `pooled`: cells with trials taken together; `gain`: log evidence of the best
-    candidate over none. `margin` widens the first two and EVIDENCE the last: a recording is not our own
-    simulation.
+    `cell`: single cells; `pooled`: cells with trials taken together; `coherent`: what recurs in all of them;
+    `gain`: log evidence of the best candidate over none. `margin` widens the first two, RECURRING the third
+    and EVIDENCE the last: a recording is not our own simulation.
     """
 
     cell: tuple[float, float]
     pooled: tuple[float, float]
+    coherent: tuple[float, float]
     gain: tuple[float, float]
     margin: float = 1.25
 
@@ -123,7 +148,9 @@ class Detection:
 
     def _of(self, name: str) -> tuple[float, float, float]:
         location, scale = getattr(self, name)
-        return (location, scale * EVIDENCE, 1.0) if name == "gain" else (location, scale, self.margin)
+        if name == "gain":
+            return location, scale * EVIDENCE, 1.0
+        return location, scale, RECURRING if name == "coherent" else self.margin
 
     def threshold(self, name: str, level: float) -> float:
         """Value that a healthy recording exceeds with probability `level`."""
@@ -139,6 +166,11 @@ def together(p_values: dict[str, float]) -> float:
 def largest(found: list[Cell]) -> dict[str, float]:
     """The largest scores of `cells`."""
     return {"cell": max(c.z for c in found), "pooled": float(pooled(found).max())}
+
+
+def raised(given: Problem, z: np.ndarray) -> dict[str, float]:
+    """The largest scores of whitened residuals z (T, N, C): all STATISTICS but the evidence."""
+    return {**largest(cells(given, z)), "coherent": float(coherent(given, z).max())}
 
 
 def subtask_name(step: Subtask) -> str:

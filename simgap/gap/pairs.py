@@ -15,15 +15,13 @@ from simgap.gap.spread import spreads
 
 BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for each
 SWAPS = 2  # times that a half of the best pair is exchanged
-MORE, COARSE = 3e-4, 5e-3  # share of its evidence that a pair must gain over its better half, a coarse one;
+MORE, COARSE = 3e-4, 1e-2  # share of its evidence that a pair must gain over its better half, a coarse one;
 CALM, CALMER = 0.1, 1e-4  # what that half leaves must look less like noise than this, even less if coarse,
-AMPLE = 0.2  # unless the pair gains so large a share;
+AMPLE, PLAIN = 0.2, 30.0  # unless the pair gains so large a share, or so many nats beside one that is not;
 WORTH = 0.7  # and the pair must leave no more than this share of what its better half leaves,
 PLENTY = 0.03  # or gain this share
 STRAINED = 10.0  # nats by which its half bends what was measured of the blocks: no residual shows that;
-SOLVED = (
-    0.3  # share of what a coarse half leaves that a pair may leave, like noise, to gain as little as MORE
-)
+SOLVED = 0.4  # share of what a coarse half leaves that a pair may leave, like noise, to gain as little
 STUCK = 2.0  # nats at T = 1 by which a half of a pair, taken alone, may do better than as a single so far
 LITTLE = 3e-3  # share of the gap that is lost in the noise's own scatter: what leaves less is not compared
 # What shifts or smooths samples in time.
@@ -112,9 +110,9 @@ def worthwhile(
         solved = p_after > ALARM and after < SOLVED * rest
         if share < (COARSE if coarse and not solved else MORE):
             continue
-        if share < AMPLE and p_rest > (CALMER if coarse else CALM):
+        if p_rest > (CALMER if coarse else CALM) and (share < AMPLE if coarse else gain < PLAIN):
             continue
-        if share > PLENTY or after < max(WORTH * rest, LITTLE):
+        if share > PLENTY or after < WORTH * rest or (after < LITTLE and p_after > ALARM):
             out.append(pair)
     return out
 

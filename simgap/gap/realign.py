@@ -16,7 +16,7 @@ from simgap.gap.fit import Fitted, Problem, world_without
 from simgap.gap.frame import thinned
 
 
-def realigned(trials: Sequence[Trial], given: Problem, found: Fitted) -> AlignedTrials:
+def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, insist: bool = False) -> AlignedTrials:
     """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
     frame, rig = given.frame, given.frame.rig
     world = world_without(given, found.effects, found.u)
@@ -28,7 +28,7 @@ def realigned(trials: Sequence[Trial], given: Problem, found: Fitted) -> Aligned
         columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
         small, _ = thinned(trial)
         rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
-    return align_trials([t.file for t in trials], rows, frame.task, _hand(rig, world))
+    return align_trials([t.file for t in trials], rows, frame.task, _hand(rig, world), insist)
 
 
 def _hand(rig: Rig, world) -> Rig:

@@ -21,7 +21,8 @@ from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.events import odd, told
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, residual_at, without
 from simgap.gap.frame import build
-from simgap.gap.locate import cells, largest
+from simgap.gap.insist import insisted
+from simgap.gap.locate import raised
 from simgap.gap.pairs import tried, unstuck, worthwhile
 from simgap.gap.realign import moved, realigned
 from simgap.gap.spread import SPREADS, spreads
@@ -64,11 +65,16 @@ def search(
     """Fit the catalogue to recordings of one block task; InputError where no trial fits its task."""
     tell("aligning trials")
     aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    names, misled = _names(rig, excluded), []
+    if not any(t.segmentation.complete for t in aligned.trials):
+        tell("aligning trials that seem not to fit")
+        known = [tuple(sorted(forced))] if forced else [(n,) for n in (*deterministic(names), *decoys())]
+        aligned, misled = insisted(trials, aligned, rig, bank, actual, known)
     trials, aligned, warnings = _complete(trials, aligned)
+    warnings = [*misled, *warnings]
     given = problem(build(trials, aligned, rig), bank.noise, actual)
     healthy = fit(given, [Start((), neutral(given))])[0]
-    statistics = largest(cells(given, residual_at(given, (), healthy.u)))
-    names = _names(rig, excluded)
+    statistics = raised(given, residual_at(given, (), healthy.u))
     tell("fitting single effects")
     wanted = [w for w in [tuple(sorted(set(forced) - set(SPREADS)))] if w]
     singles = [(n,) for n in (*deterministic(names), *decoys())]
@@ -101,7 +107,7 @@ def search(
         given = without(given, event)
     if beside is not None or event is not None:
         healthy, fits = _refitted(given, healthy, fits, bool(forced))
-        statistics = largest(cells(given, residual_at(given, (), healthy.u)))
+        statistics = raised(given, residual_at(given, (), healthy.u))
     if forced:
         found, temperature = _forced(given, fits, healthy, forced, bank)
         statistics["gain"] = found.evidence

@@ -17,9 +17,10 @@ from simgap.gap.search import Search
 
 DELAYING = frozenset({"force_lag", "force_lowpass"})
 TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
-SHAPED = 0.012  # nor those within this share of its evidence, twice TIE at least, that differ by effects
-BRIEF, ALIKE = 0.25, 0.25  # the same share for what delays by less than this many samples
-BOTH = 0.006  # which reshape signals in time; by coarse effects alone,
+# Nor those within these shares of its evidence that differ by effects
+SHAPED = 0.012  # which reshape signals in time, and by twice TIE at least,
+SHORTLY, BRIEF = 0.25, 0.25  # the same where they delay by less than this many samples,
+BOTH = 0.006  # by coarse effects alone,
 FORM = 0.002  # by a coarse effect and another,
 EXACT = 1e-4  # or by others: no form is exact to that
 
@@ -80,7 +81,7 @@ def _tie(best: Candidate, other: Candidate, given: Problem) -> float:
     share = form_share(best.effects, other.effects)
     if share == SHAPED:
         brief = _brief(best, given) and _brief(other, given)
-        return max(2 * TIE, (ALIKE if brief else SHAPED) * best.evidence)
+        return max(2 * TIE, (SHORTLY if brief else SHAPED) * best.evidence)
     return max(TIE, share * best.evidence)
 
 

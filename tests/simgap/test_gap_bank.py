@@ -19,8 +19,9 @@ from simgap.gap.bank import Bank, Reference, load_bank, parse_bank
 from simgap.gap.bootstrap import distribution, gumbel, largest_scores, refitted, statistics
 from simgap.gap.calibrate import fitted, frames, healthy_cases, learned, steps
 from simgap.gap.fit import residual_at
+from simgap.gap.frame import CHANNELS
 from simgap.gap.judge import Calibration
-from simgap.gap.locate import Detection, cells, largest
+from simgap.gap.locate import STATISTICS, Detection, raised
 from simgap.gap.noise import NoiseModel
 
 
@@ -62,7 +63,20 @@ def test_scores_of_many_draws_are_those_of_each(healthy):
     for k, one in enumerate(z):
         alone = np.zeros(given.whitening.weight.shape)
         alone[given.whitening.weight > 0] = one
-        assert {n: float(v[k]) for n, v in found.items()} == pytest.approx(largest(cells(given, alone)))
+        assert {n: float(v[k]) for n, v in found.items()} == pytest.approx(raised(given, alone))
+
+
+def test_what_recurs_adds_up_and_what_does_not_cancels(healthy):
+    _, given, _ = healthy
+    z = np.random.default_rng(6).standard_normal(given.whitening.weight.shape)
+    carry = next(k for k, s in enumerate(given.frame.steps) if s.name == "carry")
+    inside = given.frame.arrays.subtask[..., None] == carry
+    shift = np.where(inside, 0.8, 0.0) * (np.arange(z.shape[2]) == CHANNELS.index("fy"))
+    sign = np.array([1.0, -1.0] * z.shape[0])[: z.shape[0], None, None]
+    plain, same, other = (raised(given, z + add)["coherent"] for add in (0.0, shift, sign * shift))
+    assert same > plain + 2
+    assert other == pytest.approx(plain, abs=0.5)
+    assert load_bank().detection.p_values({"coherent": same})["coherent"] < 1e-3
 
 
 def test_quartiles_tell_a_gumbel_distribution():
@@ -73,7 +87,7 @@ def test_quartiles_tell_a_gumbel_distribution():
 
 def test_p_values_are_uniform_on_its_own_draws(drawn):
     found = distribution(drawn)
-    for name in ("cell", "pooled", "gain"):
+    for name in STATISTICS:
         p = gumbel_r.sf(drawn[name], *getattr(found, name))
         assert np.mean(p < 0.5) == pytest.approx(0.5, abs=0.03)
         assert np.mean(p < 0.05) < 0.07
@@ -89,19 +103,20 @@ def test_the_nominal_rig_gives_the_reference(healthy, drawn):
     assert bank.reference is not None
     assert adapted(bank, given, found, trials) is bank
     here = distribution(drawn)
-    for name in ("cell", "pooled", "gain"):
+    for name in STATISTICS:
         (location, scale), (a, b) = getattr(here, name), getattr(bank.reference.bootstrap, name)
         assert location == pytest.approx(a, abs=0.12)
         assert scale == pytest.approx(b, rel=0.2)
 
 
 def test_distributions_move_as_the_bootstrap_does():
-    learned_there = Detection((3.0, 0.6), (2.5, 0.5), (-0.9, 1.0), 1.25)
-    there = Detection((2.0, 0.3), (2.0, 0.3), (-0.5, 0.4))
-    here = Detection((2.5, 0.45), (1.5, 0.15), (0.0, 4.0))
+    learned_there = Detection((3.0, 0.6), (2.5, 0.5), (2.0, 0.4), (-0.9, 1.0), 1.25)
+    there = Detection((2.0, 0.3), (2.0, 0.3), (1.5, 0.2), (-0.5, 0.4))
+    here = Detection((2.5, 0.45), (1.5, 0.15), (1.6, 0.3), (0.0, 4.0))
     found = moved(learned_there, there, here)
     assert found.cell == pytest.approx((3.5, 0.9))
     assert found.pooled == pytest.approx((2.0, 0.25))
+    assert found.coherent == pytest.approx((2.1, 0.6))
     assert found.gain == pytest.approx((-0.4, 2.0))  # ten times as wide is not believed
     assert found.margin == 1.25
 
@@ -135,7 +150,7 @@ def test_a_fingerprint_knows_the_rig_and_not_the_names():
 
 
 def test_a_bank_is_written_and_read_again():
-    reference = Reference("abc", 240, Detection((2.9, 0.3), (2.5, 0.3), (-0.7, 0.3)))
+    reference = Reference("abc", 240, Detection((2.9, 0.3), (2.5, 0.3), (2.1, 0.3), (-0.7, 0.3)))
     bank = replace(load_bank(), reference=reference)
     again = parse_bank(bank.to_json())
     assert (again.detection, again.reference) == (bank.detection, reference)
@@ -149,7 +164,9 @@ def test_ones_own_bank_is_learned_once(shared, tmp_path, monkeypatch):
 
     def instead(task: BlockTask, rig: Rig, count: int, calibration: Calibration, tell) -> Bank:
         asked.append((rig.rate, count))
-        return Bank(NoiseModel.plain(), Detection((1.0, 0.5), (1.0, 0.5), (0.0, 1.0)), calibration)
+        return Bank(
+            NoiseModel.plain(), Detection((1.0, 0.5), (1.0, 0.5), (1.0, 0.5), (0.0, 1.0)), calibration
+        )
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(own_bank, "learned", instead)
@@ -188,6 +205,6 @@ def test_a_bank_learned_on_a_noisy_rig_takes_its_recordings_for_healthy():
     fresh = healthy_cases(STACK, hand, 2, 2, lambda text: None, first=500)
     for frame in frames(fresh, STACK, hand, lambda text: None):
         given, found = fitted(frame, bank.noise)
-        p = bank.detection.p_values(largest(cells(given, residual_at(given, (), found.u))))
+        p = bank.detection.p_values(raised(given, residual_at(given, (), found.u)))
         assert min(p.values()) > 0.01
         assert 0.8 < found.square.sum() / given.size < 1.2
