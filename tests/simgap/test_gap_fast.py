@@ -20,7 +20,7 @@ from simgap.gap.residuals import _fivepoint
 from simgap.gap.sensor_noise import _unresolved
 from simgap.gap.spread import clock
 from simgap.gap.synthetic import performed, recorded
-from simgap.gap.verdict import ALIKE, TIE, _tie
+from simgap.gap.verdict import SHORTLY, TIE, _tie
 from simgap.operator import OperatorSettings
 from simgap.properties import Block
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
@@ -87,7 +87,7 @@ def test_what_rounding_hides_beside_a_drag_is_named():
     assert found.body["causes"] == ["quantisation", "viscous_drag"]
 
 
-@pytest.mark.parametrize(("late", "share"), [(0.008, ALIKE), (0.1, None)])
+@pytest.mark.parametrize(("late", "share"), [(0.008, SHORTLY), (0.1, None)])
 def test_a_delay_within_a_sample_may_be_a_low_pass(fast, late, share):
     given, healthy = fast
     u = neutral(given)
