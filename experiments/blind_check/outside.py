@@ -368,6 +368,48 @@ def _capacitive(v: Values) -> Stage:
     return _force(shift)
 
 
+def _blunted(v: Values) -> Stage:
+    """Drives that smooth the speeds they report: rates come late and blunt, angles do not."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        assert s.dq is not None
+        keep = np.exp(-(s.t[1] - s.t[0]) / v["time"])
+        return replace(s, dq=np.asarray(lfilter([1 - keep], [1, -keep], s.dq, axis=0, zi=keep * s.dq[:1])[0]))
+
+    return stage
+
+
+def _stuck(v: Values) -> Stage:
+    """A converter with a bit stuck: one finger's readings miss every other stretch of their range."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        origin = np.array([v["origin1"], v["origin2"]] * 2)
+        is_set = np.floor(s.force / v["bit"] + origin) % 2
+        finger = np.repeat(np.arange(2) == int(v["finger"]), 2)
+        return v["bit"] * (v["value"] - is_set) * finger
+
+    return _force(shift)
+
+
+def _crumpled(v: Values) -> Stage:
+    """Blocks of cardboard: where they are gripped they dent, and do not spring back while they are held."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        keep = np.exp(-(s.t[1] - s.t[0]) / 0.005)
+        load = s.motion.force[:, 0::2] * np.array([1.0, -1.0])
+        load = np.asarray(lfilter([1 - keep], [1, -keep], load, axis=0, zi=keep * load[:1])[0])
+        dent = np.zeros_like(s.motion.position)
+        for touch, part in zip(s.motion.boundaries[0::4], s.motion.boundaries[3::4], strict=True):
+            pressed = load * ((s.t >= touch) & (s.t <= part))[:, None]
+            most = np.maximum.accumulate(np.maximum(pressed - v["bears"], 0.0))  # what is dented stays dented
+            left = 1 - np.clip((s.t - part) / 0.05, 0, 1)  # the finger that opens catches up
+            dent[:, 0::2] += v["give"] * most * left[:, None] * np.array([1.0, -1.0])
+        place, rate = s.motion.position + dent, s.motion.velocity + np.gradient(dent, s.t, axis=0)
+        return replace(s, motion=replace(s.motion, position=place, velocity=rate))
+
+    return stage
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -440,5 +482,12 @@ OUTSIDE = {
         _made("near_field", lambda r, s: {"height": 0.8 * s, "share": r.uniform(0.2, 1),
                                           "lean1": r.uniform(-0.6, 0.6), "lean2": r.uniform(-0.6, 0.6)},
               READOUT, _capacitive),
+        _made("blunt_rates", lambda r, s: {"time": 0.12 * s}, ENCODER, _blunted),
+        _made("stuck_bit", lambda r, s: {"bit": 0.35 * s, "value": float(r.integers(2)),
+                                         "finger": float(r.integers(2)),
+                                         "origin1": r.uniform(0, 2), "origin2": r.uniform(0, 2)},
+              READOUT, _stuck),
+        _made("crumpling_blocks", lambda r, s: {"give": 3e-4 * s, "bears": r.uniform(0.3, 1.0)},
+              LINKS, _crumpled),
     )
 }  # fmt: skip
