@@ -161,6 +161,7 @@ def _following(
         found.problem,
         values,
         [c.effects for c in partners],
+        [cause.evidence - c.evidence for c in partners],
         properties,
         bank,
         seed,

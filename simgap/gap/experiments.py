@@ -1,11 +1,13 @@
 """The next experiment: which of a short list would tell the leading cause from its partners.
 
-Every experiment is simulated once with the leading cause in it, then all of them are fitted to what it
-would record. The gain expected of a partner is by how much it would then fit worse: the divergence after
-properties and nuisances have done their best (Chaloner & Verdinelli, Statist. Sci. 10, 1995), for as many
-trials as there are, tempered as their evidence is, less what the effects' forms may be off by. A partner
-that is told surely need not be told more surely: of the experiments that tell most partners the first of
-the list is taken, which asks least of the model.
+Every experiment is simulated with the leading cause in it, then all candidates are fitted to what it would
+record, in TRIALS trials: where contacts fall between samples tells much of what delays, and is chance. The
+gain expected of a partner is by how much it would then fit worse: the divergence after properties and
+nuisances have done their best (Chaloner & Verdinelli, Statist. Sci. 10, 1995), for as many trials as there
+are, tempered as their evidence is, less what the effects' forms may be off by. A partner that is told surely
+need not be told more surely: of the experiments that tell most partners the first of the list is taken,
+which asks least of the model. The same forecast is made of recordings like those at hand: where they told
+less than it says, every other forecast is trusted as much less.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from simgap.operator import OperatorSettings
 from simgap.properties import Block, Blocks
 from simgap.writing import task_table
 
+TRIALS = 4  # simulated; as many as a frame is padded to
 LEAST = 1e-4  # an estimated property below this is not one
 ENOUGH = 4 * TIE  # nats (tempered): gains have a standard deviation of the square root of twice their mean
 
@@ -44,6 +47,7 @@ class Experiment:
     measured: bool = False
 
 
+USUAL = Experiment("the same again")
 # Those whose outcome needs least of the model first: fast work asks most of it.
 EXPERIMENTS = (
     Experiment(
@@ -67,6 +71,7 @@ def next_experiment(
     given: Problem,
     cause: Values,
     partners: Sequence[tuple[str, ...]],
+    behind: Sequence[float],
     properties: np.ndarray,
     bank: Bank,
     seed: int,
@@ -76,25 +81,30 @@ def next_experiment(
     """The experiment that tells most partners from the cause by ENOUGH nats; None where none tells any.
 
     `cause` holds the parameters of each effect that acts, `partners` the explanations that cannot be told
-    from them; `properties` (objects, 3) what is thought of the blocks, `actual` what was measured of them;
-    `temperature` that of the evidence. What is told stands in `separates`, the least gain of it beside.
+    from them and `behind` [nats, tempered] how far each of those is behind; `properties` (objects, 3) what is
+    thought of the blocks, `actual` what was measured of them; `temperature` that of the evidence. What is
+    told stands in `separates`, the least gain of it beside.
     """
     frame = given.frame
     if not (properties > LEAST).all():
         return None
     blocks = {n: Block(*map(float, p)) for n, p in zip(frame.task.objects, properties, strict=True)}
-    chosen, told = EXPERIMENTS[0], dict[tuple[str, ...], float]()
-    for experiment in EXPERIMENTS:
-        if experiment.measured and actual:
-            continue
+
+    def forecast(experiment: Experiment) -> np.ndarray:
         known = _measured(blocks) if experiment.measured else actual
         try:
             gains = _gains(given, experiment, blocks, cause, partners, bank, seed, known)
         except (InputError, ValueError):  # this rig or these blocks do not allow it
+            return np.zeros(len(partners))
+        return gains * frame.num_trials / temperature
+
+    trust = trusted(forecast(USUAL), np.asarray(behind))
+    chosen, told = EXPERIMENTS[0], dict[tuple[str, ...], float]()
+    for experiment in EXPERIMENTS:
+        if experiment.measured and actual:
             continue
-        sure = {
-            p: g for p, g in zip(partners, gains * frame.num_trials / temperature, strict=True) if g > ENOUGH
-        }
+        gains = trust * forecast(experiment)
+        sure = {p: g for p, g in zip(partners, gains, strict=True) if g > ENOUGH}
         if len(sure) > len(told):
             chosen, told = experiment, sure
         if len(told) == len(partners):
@@ -108,6 +118,12 @@ def next_experiment(
         "task": task_table(frame.task),
         "operator": {k: list(v) for k, v in chosen.operator.items()},
     }
+
+
+def trusted(forecast: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Share (0 to 1) of a forecast [nats] that is to be expected, from what was forecast of recordings like
+    those at hand and by how much partners are `behind` in them."""
+    return np.where(forecast > TIE, np.clip((behind + TIE) / np.maximum(forecast, TIE), 0.0, 1.0), 1.0)
 
 
 def _measured(blocks: Blocks) -> Actual:
@@ -131,14 +147,16 @@ def _gains(
     """How much worse than the cause every partner fits one trial of the experiment, less its form [nats]."""
     frame = given.frame
     task, rig = frame.task, frame.rig
-    simulated = performed(task, rig, [blocks], [seed + 77], truth, OperatorSettings(**experiment.operator))
+    seeds = [seed + 77 + k for k in range(TRIALS)]
+    simulated = performed(task, rig, [blocks] * TRIALS, seeds, truth, OperatorSettings(**experiment.operator))
     trials = [recorded(s, task, rig, truth) for s in simulated]
     aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
     asked = problem(build(trials, aligned, rig), bank.noise, actual)
     healthy = fit(asked, [Start((), neutral(asked))])[0]
     own = _cost(asked, healthy, truth, tuple(truth))
     off = [form_share(truth, names) * (healthy.cost - own) for names in partners]
-    return np.array([_cost(asked, healthy, truth, names) - own for names in partners]) - np.maximum(off, 0.0)
+    gains = np.array([_cost(asked, healthy, truth, names) - own for names in partners])
+    return (gains - np.maximum(off, 0.0)) / asked.frame.num_trials
 
 
 def _cost(asked: Problem, healthy: Fitted, truth: Values, names: tuple[str, ...]) -> float:

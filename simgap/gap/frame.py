@@ -158,7 +158,7 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, rig, group)
     sd = residual_noise(signals, sample, rig, step)
-    sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, boundaries))
+    sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, edge & (phase == 2), boundaries))
     lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
     there[lone, CHANNELS.index("fx") :] = 0.0
     if group > 1:  # a mean over a contact change is of neither contact

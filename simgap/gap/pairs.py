@@ -17,7 +17,8 @@ BEAM, PARTNERS = 2, 5  # singles that pairs start from, partners refined for eac
 SWAPS = 2  # times that a half of the best pair is exchanged
 MORE, COARSE = 3e-4, 1e-2  # share of its evidence that a pair must gain over its better half, a coarse one;
 CALM, CALMER = 0.1, 1e-4  # what that half leaves must look less like noise than this, even less if coarse,
-AMPLE, PLAIN = 0.2, 30.0  # unless the pair gains so large a share, or so many nats beside one that is not;
+AMPLE = 0.2  # unless the pair gains so large a share,
+SURELY, PLAIN = 15.0, 30.0  # beside one that is not coarse that and so many nats, or so many by themselves;
 WORTH = 0.7  # and the pair must leave no more than this share of what its better half leaves,
 PLENTY = 0.03  # or gain this share
 STRAINED = 10.0  # nats by which its half bends what was measured of the blocks: no residual shows that;
@@ -41,11 +42,12 @@ def tried(
     What is named beside a leading single may go better with another one: as long as that finds better pairs,
     the half of the best pair that no pair was sought for is the next to be taken. It joins the singles.
     """
-    enough = singles[0].spread is None and left(given, singles[0], healthy, bank)[1] > ALARM
-    beam = [c for c in singles if c.spread is None and c.name not in decoys()][: 1 if enough else BEAM]
+    known = [c for c in singles if c.name not in decoys()]
+    enough = known[0].spread is None and left(given, known[0], healthy, bank)[1] > ALARM
+    beam = [c for c in known if c.spread is None][: 1 if enough else BEAM]
     sought = {c.name for c in beam}
     found = _pairs(given, beam, healthy, names, temperature)
-    leading = max((c.evidence for c in singles if c.spread is None), default=0.0)
+    leading = max((c.evidence for c in known if c.spread is None), default=0.0)
     for _ in range(SWAPS):
         best = _shifting(found.values())
         if best is None or best.evidence < leading + LEAST:
@@ -110,7 +112,9 @@ def worthwhile(
         solved = p_after > ALARM and after < SOLVED * rest
         if share < (COARSE if coarse and not solved else MORE):
             continue
-        if p_rest > (CALMER if coarse else CALM) and (share < AMPLE if coarse else gain < PLAIN):
+        ample = share > AMPLE and (coarse or gain > SURELY)
+        plain = gain > PLAIN and not coarse
+        if p_rest > (CALMER if coarse else CALM) and not (ample or plain):
             continue
         if share > PLENTY or after < WORTH * rest or (after < LITTLE and p_after > ALARM):
             out.append(pair)

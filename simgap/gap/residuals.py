@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, YIELDING, World, gradient, tips
 from simgap.effects.filters import faded, lowpass
@@ -19,7 +20,8 @@ from simgap.gap.frame import CHANNELS, Arrays
 
 TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # sds of the distance by which fingers must be nearer than the block is wide to touch it
-HELD = 0.1  # N; a grip below this holds nothing
+HELD = 0.1  # N; a grip below this holds nothing,
+LOOSE = 0.35  # nor one below this share of its usual force: pads that let go slide by what shears they bear
 BETWEEN = 0.3  # of a bend, sd: a force read between samples
 CURVED = 0.5  # of the difference of two ways to take a slope, sd: how far it may be off
 EVEN = 0.025  # N; changes from one sample to the next below this have no corner
@@ -56,7 +58,7 @@ def residuals(
     unsure = SURE * arrays.sd[..., CHANNELS.index("distance")]
     touching = TOUCH * jax.nn.softplus(-(gap + late + unsure * world.free) / TOUCH)
     held = world.ground + world.carry
-    firm = jax.nn.sigmoid((0.5 * (force[..., 0] - force[..., 2]) / HELD - 1) * 4)
+    firm = _firm(0.5 * (force[..., 0] - force[..., 2]), held, arrays.onehot)
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = jnp.asarray(arrays.phase[..., 3])
@@ -96,6 +98,14 @@ def residuals(
         jnp.concatenate([geometry / size, speeds / size, forces], -1),
         jnp.concatenate([factor, jnp.ones_like(speeds), 1 + either / jnp.square(noise[..., 6:])], -1),
     )
+
+
+def _firm(grip: jax.Array, held: jax.Array, moves: np.ndarray) -> jax.Array:
+    """How surely (T, N) a grip's pads hold the block rather than slide on it as they close or let go."""
+    mine = moves * held[..., None]
+    usual = jnp.einsum("tnm,tn->tm", mine, grip) / jnp.maximum(mine.sum(1), 1.0)
+    least = jnp.maximum(HELD, LOOSE * jnp.einsum("tnm,tm->tn", moves, usual))
+    return jax.nn.sigmoid((grip / least - 1) * 6)
 
 
 def _net(force: jax.Array) -> jax.Array:

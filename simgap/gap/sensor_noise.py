@@ -8,7 +8,8 @@ from hmmseg.features import noise_sd
 from hmmseg.rig import Rig
 from hmmseg.signals import Signals
 
-MISFIT = 0.03  # share of a force's change between samples that no model of 20 Hz samples can tell
+MISFIT = 0.03  # share of a force's change between samples that no model of 20 Hz samples can tell,
+STARTING = 0.1  # and of that with which a block comes off its support or onto it: how fast is not recorded
 FADED, FADING = 0.1, 0.5  # the same of what is recorded in free motion, so many seconds from a grip
 BENT = 0.025  # share of a speed's fourth difference by which the rule for differences of positions is off
 SEEN = 2.0  # sds of that difference below which it is noise
@@ -73,14 +74,18 @@ def _unresolved(speed: np.ndarray, noise: float) -> np.ndarray:
     return BENT * np.maximum(np.nan_to_num(bend) - usual, 0.0)
 
 
-def misfit(t: np.ndarray, force: np.ndarray, free: np.ndarray, boundaries: np.ndarray) -> np.ndarray:
+def misfit(
+    t: np.ndarray, force: np.ndarray, free: np.ndarray, starting: np.ndarray, boundaries: np.ndarray
+) -> np.ndarray:
     """What no model of coarse samples can tell (N, 4) of net fx, net fy, grip and shear [N].
 
-    A share of the largest change from sample to sample, two samples around; and just after a grip a
-    share of what is still recorded, for it tells of forces between samples.
+    A share of the largest change from sample to sample, two samples around, more of it where a carry is
+    `starting` or ending; and just after a grip a share of what is still recorded, for it tells of forces
+    between samples.
     """
     every = np.concatenate([force[:, :2] + force[:, 2:], (force[:, :2] - force[:, 2:]) / 2], 1)
     step = np.pad(np.abs(np.diff(every, axis=0)), ((2, 2), (0, 0)))
     change = np.max([step[k : k + len(force)] for k in range(4)], axis=0)
     after = free & (np.abs(t[:, None] - boundaries) < FADING).any(axis=1)
-    return np.maximum(MISFIT * change, FADED * np.abs(every) * after[:, None])
+    share = np.where(starting, STARTING, MISFIT)[:, None]
+    return np.maximum(share * change, FADED * np.abs(every) * after[:, None])

@@ -10,7 +10,7 @@ from hmmseg.segmentation import align_trials
 from hmmseg.signals import task_space
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import _inseparable
-from simgap.gap.experiments import ENOUGH, next_experiment
+from simgap.gap.experiments import ENOUGH, next_experiment, trusted
 from simgap.gap.fit import problem
 from simgap.gap.frame import build
 from simgap.gap.verdict import SHAPED, form_share
@@ -30,8 +30,10 @@ def given():
     return problem(build(TRIALS, aligned, RIG), load_bank().noise)
 
 
-def asked(given, cause, partners, actual=None):
-    return next_experiment(given, cause, partners, BLOCKS, load_bank(), 0, actual, 1.5)
+def asked(given, cause, partners, actual=None, behind=0.0):
+    return next_experiment(
+        given, cause, partners, [behind] * len(partners), BLOCKS, load_bank(), 0, actual, 1.5
+    )
 
 
 def test_a_balance_and_calipers_tell_a_gain_from_softer_pads(given):
@@ -67,3 +69,8 @@ def test_what_reshapes_signals_in_time_has_the_least_exact_forms():
     assert form_share(["force_lag"], ["force_lowpass"]) == SHAPED
     pads = form_share(["force_lag", "force_gain"], ["force_lag", *SOFTER])
     assert pads < form_share(["force_lag"], ["force_gain"]) < SHAPED
+
+
+def test_a_forecast_is_trusted_as_far_as_that_of_the_recordings_at_hand_came_true():
+    forecast, behind = np.array([1.0, 60.0, 60.0]), np.array([0.0, 3.0, 90.0])
+    assert trusted(forecast, behind) == pytest.approx([1.0, 0.1, 1.0])
