@@ -12,7 +12,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, YIELDING, World, gradient, tips
 from simgap.effects.filters import faded, lowpass
@@ -58,7 +57,7 @@ def residuals(
     unsure = SURE * arrays.sd[..., CHANNELS.index("distance")]
     touching = TOUCH * jax.nn.softplus(-(gap + late + unsure * world.free) / TOUCH)
     held = world.ground + world.carry
-    firm = _firm(0.5 * (force[..., 0] - force[..., 2]), held, arrays.onehot)
+    firm = _firm(0.5 * (force[..., 0] - force[..., 2]), held, jnp.asarray(arrays.onehot))
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = jnp.asarray(arrays.phase[..., 3])
@@ -100,7 +99,7 @@ def residuals(
     )
 
 
-def _firm(grip: jax.Array, held: jax.Array, moves: np.ndarray) -> jax.Array:
+def _firm(grip: jax.Array, held: jax.Array, moves: jax.Array) -> jax.Array:
     """How surely (T, N) a grip's pads hold the block rather than slide on it as they close or let go."""
     mine = moves * held[..., None]
     usual = jnp.einsum("tnm,tn->tm", mine, grip) / jnp.maximum(mine.sum(1), 1.0)

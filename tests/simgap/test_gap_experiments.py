@@ -45,7 +45,8 @@ def test_a_balance_and_calipers_tell_a_gain_from_softer_pads(given):
 
 
 def test_blocks_that_were_measured_need_not_be_measured_again(given):
-    found = asked(given, {"force_lowpass": {"time_constant": 0.03}}, [("force_lag",)], MEASURED)
+    cause, lag = {"force_lowpass": {"time_constant": 0.03}}, [("force_lag",)]
+    found = asked(given, cause, lag, MEASURED, behind=1e3)
     assert found is not None and found["operator"]
 
 
