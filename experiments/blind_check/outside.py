@@ -410,6 +410,50 @@ def _crumpled(v: Values) -> Stage:
     return stage
 
 
+def _knocked(v: Values) -> Stage:
+    """Somebody knocks against the bench now and then: both fingertips' masses swing, whatever they do."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        out = np.zeros_like(s.force)
+        for at in rng.uniform(0.05, 0.95, int(v["knocks"])) * s.t[-1]:
+            since, way = np.maximum(s.t - at, 0.0), rng.uniform(0, 2 * np.pi)
+            swing = np.exp(-since / v["decay"]) * np.sin(2 * np.pi * v["frequency"] * since)
+            out += rng.uniform(0.6, 1.4) * swing[:, None] * np.array([np.cos(way), np.sin(way)] * 2)
+        return v["amplitude"] * out
+
+    return _force(shift)
+
+
+def _grounded(v: Values) -> Stage:
+    """Metal blocks close a ground loop: while both fingers touch one, a current shifts the zeros."""
+
+    def shift(s: Signals, rng: Rng) -> np.ndarray:
+        pressed = np.maximum(np.minimum(s.motion.force[:, 0], -s.motion.force[:, 2]), 0.0)
+        current = pressed / (pressed + v["load"])  # contacts conduct the better the firmer they are
+        share = np.array([v["share1"], 1.0, v["share2"], v["share3"]])
+        return v["height"] * current[:, None] * share
+
+    return _force(shift)
+
+
+def _sagging(v: Values) -> Stage:
+    """A hand that turns about its clamp: every load lets it sag on; it is set up anew before each trial."""
+
+    def stage(s: Signals, rng: Rng) -> Signals:
+        load = np.cumsum(np.hypot(*(s.motion.force[:, :2] + s.motion.force[:, 2:]).T))
+        sag = v["angle"] * rng.uniform(0.8, 1.2) * load / load[-1]
+        turn, rate = np.exp(1j * sag)[:, None], np.gradient(sag, s.t)[:, None]
+        place, speed, force = (
+            a[:, 0::2] + 1j * a[:, 1::2] for a in (s.motion.position, s.motion.velocity, s.force)
+        )
+        clamp = v["x"] + 1j * v["y"]
+        seen = clamp + (place - clamp) * turn, (speed + 1j * rate * (place - clamp)) * turn, force * turn
+        place, speed, force = (np.stack([a.real, a.imag], 2).reshape(-1, 4) for a in seen)
+        return replace(s, motion=replace(s.motion, position=place, velocity=speed), force=force)
+
+    return stage
+
+
 def _made(name: str, draw, stage: int, build) -> Made:
     return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
 
@@ -489,5 +533,15 @@ OUTSIDE = {
               READOUT, _stuck),
         _made("crumpling_blocks", lambda r, s: {"give": 3e-4 * s, "bears": r.uniform(0.3, 1.0)},
               LINKS, _crumpled),
+        _made("knocked_bench", lambda r, s: {"amplitude": 0.6 * s, "knocks": float(r.integers(4, 8)),
+                                             "frequency": r.uniform(2.5, 6), "decay": r.uniform(0.12, 0.3)},
+              HAND, _knocked),
+        _made("ground_loop", lambda r, s: {"height": 0.35 * s * _sign(r), "load": r.uniform(0.05, 0.3),
+                                           "share1": r.uniform(-1, 1), "share2": r.uniform(-1, 1),
+                                           "share3": r.uniform(-1, 1)},
+              READOUT, _grounded),
+        _made("sagging_clamp", lambda r, s: {"angle": 0.02 * s, "x": r.uniform(-0.05, 0.03),
+                                             "y": r.uniform(0.2, 0.3)},
+              LINKS, _sagging),
     )
 }  # fmt: skip
