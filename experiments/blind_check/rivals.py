@@ -55,7 +55,7 @@ def _gains(found: Diagnosis, fits: Sequence[Fitted]) -> dict[str, float]:
     moves = np.array([s.move if s.move is not None else 0 for s in given.frame.steps])
 
     def left(f: Fitted) -> float:
-        return float(judge.heldout(f, judge.folds(f, n, moves), n).sum())
+        return float(judge.heldout(given, f, judge.folds(f, n, moves), n).sum())
 
     before = left(found.healthy)
     gains = {f.effects[0]: 0.5 * (before - left(f)) for f in fits}

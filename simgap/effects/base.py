@@ -153,6 +153,7 @@ class Effect:
     effects act between samples: their form holds to a per cent or so, the others' to far less. `form` is the
     share, `blur` the amount, by which parameters of real parts are off what our own simulator can show.
     `ties`: patterns (rows that span a space of amplitudes) that independent parts fall into by chance alone.
+    `resolved(values, rig)`: whether the sensors can show so small an effect.
     """
 
     name: str
@@ -173,6 +174,7 @@ class Effect:
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
     coarse: bool = False
     ties: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    resolved: Callable[[dict[str, float], Rig], bool] | None = None
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""

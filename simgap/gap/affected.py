@@ -55,6 +55,8 @@ def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
     jitter = np.zeros_like(change)
     if candidate.spread is not None and candidate.spread.effect == "clock_jitter":
         jitter = candidate.spread.value * np.asarray(gradient(frame.world.t, recorded))
+    sample = frame.arrays.sample
+    change, violated, jitter = change / sample, violated / sample, jitter / sample
     mean = np.zeros((frame.num_trials, len(frame.steps), change.shape[2]))
     for r in range(frame.num_trials):
         n = frame.lengths[r]
@@ -64,8 +66,7 @@ def shifts(given: Problem, candidate: Candidate) -> np.ndarray:
                 signal, number = change[r, mine].mean(0), np.maximum(there[r, mine].sum(0), 1)
                 equation = violated[r, mine].sum(0) / number
                 scatter = np.sqrt((jitter[r, mine] ** 2).sum(0)) / mine.size
-                shift = np.maximum(np.abs(signal), np.abs(equation))
-                mean[r, s] = np.hypot(shift, scatter) / frame.arrays.sample[r]
+                mean[r, s] = np.hypot(np.maximum(np.abs(signal), np.abs(equation)), scatter)
     return mean
 
 

@@ -11,7 +11,7 @@ from simgap.effects import decoys, fitted
 from simgap.gap import judge
 from simgap.gap.bank import Bank
 from simgap.gap.events import RECURS
-from simgap.gap.fit import Fitted, Problem, residual_at
+from simgap.gap.fit import Fitted, Problem, residual_at, slots
 from simgap.gap.locate import cells, largest, tamed
 from simgap.gap.spread import Spread
 
@@ -60,11 +60,22 @@ def scored(given: Problem, f: Fitted, healthy: Fitted, temperature: float) -> Ca
     n = given.frame.num_trials
     if n >= RECURS:
         labels = judge.folds(f, n, np.zeros(0))
-        kept = 0.5 * float((judge.heldout(healthy, labels, n) - judge.heldout(f, labels, n)).sum())
+        kept = judge.heldout_gain(given, f, healthy, labels)
         kept += believed(given, f) - believed(given, healthy)
         if kept < KEPT * evidence:
             evidence = min(evidence, max(kept, 0.0) / temperature)
+    if not all(_resolved(given, name, f) for name in f.effects):
+        evidence = min(evidence, 0.0)
     return Candidate(judge.joined(f.effects), evidence, f)
+
+
+def _resolved(given: Problem, name: str, f: Fitted) -> bool:
+    """Whether the rig's sensors can show an effect as small as it was fitted."""
+    effect, slot = fitted()[name], next(s for s in slots(given.num_properties)[0] if s.effect.name == name)
+    if effect.resolved is None:
+        return True
+    values = {p.name: float(p.value(f.u[slot.start + j])) for j, p in enumerate(effect.parameters)}
+    return effect.resolved(values, given.frame.rig)
 
 
 def believed(given: Problem, f: Fitted) -> float:

@@ -51,12 +51,10 @@ def describe(
         prefix = "" if len(candidate.effects) == 1 else f"{s.effect}."
         values = s.value * np.exp(s.log_sd * rng.standard_normal(DRAWS))
         parameters[prefix + p.name] = _parameter(values, p.unit, s.effect, calibration)
-    labels, n = folds_of(given, f), given.frame.num_trials
-    score = 0.5 * (judge.heldout(healthy, labels, n) - judge.heldout(f, labels, n)).sum()
     return {
         "parameters": parameters,
         "log_evidence": candidate.evidence,
-        "heldout_score": float(score),
+        "heldout_score": judge.heldout_gain(given, f, healthy, folds_of(given, f)),
         "property_shift": _shifts(given, healthy, f),
     }
 

@@ -25,15 +25,14 @@ from hmmseg.signals import task_space
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, slots
-from simgap.gap.frame import build
+from simgap.gap.frame import TRIALS, build
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import Values, performed, recorded
-from simgap.gap.verdict import TIE, form_share
+from simgap.gap.verdict import DELAYING, TIE, brief, form_share
 from simgap.operator import OperatorSettings
 from simgap.properties import Block, Blocks
 from simgap.writing import task_table
 
-TRIALS = 4  # simulated; as many as a frame is padded to
 LEAST = 1e-4  # an estimated property below this is not one
 ENOUGH = 4 * TIE  # nats (tempered): gains have a standard deviation of the square root of twice their mean
 
@@ -154,7 +153,9 @@ def _gains(
     asked = problem(build(trials, aligned, rig), bank.noise, actual)
     healthy = fit(asked, [Start((), neutral(asked))])[0]
     own = _cost(asked, healthy, truth, tuple(truth))
-    off = [form_share(truth, names) * (healthy.cost - own) for names in partners]
+    delays = [v for name in DELAYING & truth.keys() for v in truth[name].values()]
+    short = brief(delays, float(np.median(np.diff(asked.frame.world.t[0]))))
+    off = [form_share(truth, names, short) * (healthy.cost - own) for names in partners]
     gains = np.array([_cost(asked, healthy, truth, names) - own for names in partners])
     return (gains - np.maximum(off, 0.0)) / asked.frame.num_trials
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hmmseg.decompose import ABOVE_GROUND, FREE, Subtask, height_equations
 from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials
+from hmmseg.segmentation import AlignedTrials, TrialAlignment
 from hmmseg.signals import task_space
 from hmmseg.task import BlockTask
 from hmmseg.trial import Trial
@@ -18,9 +18,12 @@ from simgap.effects.base import FORCES, World
 from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
+BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
+BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
 PHASES = ("free", "pickup", "carry", "place", "slide")
 MAX_RATE = 30.0  # Hz; finer samples are averaged first
 TOUCHING = 5.0  # sds of a force by which a touch shows
+EITHER_SIDE = 0.02  # chance of a boundary to lie beyond a sample from which that sample is of neither side
 FIRST_TOUCH = 0.2  # s; one finger touches no earlier before the other, nor lets go later
 TRIALS = 4  # arrays are padded to multiples of it, so that few programs are compiled
 
@@ -31,7 +34,7 @@ class Arrays(NamedTuple):
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): its sensor noise
     in units of the channel; `kind` (T, N): 2 * phase, + 1 beside a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
-    `sample` (T, C): noise of one sample of a channel itself.
+    `sample` (T, N, C): noise of one sample of a channel itself.
     """
 
     there: np.ndarray
@@ -85,7 +88,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
     chosen = [(trial, a) for trial, a in zip(trials, aligned.trials, strict=True) if a.segmentation.complete]
     if not chosen:
         raise ValueError("no trial fits its task")
-    rows = [_row(trial, np.array([b.quantile(0.5) for b in a.boundaries]), steps, rig) for trial, a in chosen]
+    rows = [_row(trial, _boundaries(a), steps, rig) for trial, a in chosen]
     length = padded_length(max(r["t"].size for r in rows))
     count = -(-len(rows) // TRIALS) * TRIALS
     stack = {key: _stacked([r[key] for r in rows], length, count) for key in rows[0] if key != "events"}
@@ -114,7 +117,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         objects,
         rises,
         stack["phase"],
-        stack["sample"][:, 0],
+        stack["sample"],
     )
     lengths = tuple(r["t"].size for r in rows)
     return Frame(
@@ -139,9 +142,16 @@ def _stacked(rows: list[np.ndarray], length: int, count: int) -> np.ndarray:
     return np.stack(padded + [padded[-1]] * (count - len(rows)))
 
 
-def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: Rig) -> dict[str, np.ndarray]:
+def _boundaries(aligned: TrialAlignment) -> np.ndarray:
+    """Quantiles (3, B) [s] of every boundary: nearly the first, the median and nearly the last it may be."""
+    levels = (EITHER_SIDE, 0.5, 1 - EITHER_SIDE)
+    return np.array([[b.quantile(p) for b in aligned.boundaries] for p in levels])
+
+
+def _row(trial: Trial, quantiles: np.ndarray, steps: tuple[Subtask, ...], rig: Rig) -> dict[str, np.ndarray]:
     """One trial's signals, states and noise, arrays over its samples."""
     trial, group = thinned(trial)
+    first, boundaries, last = quantiles
     signals = task_space(trial, rig)
     t, step = trial.t, np.median(np.diff(trial.t))
     subtask = np.searchsorted(boundaries, t, side="right")
@@ -161,6 +171,10 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
     sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, edge & (phase == 2), boundaries))
     lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
     there[lone, CHANNELS.index("fx") :] = 0.0
+    carried = np.array([_phase(s) == 2 for s in steps])
+    lifts = carried[1:] != carried[:-1]  # a block leaves its support or meets one
+    either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
+    there[np.ix_(either, np.isin(CHANNELS, BORNE))] = 0.0
     if group > 1:  # a mean over a contact change is of neither contact
         there[np.abs(t[:, None] - boundaries).min(axis=1) <= step / 2] = 0.0
     return {
@@ -171,7 +185,7 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
         "events": boundaries,
         "there": there,
         "sd": sd,
-        "sample": np.tile(channel_noise(sample), (t.size, 1)),
+        "sample": channel_noise(sample),
         "kind": (2 * phase + edge).astype(float),
         "subtask": subtask.astype(float),
         "move": _moves(t, boundaries, steps, subtask).astype(float),
@@ -180,19 +194,24 @@ def _row(trial: Trial, boundaries: np.ndarray, steps: tuple[Subtask, ...], rig: 
 
 
 def _one_finger(
-    t: np.ndarray, force: np.ndarray, subtask: np.ndarray, free: np.ndarray, boundaries: np.ndarray, sd: float
+    t: np.ndarray,
+    force: np.ndarray,
+    subtask: np.ndarray,
+    free: np.ndarray,
+    boundaries: np.ndarray,
+    sd: np.ndarray,
 ) -> np.ndarray:
     """Samples (N,) of free motion beside a grip at which one finger touches already or still.
 
     Such a touch is a contact that the task does not list and no gap. One finger presses inwards, compared
-    with its own median in that free motion, and the other does not; `sd` is a force's noise [N].
+    with its own median in that free motion, and the other does not; `sd` (N,) is a force's noise [N].
     """
     out = np.zeros(t.size, bool)
     for s in np.unique(subtask[free]):
         mine = np.flatnonzero(subtask == s)
         change = force[mine] - np.median(force[mine], axis=0)
-        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > TOUCHING * sd
-        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < TOUCHING * sd
+        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > TOUCHING * sd[mine, None]
+        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < TOUCHING * sd[mine, None]
         near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
         out[mine] = near & ((inwards[:, 0] & quiet[:, 1]) | (inwards[:, 1] & quiet[:, 0]))
     return out

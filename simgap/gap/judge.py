@@ -97,10 +97,7 @@ def _log_integral(
     bend = found.hessian.sum((0, 1)) / temperature
     slope = found.gradient.sum((0, 1)) / temperature
     groups = _amplitudes(given, found)
-    low, high = (edge[found.columns] for edge in limits(given))
-    down = slope + u < 0
-    free = np.where(down, u < high - EDGE, u > low + EDGE)  # a coordinate at its limit stays there
-    inside = np.ix_(free, free)
+    bounds = _bounds(given, found)
     each = []
     for scales in itertools.product(SCALES, repeat=len(groups)):
         sure = np.eye(u.size)  # precision of the prior
@@ -108,11 +105,38 @@ def _log_integral(
             own = tied[1] if tied is not None and name == tied[0] else np.eye(group.size)
             sure[np.ix_(group, group)] = own * scale**-2.0
         total = bend + sure
-        pull = (slope + sure @ u)[free]
-        gain = 0.5 * (pull @ np.linalg.solve(total[inside], pull) - u @ sure @ u)
+        pull = slope + sure @ u
+        step = newton(total, pull, u, *bounds)
+        gain = -pull @ step - 0.5 * (step @ total @ step + u @ sure @ u)
         each.append(gain + 0.5 * (np.linalg.slogdet(sure)[1] - np.linalg.slogdet(total)[1]))
     fitted_part = (found.cost - 0.5 * u @ u) / temperature
     return float(logsumexp(each) - np.log(len(each)) - fitted_part)
+
+
+def _bounds(given: Problem, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    low, high = limits(given)
+    return low[found.columns], high[found.columns]
+
+
+def newton(
+    hessian: np.ndarray, slope: np.ndarray, u: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Step (K,) from `u` to the least of a quadratic form inside its bounds.
+
+    What a step would take past its bound stays there, and the others make up for it: beyond a bound nothing
+    can be gained, however steep the slope.
+    """
+    step = np.zeros_like(u)
+    held = np.where(slope < 0, u >= high - EDGE, u <= low + EDGE)
+    while True:
+        free = ~held
+        rest = slope + hessian @ np.where(held, step, 0.0)
+        step[free] = -np.linalg.solve(hessian[np.ix_(free, free)], rest[free])
+        past = free & ((u + step < low) | (u + step > high))
+        if not past.any():
+            return step
+        step[past] = (np.clip(u + step, low, high) - u)[past]
+        held |= past
 
 
 def _amplitudes(given: Problem, found: Fitted) -> dict[str, np.ndarray]:
@@ -134,19 +158,25 @@ def folds(found: Fitted, num_trials: int, moves: np.ndarray) -> np.ndarray:
     return np.broadcast_to(moves[None, :], shape)
 
 
-def heldout(found: Fitted, labels: np.ndarray, num_trials: int) -> np.ndarray:
+def heldout_gain(given: Problem, f: Fitted, healthy: Fitted, labels: np.ndarray) -> float:
+    """Nats that a fit gains over the healthy one on blocks that neither was fitted to, in sum."""
+    n = given.frame.num_trials
+    return 0.5 * float((heldout(given, healthy, labels, n) - heldout(given, f, labels, n)).sum())
+
+
+def heldout(given: Problem, found: Fitted, labels: np.ndarray, num_trials: int) -> np.ndarray:
     """Squared whitened residual (T, S) of every block, predicted by a fit to the others.
 
-    The fit is the linearised one about the optimum: exact for linear effects.
+    The fit is the linearised one about the optimum, inside its bounds: exact for linear effects.
     """
     real = np.arange(labels.shape[0]) < num_trials
     hessian, gradient = found.hessian[real], found.gradient[real]
     out = found.square.copy()
-    prior = found.u[found.columns]
+    prior, bounds = found.u[found.columns], _bounds(given, found)
     for label in np.unique(labels[real]):
         left = labels[real] == label
         h = hessian[~left].sum(0) + np.eye(prior.size)
-        step = -np.linalg.solve(h, gradient[~left].sum(0) + prior)
+        step = newton(h, gradient[~left].sum(0) + prior, prior, *bounds)
         rows = np.flatnonzero(real)[np.nonzero(left)[0]], np.nonzero(left)[1]
         out[rows] = (
             found.square[rows]

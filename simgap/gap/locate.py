@@ -15,7 +15,7 @@ from simgap.gap.frame import CHANNELS
 
 BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges, the last band ends at half the sampling rate
 ALARM = 0.01  # chance that a healthy recording is called otherwise
-EVIDENCE = 1.2  # times the scale of a healthy recording's largest evidence: see docs/gap.md
+EVIDENCE = 1.5  # times the scale of a healthy recording's largest evidence: see docs/gap.md
 # Of that chance; effects raise the evidence first.
 SHARES = {"cell": 0.15, "pooled": 0.1, "coherent": 0.15, "gain": 0.6}
 STATISTICS = tuple(SHARES)

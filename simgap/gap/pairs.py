@@ -97,6 +97,7 @@ def worthwhile(
 ) -> list[Candidate]:
     """The pairs that say enough more than the better one of their halves."""
     out = []
+    rests: dict[str, tuple[float, float]] = {}
     for pair in pairs:
         better = max((c for c in singles if c.name in pair.effects), key=lambda c: c.evidence)
         coarse = better.spread is None and any(catalogue()[name].coarse for name in better.effects)
@@ -107,7 +108,9 @@ def worthwhile(
         if believed(given, pair.fitted) - believed(given, better.fitted) > STRAINED:
             out.append(pair)
             continue
-        rest, p_rest = left(given, better, healthy, bank)
+        if better.name not in rests:
+            rests[better.name] = left(given, better, healthy, bank)
+        rest, p_rest = rests[better.name]
         after, p_after = left(given, pair, healthy, bank)
         solved = p_after > ALARM and after < SOLVED * rest
         if share < (COARSE if coarse and not solved else MORE):

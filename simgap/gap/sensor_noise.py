@@ -16,18 +16,19 @@ SEEN = 2.0  # sds of that difference below which it is noise
 NUDGE = 1e-4  # m; fingers that push unequally move a resting block by about as much
 
 
-def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, float]:
-    """Noise of one finger's x, y, vx, vy and force, of means over `group` samples.
+def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, np.ndarray]:
+    """Noise (N,) of one finger's x, y, vx, vy and force, of means over `group` samples.
 
-    Learned from the recording where the rig does not state it.
+    A jointed finger's changes with its pose. Learned from the recording where the rig does not state it.
     """
 
-    def known(stated: np.ndarray | float, values: np.ndarray, factor: float) -> float:
-        there = np.atleast_1d(stated)[np.isfinite(np.atleast_1d(stated))]
-        if there.size:
-            return float(np.median(there)) / np.sqrt(group)
+    def known(stated: np.ndarray | float, values: np.ndarray, factor: float) -> np.ndarray:
+        each = np.broadcast_to(stated, s.t.shape)
+        there = np.isfinite(each)
+        if there.any():
+            return np.where(there, each, np.median(each[there])) / np.sqrt(group)
         learned = noise_sd(values) * factor  # of what is averaged already
-        return max(learned if np.isfinite(learned) else 0.0, 1e-9)
+        return np.full(s.t.shape, max(learned if np.isfinite(learned) else 0.0, 1e-9))
 
     root2 = np.sqrt(2.0)
     return {
@@ -37,15 +38,15 @@ def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, float]:
     }  # fmt: skip
 
 
-def channel_noise(one: dict[str, float]) -> np.ndarray:
-    """Noise (C,) of one sample of x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
+def channel_noise(one: dict[str, np.ndarray]) -> np.ndarray:
+    """Noise (N, C) of one sample of x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
     root2 = np.sqrt(2.0)
     x, y, f = one["x"], one["y"], one["force"]
-    return np.array([x / root2, y / root2, root2 * x, root2 * y, one["vx"] / root2, one["vy"] / root2,
-                     root2 * f, root2 * f, f / root2, f / root2])  # fmt: skip
+    return np.stack([x / root2, y / root2, root2 * x, root2 * y, one["vx"] / root2, one["vy"] / root2,
+                     root2 * f, root2 * f, f / root2, f / root2], 1)  # fmt: skip
 
 
-def residual_noise(s: Signals, one: dict[str, float], rig: Rig, step: float) -> np.ndarray:
+def residual_noise(s: Signals, one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndarray:
     """Noise (N, C) of each channel's residual: positions with the pads' yielding taken out, velocities less
     differences of positions `step` s apart.
 
@@ -54,20 +55,21 @@ def residual_noise(s: Signals, one: dict[str, float], rig: Rig, step: float) -> 
     pad, root2 = rig.fingertip, np.sqrt(2.0)
     x, y, vx, vy, f = (one[k] for k in ("x", "y", "vx", "vy", "force"))
     gn, gs = f / pad.normal_stiffness, f / pad.shear_stiffness
-    row = [
+    columns = [
         np.hypot(np.hypot(x, gn) / root2, NUDGE), np.hypot(y, gs) / root2,
         root2 * np.hypot(x, gn), root2 * np.hypot(y, gs),
         np.hypot(0.5 * vx, 0.5 * x / step), np.hypot(0.5 * vy, 0.5 * y / step),
         root2 * f, root2 * f, f / root2, f / root2,
     ]  # fmt: skip
-    out = np.tile(row, (s.t.size, 1))
-    for channel, mean, noise in ((4, s.vx, vx), (5, s.vy, vy)):
-        out[:, channel] = np.hypot(out[:, channel], _unresolved(mean, noise / root2))
+    out = np.stack(columns, 1)
+    for channel, fingers, noise in ((4, (s.vx1, s.vx2), vx), (5, (s.vy1, s.vy2), vy)):
+        unresolved = sum(_unresolved(speed, noise) for speed in fingers) / 2
+        out[:, channel] = np.hypot(out[:, channel], unresolved)
     return out
 
 
-def _unresolved(speed: np.ndarray, noise: float) -> np.ndarray:
-    """How far (N,) a mean speed is off from differences of positions, told from its fourth difference."""
+def _unresolved(speed: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """How far (N,) a fingertip's speed is off from differences of positions, by its fourth difference."""
     bend = np.zeros_like(speed)
     bend[2:-2] = np.abs(np.convolve(speed, (1, -4, 6, -4, 1), "valid"))
     usual = SEEN * np.sqrt(70.0) * noise  # 70: the squares of these weights

@@ -26,7 +26,7 @@ def shrinkage(
     there = (given.whitening.weight > 0)[:n]
     member = given.whitening.member[:n]
     count = np.einsum("tns,tnc->ts", member, there.astype(float))
-    before, after = judge.heldout(healthy, labels, n), judge.heldout(f, labels, n)
+    before, after = judge.heldout(given, healthy, labels, n), judge.heldout(given, f, labels, n)
     if chosen.spread is not None:  # a spread explains the scatter it predicts, no more
         spared = residual_at(given, f.effects, f.u)[:n] ** 2 - remainder(given, chosen)[:n] ** 2
         after = after - np.einsum("tns,tnc->ts", member, spared)

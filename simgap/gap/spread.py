@@ -36,9 +36,10 @@ class Spread:
     scale: np.ndarray
 
 
-def clock(given: Problem, fitted: Fitted, samples: np.ndarray) -> Spread:
-    """Variance in proportion to the squared rate of change, on a grid of jitters [s]."""
-    z = tamed(given, residual_at(given, fitted.effects, fitted.u))
+def clock(given: Problem, z: np.ndarray, samples: np.ndarray) -> Spread:
+    """Variance of whitened residuals z (T, N, C) in proportion to the squared rate of change, on a grid of
+    jitters [s]."""
+    z = tamed(given, z)
     rate = _rates(given)
     there = (given.whitening.weight > 0) & (rate > 0)
     h2, z2 = rate[there] ** 2, z[there] ** 2
@@ -79,13 +80,13 @@ def _rates(given: Problem) -> np.ndarray:
     return out * given.whitening.weight * np.sqrt((1 + rho2) / (1 - rho2))
 
 
-def quantised(given: Problem, fitted: Fitted) -> Spread:
+def quantised(given: Problem, z: np.ndarray) -> Spread:
     """Whether forces repeat the same values: levels of a lattice through zero.
 
     Written to 1e-5 N, as files are, one sample in ten repeats another's value by chance; on a lattice
     most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
     were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each; and what
-    rounding adds to the noise explains what a fit leaves.
+    rounding adds to the noise explains of what a fit leaves, `z` (T, N, C).
     """
     frame = given.frame
     force = frame.world.force[: frame.num_trials]
@@ -110,11 +111,11 @@ def quantised(given: Problem, fitted: Fitted) -> Spread:
         c = CHANNELS.index(channel)
         scale[..., c] = np.sqrt(1 + share * step**2 / 12 * given.whitening.weight[..., c] ** 2)
     lattice = values.size * np.log(step / WRITTEN)
-    z2 = residual_at(given, fitted.effects, fitted.u) ** 2
-    noise = (0.5 * z2 * (1 - scale**-2) - np.log(scale)).sum()
+    noise = (0.5 * z**2 * (1 - scale**-2) - np.log(scale)).sum()
     return Spread("quantisation", float(lattice + noise), step, 1e-3, scale)
 
 
 def spreads(given: Problem, fitted: Fitted) -> list[Spread]:
     """Both spread effects, tried on top of a fit."""
-    return [clock(given, fitted, np.geomspace(5e-4, 0.03, 40)), quantised(given, fitted)]
+    z = residual_at(given, fitted.effects, fitted.u)
+    return [clock(given, z, np.geomspace(5e-4, 0.03, 40)), quantised(given, z)]

@@ -67,36 +67,42 @@ def choose(
     return ("set" if partners else "named"), sorted(best.effects), partners
 
 
-def form_share(one: Iterable[str], other: Iterable[str]) -> float:
-    """Share of their evidence by which two sets of effects must differ to be told apart: no form is exact."""
+def form_share(one: Iterable[str], other: Iterable[str], brief: bool = False) -> float:
+    """Share of their evidence by which two sets of effects must differ to be told apart: no form is exact.
+
+    `brief`: they delay forces by a part of a sample only.
+    """
     differ = set(one) ^ set(other)
     coarse = [fitted()[name].coarse for name in differ]
     if differ <= SHAPING:
-        return SHAPED
+        return SHORTLY if brief else SHAPED
     return BOTH if all(coarse) else FORM if any(coarse) else EXACT
+
+
+def brief(delays: Iterable[float], step: float) -> bool:
+    """Whether forces are late by a part of a sample only: then contacts within one are all that tells.
+
+    `delays` [s] of a cause, none where it has no such part; `step` [s] from sample to sample.
+    """
+    return max(delays, default=np.inf) < BRIEF * step
 
 
 def _tie(best: Candidate, other: Candidate, given: Problem) -> float:
     """Nats (tempered) by which a candidate must be behind the best to be told from it."""
-    share = form_share(best.effects, other.effects)
-    if share == SHAPED:
-        brief = _brief(best, given) and _brief(other, given)
-        return max(2 * TIE, (SHORTLY if brief else SHAPED) * best.evidence)
-    return max(TIE, share * best.evidence)
+    step = float(np.median(np.diff(given.frame.world.t[0])))
+    short = all(brief(_delays(k, given), step) for k in (best, other))
+    least = 2 * TIE if set(best.effects) ^ set(other.effects) <= SHAPING else TIE
+    return max(least, form_share(best.effects, other.effects, short) * best.evidence)
 
 
-def _brief(candidate: Candidate, given: Problem) -> bool:
-    """Whether forces are late by a part of a sample only: then contacts within one are all that tells."""
-    slowest = max(
-        (
-            float(p.value(candidate.fitted.u[slot.start + j]))
-            for slot in slots(given.num_properties)[0]
-            if slot.effect.name in DELAYING and slot.effect.name in candidate.effects
-            for j, p in enumerate(slot.effect.parameters)
-        ),
-        default=np.inf,
-    )
-    return slowest < BRIEF * float(np.median(np.diff(given.frame.world.t[0])))
+def _delays(candidate: Candidate, given: Problem) -> list[float]:
+    """By how much [s] a candidate's effects delay forces."""
+    return [
+        float(p.value(candidate.fitted.u[slot.start + j]))
+        for slot in slots(given.num_properties)[0]
+        if slot.effect.name in DELAYING and slot.effect.name in candidate.effects
+        for j, p in enumerate(slot.effect.parameters)
+    ]
 
 
 def _as_good(best: Candidate, other: Candidate, temperature: float) -> bool:

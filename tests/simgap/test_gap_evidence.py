@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
+from scipy.optimize import lsq_linear
 from scipy.special import logsumexp
 
 import commands
@@ -17,7 +18,7 @@ from hmmseg.trial import Trial, read_trial
 from simgap.effects import catalogue
 from simgap.gap.diagnose import diagnose
 from simgap.gap.fit import Fitted, Problem, limits, slots
-from simgap.gap.judge import SCALES, TIED, coincidence, log_evidence
+from simgap.gap.judge import SCALES, TIED, coincidence, heldout, log_evidence, newton
 
 NOTHING = object.__new__(Problem)  # a problem of no blocks: evidence reads no more of it
 object.__setattr__(NOTHING, "centre", np.zeros((0, 3)))
@@ -124,6 +125,37 @@ def test_what_a_limit_keeps_out_gains_nothing():
     assert found.u[delay] == 0.0
     nothing = -0.5 * 400.0 * 0.5**2
     assert log_evidence(NOTHING, found, _none()) <= nothing + 1e-6
+
+
+def test_what_lies_past_a_limit_gains_nothing():
+    # A search that stopped a step before the limit, where its slope still said that there was much to gain.
+    low = float(limits(NOTHING)[0][_columns("force_lowpass")][0])
+    found = _fitted("force_lowpass", np.array([[3e5]]), np.array([low - 0.01]), 0.0)
+    stopped = found.u.copy()
+    stopped[found.columns] = low + 1e-3
+    slope = np.full_like(found.gradient, 2500.0)
+    stuck = replace(found, u=stopped, gradient=slope, square=np.zeros((1, 1)), cost=0.5 * low**2)
+    assert log_evidence(NOTHING, stuck, _none()) < 2500.0 * 1e-3 + 1.0  # what the slope gains up to the limit
+    labels = np.zeros((1, 1), int)
+    assert heldout(NOTHING, stuck, labels, 1)[0, 0] >= 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_bounded_step_against_a_solver_of_bounded_least_squares(seed):
+    rng = np.random.default_rng(seed)
+    root, u = rng.normal(size=(8, 4)), rng.uniform(-0.5, 0.5, 4)
+    low, high = np.full(4, -1.0), np.full(4, 1.0)
+    wanted = root @ rng.normal(size=4) * 1.5
+    hessian, slope = root.T @ root, root.T @ (root @ u - wanted)
+    step = newton(hessian, slope, u, low, high)
+    assert (u + step >= low - 1e-12).all() and (u + step <= high + 1e-12).all()
+    best = lsq_linear(root, wanted, (low, high)).x - u
+
+    def gain(d):
+        return -slope @ d - 0.5 * d @ hessian @ d
+
+    free = -np.linalg.solve(hessian, slope)
+    assert 0.85 * gain(best) <= gain(step) <= gain(best) + 1e-9 <= gain(free) + 1e-8
 
 
 def _ringing(trial: Trial, events: np.ndarray) -> Trial:

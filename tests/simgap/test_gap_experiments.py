@@ -13,7 +13,7 @@ from simgap.gap.diagnose import _inseparable
 from simgap.gap.experiments import ENOUGH, next_experiment, trusted
 from simgap.gap.fit import problem
 from simgap.gap.frame import build
-from simgap.gap.verdict import SHAPED, form_share
+from simgap.gap.verdict import SHAPED, SHORTLY, brief, form_share
 
 BLOCKS = np.array([[0.5, 0.018, 0.016], [0.6, 0.026, 0.016]])  # weight [N], width and height [m]
 MEASURED = {
@@ -69,7 +69,13 @@ def test_an_experiment_names_only_what_it_tells_apart(given):
 def test_what_reshapes_signals_in_time_has_the_least_exact_forms():
     assert form_share(["force_lag"], ["force_lowpass"]) == SHAPED
     pads = form_share(["force_lag", "force_gain"], ["force_lag", *SOFTER])
+    assert form_share(["force_lag"], ["force_lowpass"], brief=True) == SHORTLY > SHAPED
     assert pads < form_share(["force_lag"], ["force_gain"]) < SHAPED
+
+
+def test_delays_are_brief_beside_a_sample():
+    assert brief([0.012], 0.05) and not brief([0.03], 0.05)
+    assert not brief([0.012, 0.03], 0.05) and not brief([], 0.05)  # what delays nothing is no brief delay
 
 
 def test_a_forecast_is_trusted_as_far_as_that_of_the_recordings_at_hand_came_true():

@@ -46,7 +46,7 @@ def fast():
 
 def test_fast_work_shows_no_irregular_clock(fast):
     given, healthy = fast
-    assert clock(given, healthy, np.geomspace(5e-4, 0.03, 40)).evidence < 0
+    assert clock(given, residual_at(given, (), healthy.u), np.geomspace(5e-4, 0.03, 40)).evidence < 0
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,12 @@ def test_five_samples_give_slopes_to_fourth_order():
 def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
     rng = np.random.default_rng(0)
     noise = 0.002 * rng.standard_normal(4000)
-    assert (_unresolved(noise, 0.002) > 0).mean() < 0.06
+    sd = np.asarray(0.002)
+    assert (_unresolved(noise, sd) > 0).mean() < 0.06
     speed = np.where(np.arange(40) < 20, 0.0, 0.2)
-    doubt = _unresolved(speed, 0.002)
+    doubt = _unresolved(speed, sd)
     assert doubt[19] > 0.01 and doubt[20] > 0.01 and not doubt[:17].any() and not doubt[23:].any()
-    assert (_unresolved(np.full(40, np.nan), 0.002) == 0).all()
+    assert (_unresolved(np.full(40, np.nan), sd) == 0).all()
 
 
 def test_what_rounding_hides_beside_a_drag_is_named():

@@ -69,7 +69,7 @@ def test_held_out_squares_agree_with_refitting(healthy):
     """Left out by trial: the quadratic forms against a fit that never saw the trial."""
     given, found = healthy
     labels = np.broadcast_to(np.arange(4)[:, None], found.square.shape)
-    out = heldout(found, labels, given.frame.num_trials)
+    out = heldout(given, found, labels, given.frame.num_trials)
     hessian, gradient = found.hessian[1].sum(0), found.gradient[1].sum(0)  # trial 1 alone tells trial 0
     step = np.linalg.solve(hessian + np.eye(len(gradient)), -(gradient + found.u[found.columns]))
     other = (
@@ -81,10 +81,11 @@ def test_held_out_squares_agree_with_refitting(healthy):
 
 def test_quantisation_is_seen_and_not_imagined(healthy):
     given, found = healthy
-    assert quantised(given, found).evidence < 0
+    assert quantised(given, residual_at(given, (), found.u)).evidence < 0
     coarse = given.frame.world._replace(force=0.04 * np.round(given.frame.world.force / 0.04))
     frame = type(given.frame)(**{**vars(given.frame), "world": coarse})
-    seen = quantised(type(given)(frame, given.whitening, given.centre, given.spread), found)
+    rounded = type(given)(frame, given.whitening, given.centre, given.spread)
+    seen = quantised(rounded, residual_at(rounded, (), found.u))
     assert seen.evidence > 100
     assert seen.value == pytest.approx(0.04, rel=1e-6)
 

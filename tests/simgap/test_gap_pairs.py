@@ -12,7 +12,7 @@ from estimation.actual import read_actual
 from hmmseg.trial import Trial
 from simgap.effects.base import FORCES
 from simgap.gap.affected import HAND, shifts
-from simgap.gap.diagnose import diagnose
+from simgap.gap.diagnose import Diagnosis, diagnose
 from simgap.gap.fit import slots
 from simgap.gap.frame import CHANNELS
 
@@ -60,6 +60,12 @@ def test_measured_blocks_bear_out_a_length_that_no_trial_shows():
     assert length["heldout_score"] < 0.3 * length["log_evidence"]
 
 
+def _noise(found: Diagnosis, subtask: int) -> np.ndarray:
+    """Noise (C,) of one sample in a subtask of the first trial, the harmonic mean of its samples'."""
+    arrays = found.problem.frame.arrays
+    return 1 / np.mean(1 / arrays.sample[0][arrays.subtask[0] == subtask], axis=0)
+
+
 def test_a_cable_displaces_the_hand_that_bears_it():
     found = diagnose(TRIALS, TASK, RIG, forced=["cable_force"])
     (cable,) = found.candidates
@@ -70,7 +76,7 @@ def test_a_cable_displaces_the_hand_that_bears_it():
     ]
     mean = shifts(found.problem, replace(cable, fitted=replace(cable.fitted, u=u)))
     mean = mean[0, 0]  # before any contact
-    noise = found.problem.frame.arrays.sample[0]
+    noise = _noise(found, 0)
     for path, force, pull in (("x", "fx", 0.1), ("y", "fy", 0.2)):
         p, f = CHANNELS.index(path), CHANNELS.index(force)
         assert mean[f] * noise[f] == pytest.approx(2 * pull)
@@ -89,7 +95,7 @@ def test_a_hand_grips_the_less_the_farther_pads_creep(effect):
         for j, p in enumerate(slot.effect.parameters)
     ]
     mean = shifts(found.problem, replace(pads, fitted=replace(pads.fitted, u=u)))
-    noise = found.problem.frame.arrays.sample[0]
+    noise = _noise(found, 1)
     grip, distance = (mean[0, 1, k] * noise[k] for k in map(CHANNELS.index, ("grip", "distance")))
     assert distance > 1e-4
     if effect == "fingertip_creep":

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import commands
+from hmmseg.boundaries import BoundaryPosterior
+from hmmseg.rig import read_rig
+from hmmseg.segmentation import AlignedTrials, align_trials
+from hmmseg.signals import task_space
+from hmmseg.task import read_task
+from hmmseg.trial import read_trial
+from simgap.effects import catalogue
+from simgap.gap.frame import CHANNELS, build
 from simgap.gap.residuals import HELD, LOOSE, _firm
-from simgap.gap.sensor_noise import MISFIT, STARTING, misfit
+from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
 
+DEMO = Path(commands.__file__).parent / "demo_data"
 MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)
 
 
@@ -42,3 +55,50 @@ def test_how_fast_a_block_comes_off_its_support_is_in_doubt():
     doubt = misfit(t, force, free, starting, np.array([t[6]]))
     assert doubt[6, 1] == pytest.approx(STARTING * 0.8)
     assert doubt[5, 1] == pytest.approx(MISFIT * 0.8) and doubt[0, 1] == 0
+
+
+def _lift(aligned: AlignedTrials, at: float, known_to: float) -> AlignedTrials:
+    """The first trial with its first lift at `at` [s], give or take `known_to`."""
+    first, *rest = aligned.trials
+    k = next(k for k, s in enumerate(aligned.subtasks) if s.name == "carry") - 1
+    lift = BoundaryPosterior(at + known_to * np.linspace(-1, 1, 9), np.full(9, 1 / 9))
+    boundaries = tuple(lift if j == k else b for j, b in enumerate(first.boundaries))
+    return replace(aligned, trials=(replace(first, boundaries=boundaries), *rest))
+
+
+def test_a_sample_that_may_be_on_either_side_of_a_lift_is_of_neither():
+    rig, task = read_rig(DEMO / "rig.toml"), read_task(DEMO / "task.toml")
+    trials = [read_trial(DEMO / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
+    aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    k = next(k for k, s in enumerate(aligned.subtasks) if s.name == "carry") - 1
+    t = trials[0].t
+    j = int(np.searchsorted(t, aligned.trials[0].boundaries[k].quantile(0.5)))
+    columns = [CHANNELS.index(c) for c in ("y", "fy")]
+
+    def told(at: float, known_to: float) -> np.ndarray:
+        there = build(trials, _lift(aligned, at, known_to), rig).arrays.there[0]
+        return there[j - 2 : j + 2, columns].sum(1)
+
+    step = t[j] - t[j - 1]
+    np.testing.assert_array_equal(told(t[j] - 0.5 * step, 0.1 * step), [1, 1, 1, 1])
+    np.testing.assert_array_equal(told(t[j] + 0.01 * step, 0.1 * step), [1, 1, 0, 1])
+    np.testing.assert_array_equal(told(t[j] - 0.5 * step, 0.6 * step), [1, 0, 0, 1])
+
+
+def test_noise_of_a_jointed_finger_changes_with_its_pose():
+    rig = read_rig(DEMO / "rig.toml")
+    trial = read_trial(DEMO / "trial_01.csv", rig)
+    s = task_space(trial, rig)
+    one = sample_noise(s, rig, 1)
+    np.testing.assert_allclose(one["y"], s.sd_y)
+    assert np.ptp(one["y"]) > 0.05 * one["y"].mean() and np.ptp(one["force"]) == 0
+    np.testing.assert_allclose(sample_noise(s, rig, 4)["y"], s.sd_y / 2)
+    np.testing.assert_allclose(channel_noise(one)[:, CHANNELS.index("distance")], np.sqrt(2) * s.sd_x)
+
+
+def test_a_dead_band_narrower_than_an_angles_noise_is_no_evidence():
+    rig = read_rig(DEMO / "rig.toml")
+    resolved = catalogue()["backlash"].resolved
+    assert resolved is not None and rig.noise.angle is not None
+    assert resolved({"width": 1.1 * rig.noise.angle}, rig)
+    assert not resolved({"width": 0.9 * rig.noise.angle}, rig)
