@@ -136,8 +136,12 @@ def test_what_lies_past_a_limit_gains_nothing():
     slope = np.full_like(found.gradient, 2500.0)
     stuck = replace(found, u=stopped, gradient=slope, square=np.zeros((1, 1)), cost=0.5 * low**2)
     assert log_evidence(NOTHING, stuck, _none()) < 2500.0 * 1e-3 + 1.0  # what the slope gains up to the limit
-    labels = np.zeros((1, 1), int)
-    assert heldout(NOTHING, stuck, labels, 1)[0, 0] >= 0.0
+
+    trials = {k: np.repeat(getattr(stuck, k), 2, axis=0) for k in ("hessian", "gradient")}
+    both = replace(stuck, **trials, square=np.full((2, 1), 20.0))
+    step = low - stopped[found.columns]  # each trial, told by the other alone, would go far past the limit
+    expected = 20.0 + 2 * 2500.0 * step + 3e5 * step**2
+    np.testing.assert_allclose(heldout(NOTHING, both, np.array([[0], [1]]), 2), np.full((2, 1), expected))
 
 
 @pytest.mark.parametrize("seed", range(6))
