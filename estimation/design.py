@@ -17,12 +17,12 @@ import numpy as np
 
 from estimation.nuisance import Nuisance, nuisances
 from estimation.observations import Aligned, Noise, channel_values, gravity_factor
-from hmmseg.decompose import height_equations
-from hmmseg.features import thin
-from hmmseg.rig import FORCE_CHANNELS, Rig
-from hmmseg.signals import Signals
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.contact.decompose import height_equations
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.features import thin
 
 PROPERTIES = ("weight", "width", "height")
 

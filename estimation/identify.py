@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.design import Design, build
-from estimation.friction import FrictionPosterior, friction_posteriors
+from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.mode import find_mode, start
 from estimation.observations import Aligned, Noise, aligned_weights
 from estimation.posterior import pack
 from estimation.predictive import PredictiveCheck, check
 from estimation.sampler import Draws, sample
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
-from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials, align_trials
-from hmmseg.signals import Signals, task_space
-from hmmseg.spans import Segmentation
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import AlignedTrials, align_trials
+from hmmseg.segment.spans import Segmentation
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 NOT_LEVEL = 2e-3  # m; more than a tilted table or a slip in the grip make of a move on a level

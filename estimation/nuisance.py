@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.rig import FORCE_CHANNELS, JOINTS, Rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
+from hmmseg.io.trial import Trial
 
 
 @dataclass(frozen=True)

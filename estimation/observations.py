@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.contact_emissions import TAIL
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
-from hmmseg.features import acceleration, thin
-from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials, TrialAlignment
-from hmmseg.signals import Signals
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import Rig
+from hmmseg.segment.align import AlignedTrials, TrialAlignment
+from hmmseg.segment.emissions import TAIL
+from hmmseg.segment.features import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
 MAX_RATE = 50.0  # Hz; noise of finer samples is averaged before it is weighed

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from estimation.identify import Identification
 from estimation.observations import gravity_factor
-from hmmseg.decompose import ABOVE_GROUND, FREE
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ import numpy as np
 from experiments.bank import simulated_cases
 from experiments.estimates import estimate, summarise_estimates
 from experiments.recordings import Case
-from hmmseg.rig import FORCE_CHANNELS, Fingertip
-from hmmseg.segmentation import TrialAlignment
-from hmmseg.signals import task_space
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import FORCE_CHANNELS, Fingertip
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import TrialAlignment
 
 RESULTS = Path(__file__).parent / "results"
 FIRST_SEED = 22_000
@@ -48,7 +48,10 @@ def no_inertia() -> Iterator[None]:
     def still(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         return np.zeros_like(velocity)
 
-    with patch("hmmseg.features.acceleration", still), patch("estimation.observations.acceleration", still):
+    with (
+        patch("hmmseg.segment.features.acceleration", still),
+        patch("estimation.observations.acceleration", still),
+    ):
         yield
 
 
@@ -60,7 +63,7 @@ def rigid(case: Case) -> Case:
 @contextmanager
 def gaussian() -> Iterator[None]:
     """Student-t residuals with so many degrees of freedom that they are Gaussian."""
-    modules = ("hmmseg.contact_emissions", "hmmseg.contact_fit", "estimation.observations")
+    modules = ("hmmseg.segment.emissions", "hmmseg.segment.fit", "estimation.observations")
     with patch(f"{modules[0]}.TAIL", 1e8), patch(f"{modules[1]}.TAIL", 1e8), patch(f"{modules[2]}.TAIL", 1e8):
         yield
 
@@ -72,7 +75,7 @@ def flat_durations() -> Iterator[None]:
     def equal(gammas: Sequence[np.ndarray]) -> np.ndarray:
         return np.full(gammas[0].shape[1], 1.0 / gammas[0].shape[1])
 
-    with patch("hmmseg.contact_fit._mean_share", equal):
+    with patch("hmmseg.segment.fit._mean_share", equal):
         yield
 
 
@@ -95,7 +98,7 @@ def unrefined() -> Iterator[None]:
     def unknown(*_: object) -> None:
         return None
 
-    with patch("hmmseg.crossings.Contacts.density", unknown):
+    with patch("hmmseg.segment.crossings.Contacts.density", unknown):
         yield
 
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from experiments.recordings import Case
-from hmmseg.rig import FORCE_CHANNELS, JOINTS, Rig, Systematic, read_rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import Trial
-from simgap.hand import inverse, joint_velocity
-from simgap.properties import random_properties
-from simgap.simulate import simulate_trials
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig, Systematic, read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import Trial
+from simgap.world.hand import inverse, joint_velocity
+from simgap.world.properties import random_properties
+from simgap.world.simulate import simulate_trials
 
 SCENE = Path(__file__).parent / "sweeps"
 SEED = 40_000  # cases are SEED, SEED + 1, ...; their trials 100 times that and on
@@ -27,7 +27,7 @@ SEED = 40_000  # cases are SEED, SEED + 1, ...; their trials 100 times that and 
 
 @dataclass(frozen=True)
 class Deviations:
-    """How the true hand differs from the nominal one, units as in `hmmseg.rig.Systematic`."""
+    """How the true hand differs from the nominal one, units as in `hmmseg.io.rig.Systematic`."""
 
     force_bias: np.ndarray
     force_gain: np.ndarray

@@ -18,7 +18,7 @@ from pathlib import Path
 from experiments.bank import SEED, simulated_cases
 from experiments.estimates import estimate, summarise_estimates
 from experiments.recordings import Case, list_cases, read_case
-from hmmseg.rig import Systematic
+from hmmseg.io.rig import Systematic
 
 RESULTS = Path(__file__).parent / "results"
 POOLED = 4

@@ -16,7 +16,7 @@ from estimation.posterior import pack
 from estimation.sampler import sample
 from experiments.recordings import Case
 from experiments.scoring import boundaries_covered, boundary_residuals
-from hmmseg.segmentation import align_trials
+from hmmseg.segment.align import align_trials
 
 KINDS = ("touch", "lift", "land", "release")  # the boundaries of each move, in order
 LEVELS = {"68": 0.68, "95": 0.95}

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
-from hmmseg.rig import read_rig
-from hmmseg.task import BlockTask, read_task
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, read_task
 from simgap.gap import bank as store
 from simgap.gap.adapt import rate_of
 from simgap.gap.calibrate import (

@@ -25,8 +25,8 @@ from scipy.optimize import minimize
 
 from experiments.gap_cases import draw_case, plan
 from hmmseg.errors import InputError
-from hmmseg.rig import read_rig
-from hmmseg.task import BlockTask, read_task
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, read_task
 from simgap.gap import bank as store
 from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import DEFAULT_MISFIT, Calibration

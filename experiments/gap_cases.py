@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.rig import Rig
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
 from simgap.effects import catalogue
 from simgap.effects.base import Performance, flat, with_force
 from simgap.gap.synthetic import draw, performed, recorded
-from simgap.properties import Blocks, random_properties
-from simgap.simulate import SimulatedTrial
+from simgap.world.properties import Blocks, random_properties
+from simgap.world.simulate import SimulatedTrial
 
 TRIALS = 4
 SIZES = (0.1, 1.3)  # log-uniform factors on the usual draw of an effect's parameters

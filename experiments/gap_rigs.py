@@ -23,14 +23,14 @@ import numpy as np
 
 from experiments.table_text import RESULTS
 from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
-from hmmseg.rig import Rig, read_rig
-from hmmseg.task import GROUND, BlockTask, Move, read_task
-from hmmseg.trial import Trial
+from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.task import GROUND, BlockTask, Move, read_task
+from hmmseg.io.trial import Trial
 from simgap.gap.adapt import adapted
 from simgap.gap.bank import Bank, load_bank
 from simgap.gap.calibrate import healthy_cases, learned
 from simgap.gap.search import search
-from simgap.operator import OperatorSettings
+from simgap.world.operator import OperatorSettings
 
 TRIALS = 4
 FIRST = 500  # no bank is learned on cases from this one on

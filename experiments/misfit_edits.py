@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hmmseg.trial import Trial
+from hmmseg.io.trial import Trial
 
 Edit = Callable[[Trial, Sequence[float]], tuple[Trial, int]]
 FORCES = ("fx1", "fy1", "fx2", "fy2")

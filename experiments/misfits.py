@@ -3,7 +3,7 @@
     python -m experiments.misfits RECORDINGS
 
 Each recording is edited in each way of experiments.misfit_edits and judged alone, and pooled with
-the unedited others of its case; unedited ones count false alarms. The constants of hmmseg.conformity
+the unedited others of its case; unedited ones count false alarms. The constants of hmmseg.segment.conformity
 were chosen with these recordings in view, so the same is done with simulated trials of several
 tasks that were not. Writes experiments/results/misfits.json.
 """
@@ -20,14 +20,14 @@ import numpy as np
 
 from experiments.misfit_edits import EDITS
 from experiments.recordings import Case, list_cases, read_case
-from hmmseg.conformity import MAX_RATE, Conformity, judge
-from hmmseg.contact_emissions import Features
-from hmmseg.features import features, thin
-from hmmseg.rig import Rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.task import BlockTask, Move
-from simgap.properties import random_properties
-from simgap.simulate import simulate_trials
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.segment.conformity import MAX_RATE, Conformity, judge
+from hmmseg.segment.emissions import Features
+from hmmseg.segment.features import features, thin
+from simgap.world.properties import random_properties
+from simgap.world.simulate import simulate_trials
 
 RESULTS = Path(__file__).parent / "results"
 POOLED = 4

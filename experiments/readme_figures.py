@@ -13,7 +13,7 @@ DOCS = Path(__file__).parents[1] / "docs" / "figures"
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "commands.main", "demo", "--figures", folder, "--quiet"]
+        command = [sys.executable, "-m", "hmmseg_cli.main", "demo", "--figures", folder, "--quiet"]
         subprocess.run(command, check=True)
         DOCS.mkdir(parents=True, exist_ok=True)
         for source, target in (("trial_01_segments", "demo_segments"), ("estimates", "demo_estimates")):

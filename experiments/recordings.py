@@ -8,10 +8,10 @@ from pathlib import Path
 
 from estimation.actual import read_actual
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig, read_rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import Trial, read_trial
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import Trial, read_trial
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from estimation.plugin import estimate_plugin
+from estimation.paper_formulas import estimate_plugin
 from experiments.recordings import Case, list_cases, read_case
 from experiments.scoring import (
     boundaries_covered,
@@ -27,9 +27,9 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
-from hmmseg.decompose import subtasks
-from hmmseg.qualitative import Rule, segment_qualitative
-from hmmseg.spans import Segmentation
+from hmmseg.contact.decompose import subtasks
+from hmmseg.segment.spans import Segmentation
+from hmmseg.segment.thresholds import Rule, segment_qualitative
 
 RESULTS = Path(__file__).parent / "results"
 Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]

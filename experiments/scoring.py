@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hmmseg.decompose import Subtask
-from hmmseg.spans import Segmentation
+from hmmseg.contact.decompose import Subtask
+from hmmseg.segment.spans import Segmentation
 
 PROPERTIES = ("weight", "width", "height")
 

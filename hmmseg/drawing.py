@@ -11,7 +11,7 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING
 
 WIDTH = 7.2  # in, a journal's double column
 DPI = 200

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.contact_emissions import Features
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
-from hmmseg.task import BlockTask, Move
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.segment.emissions import Features
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-FLOORS = ("commands", "experiments", "paper_figs", "simgap", "estimation", "hmmseg")
+FLOORS = ("hmmseg_cli", "experiments", "paper_figs", "simgap", "estimation", "hmmseg")
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -36,5 +36,5 @@ def test_imports_run_downwards(package):
 
 def test_an_upward_import_is_seen():
     assert upward("hmmseg", "def f():\n    from estimation.priors import x\n") == {"estimation"}
-    assert upward("hmmseg", "import simgap.hand as h, hmmseg.task") == {"simgap"}
+    assert upward("hmmseg", "import simgap.world.hand as h, hmmseg.io.task") == {"simgap"}
     assert upward("simgap", "from hmmseg import task\nimport estimation") == set()

@@ -23,13 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hmmseg.rig import Fingertip, Rig
-from hmmseg.task import GROUND, BlockTask, Move
-from simgap.haptics import PassivityControl, stiffest_passive
-from simgap.properties import PAPER_BLOCKS
-from simgap.scene import Surroundings
-from simgap.simulate import simulate_trial
-from simgap.virtual_model import VirtualModel
+from hmmseg.io.rig import Fingertip, Rig
+from hmmseg.io.task import GROUND, BlockTask, Move
+from simgap.world.haptics import PassivityControl, stiffest_passive
+from simgap.world.properties import PAPER_BLOCKS
+from simgap.world.scene import Surroundings
+from simgap.world.simulate import simulate_trial
+from simgap.world.virtual_model import VirtualModel
 
 TASK = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
 PADS = Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0)

@@ -31,7 +31,7 @@ def timed(recording: Path, trials: int, cache: Path) -> dict[str, float]:
     command = [
         sys.executable,
         "-m",
-        "commands.main",
+        "hmmseg_cli.main",
         "identify",
         *files,
         *described,

@@ -35,7 +35,7 @@ from estimation.sampler import (
 )
 from experiments.bank import SEED, simulated_cases
 from experiments.recordings import Case
-from hmmseg.segmentation import align_trials
+from hmmseg.segment.align import align_trials
 
 RESULTS = Path(__file__).parents[1] / "results"
 STEPS = 600

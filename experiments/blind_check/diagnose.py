@@ -17,9 +17,9 @@ from estimation.actual import Actual, read_actual
 from experiments.blind_check.rivals import rival_verdicts
 from experiments.blind_check.sealing import code_digest
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig, read_rig
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import Trial, read_trial
+from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import Trial, read_trial
 from simgap.gap.diagnose import diagnose
 
 Progress = Callable[[int, int, str], None]

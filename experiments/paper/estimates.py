@@ -11,11 +11,11 @@ import numpy as np
 
 from estimation.identify import Identification, identify, source_subtasks
 from estimation.observations import draw_boundaries
-from estimation.plugin import FrictionBound, estimate_plugin
+from estimation.paper_formulas import FrictionBound, estimate_plugin
 from estimation.priors import property_priors
 from experiments.paper.sources import BLOCKS, ONE, PRINTED, qualitative, recorded, save, simulated
 from experiments.recordings import Case
-from hmmseg.decompose import subtasks
+from hmmseg.contact.decompose import subtasks
 
 KEYS = ("weight", "height", "width")
 PROPERTIES = (("block1", "weight"), ("block2", "height"), ("block1", "width"), ("block1", "friction"))

@@ -12,7 +12,7 @@ from typing import Any
 
 from experiments.paper.sources import PRINTED, recorded, save
 from experiments.recordings import Case
-from hmmseg.rig import Rig
+from hmmseg.io.rig import Rig
 from simgap.gap.diagnose import Diagnosis, diagnose
 from simgap.gap.judge import joined
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.plugin import TRIM
+from estimation.paper_formulas import TRIM
 from experiments.paper.sources import BLOCKS, ONE, qualitative, recorded, save, true_blocks
-from hmmseg.decompose import subtasks
-from hmmseg.qualitative import label_states
-from simgap.replay import replay
+from hmmseg.contact.decompose import subtasks
+from hmmseg.segment.thresholds import label_states
+from simgap.world.replay import replay
 
 MOMENT = {"pregrasp": 0.6, "release": 0.25}  # share of a subtask at which it is shown, else half
 CHANNELS = ("x", "y", "distance", "offset", "fx", "fy", "grip", "shear", "y2")

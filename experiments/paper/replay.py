@@ -13,9 +13,9 @@ import numpy as np
 from estimation.identify import Identification
 from experiments.paper.estimates import identified
 from experiments.paper.sources import ONE, recorded, save
-from hmmseg.decompose import subtasks
-from simgap.properties import UNITS, Block, Blocks
-from simgap.replay import replay, residual_summary
+from hmmseg.contact.decompose import subtasks
+from simgap.world.properties import UNITS, Block, Blocks
+from simgap.world.replay import replay, residual_summary
 
 LIMIT = 1.5  # times the sensors' noise, in free motion and carry
 

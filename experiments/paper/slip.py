@@ -19,21 +19,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from estimation.identify import identify
-from estimation.plugin import estimate_plugin
+from estimation.paper_formulas import estimate_plugin
 from experiments.paper.rigid import by_formula
 from experiments.paper.sources import BLOCKS, PRINTED, recorded, save
 from experiments.recordings import Case
-from hmmseg.qualitative import segment_qualitative
-from hmmseg.rig import Rig
-from hmmseg.signals import task_space
-from hmmseg.task import GROUND, BlockTask, Move
-from simgap.operator import minimum_jerk
-from simgap.performance import CONTROL_PERIOD
-from simgap.properties import PAPER_BLOCKS
-from simgap.scene import physics, substeps_for
-from simgap.sensors import record
-from simgap.simulate import SimulatedTrial, simulate_trials
-from simgap.virtual_model import Rollout, rollout, standing
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import GROUND, BlockTask, Move
+from hmmseg.segment.thresholds import segment_qualitative
+from simgap.world.operator import minimum_jerk
+from simgap.world.performance import CONTROL_PERIOD
+from simgap.world.properties import PAPER_BLOCKS
+from simgap.world.scene import physics, substeps_for
+from simgap.world.sensors import record
+from simgap.world.simulate import SimulatedTrial, simulate_trials
+from simgap.world.virtual_model import Rollout, rollout, standing
 
 STACK = BlockTask({"block1": GROUND, "block2": GROUND}, (Move("block2", "block1"),))
 PLACES = {"block1": 0.15, "block2": 0.11}  # m

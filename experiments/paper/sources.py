@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from experiments.recordings import Case, read_case
-from hmmseg.qualitative import segment_qualitative
-from hmmseg.signals import task_space
-from hmmseg.spans import Segmentation
+from hmmseg.hand.signals import task_space
+from hmmseg.segment.spans import Segmentation
+from hmmseg.segment.thresholds import segment_qualitative
 from paper_figs.results import RESULTS
-from simgap.properties import PAPER_BLOCKS, UNITS, Block, Blocks
-from simgap.simulate import simulate_trials
+from simgap.world.properties import PAPER_BLOCKS, UNITS, Block, Blocks
+from simgap.world.simulate import simulate_trials
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 BLOCKS = ("block1", "block2")

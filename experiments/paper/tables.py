@@ -11,10 +11,10 @@ import numpy as np
 
 from experiments.paper.sources import recorded, save, simulated
 from experiments.recordings import Case
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, decompose, subtasks
-from hmmseg.notation import cell, equation
-from hmmseg.qualitative import FORCE_THRESHOLD, NUMBERS, VELOCITY_THRESHOLD, label_states, threshold
-from hmmseg.signals import Signals
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, decompose, subtasks
+from hmmseg.contact.notation import cell, equation
+from hmmseg.hand.signals import Signals
+from hmmseg.segment.thresholds import FORCE_THRESHOLD, NUMBERS, VELOCITY_THRESHOLD, label_states, threshold
 
 COLUMNS = ("weight", "width", "height", "friction")
 SENSED = {"vx": VELOCITY_THRESHOLD, "vy": VELOCITY_THRESHOLD, "fx": FORCE_THRESHOLD,

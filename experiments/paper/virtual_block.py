@@ -10,11 +10,11 @@ import numpy as np
 from experiments.paper.estimates import identified
 from experiments.paper.replay import calibrated
 from experiments.paper.sources import ONE, qualitative, recorded, save
-from hmmseg.qualitative import label_states, segment_qualitative
-from hmmseg.signals import Signals, task_space
-from hmmseg.spans import Segmentation
-from hmmseg.task import GROUND, BlockTask, Move
-from simgap.simulate import simulate_trial
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.task import GROUND, BlockTask, Move
+from hmmseg.segment.spans import Segmentation
+from hmmseg.segment.thresholds import label_states, segment_qualitative
+from simgap.world.simulate import simulate_trial
 
 TWICE = BlockTask({"block2": GROUND}, (Move("block2", GROUND), Move("block2", GROUND)))
 SEED = 0

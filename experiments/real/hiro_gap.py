@@ -19,8 +19,8 @@ from scipy.stats import t as student
 
 from experiments.real.hiro_snap import KINDS, WRENCH, read_kind
 from experiments.real.on_folder import run_on_folder
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
 from simgap.generic.diagnose import GenericDiagnosis, diagnose
 from simgap.generic.features import transformed
 from simgap.generic.report import channel_name

@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.fit import fit_sequence
-from hmmseg.sequence_segment import segment_sequence
-from hmmseg.spans import Segmentation
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.spans import Segmentation
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.segment import segment_sequence
 
 COLUMNS = {
     "R_Torques.dat": ("fx", "fy", "fz", "mx", "my", "mz"),

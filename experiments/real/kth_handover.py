@@ -17,9 +17,9 @@ import pandas as pd
 
 from experiments.real.on_folder import run_on_folder
 from hmmseg.errors import InputError
-from hmmseg.sequence_segment import segment_sequence
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.sequence.segment import segment_sequence
 
 RATE = 120.0  # Hz, nominal: the files have no time column
 WRENCHES = {"giver": "Wrench_giver_saved.csv", "taker": "Wrench_taker_saved.csv",

@@ -13,13 +13,13 @@ import jax
 import numpy as np
 
 from hmmseg import jaxconfig  # noqa: F401
-from hmmseg.contact_fit import otsu
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND
-from hmmseg.ergodic import log_evidence, viterbi
-from hmmseg.features import noise_sd, thin
-from hmmseg.padded import bucket
-from hmmseg.qualitative import NUMBERS, StateLabels
-from hmmseg.signals import Signals
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
+from hmmseg.hand.signals import Signals
+from hmmseg.hmm.dense import log_evidence, viterbi
+from hmmseg.hmm.padding import bucket
+from hmmseg.segment.features import noise_sd, thin
+from hmmseg.segment.fit import otsu
+from hmmseg.segment.thresholds import NUMBERS, StateLabels
 
 ITERATIONS = 40
 STATES = 3

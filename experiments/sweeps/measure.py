@@ -31,9 +31,14 @@ from experiments.sweeps.methods import (
     unsqueezed,
 )
 from experiments.sweeps.trials import Recorded, interpolated, record_cell, scene, stated_rig
-from hmmseg.alignment import InfeasibleAlignment
-from hmmseg.decompose import Subtask, subtasks
-from hmmseg.qualitative import (
+from hmmseg.contact.decompose import Subtask, subtasks
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hmm.banded import InfeasibleAlignment
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.segment.align import align_trials
+from hmmseg.segment.spans import Segmentation
+from hmmseg.segment.thresholds import (
     FORCE_THRESHOLD,
     VELOCITY_THRESHOLD,
     StateLabels,
@@ -41,11 +46,6 @@ from hmmseg.qualitative import (
     monotone_order,
     segment_qualitative,
 )
-from hmmseg.rig import Rig
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import Signals, task_space
-from hmmseg.spans import Segmentation
-from hmmseg.task import BlockTask
 
 Z95 = 1.959964
 

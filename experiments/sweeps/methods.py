@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.plugin import estimate_plugin
-from hmmseg.decompose import Subtask
-from hmmseg.qualitative import NUMBERS, StateLabels
-from hmmseg.rig import Rig
-from hmmseg.signals import Signals
-from hmmseg.spans import Failure, Segmentation, Span
-from hmmseg.task import BlockTask
-from simgap.properties import Block
+from estimation.paper_formulas import estimate_plugin
+from hmmseg.contact.decompose import Subtask
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.segment.spans import Failure, Segmentation, Span
+from hmmseg.segment.thresholds import NUMBERS, StateLabels
+from simgap.world.properties import Block
 
 PROPERTIES = ("weight", "width", "height")
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from experiments.sweeps.cells import Cell
-from hmmseg.rig import Noise, Rig, read_rig
-from hmmseg.task import BlockTask, read_task
-from hmmseg.trial import Trial
-from simgap.operator import OperatorSettings
-from simgap.properties import Block, random_properties
-from simgap.simulate import simulate_trials
+from hmmseg.io.rig import Noise, Rig, read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import Trial
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block, random_properties
+from simgap.world.simulate import simulate_trials
 
 HERE = Path(__file__).parent
 FORCES = ("fx1", "fy1", "fx2", "fy2")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hmmseg.rig import Rig
+from hmmseg.io.rig import Rig
 from simgap.effects.base import KINEMATICS, Effect, Parameter, World, gradient
 from simgap.effects.kinematics import moved_joints
 

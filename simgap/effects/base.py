@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from hmmseg.rig import Rig
+from hmmseg.io.rig import Rig
 
 Array = Any  # jax.Array under a trace, np.ndarray outside of one
 Values = dict[str, Array]  # parameter name -> scalar

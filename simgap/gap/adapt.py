@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmmseg.rig import Rig
-from hmmseg.task import GROUND, BlockTask
-from hmmseg.trial import Trial
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import GROUND, BlockTask
+from hmmseg.io.trial import Trial
 from simgap.gap.bank import BOOTSTRAP, Bank
 from simgap.gap.bootstrap import distribution, statistics
 from simgap.gap.fit import Fitted, Problem

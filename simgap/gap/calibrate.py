@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import align_trials
 from simgap.effects import catalogue
 from simgap.gap import judge
 from simgap.gap.adapt import fingerprint
@@ -26,8 +26,8 @@ from simgap.gap.locate import Detection, raised
 from simgap.gap.noise import NoiseModel, learn
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import performed, recorded
-from simgap.operator import OperatorSettings
-from simgap.properties import random_properties
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import random_properties
 
 HEALTHY, CATALOGUED = 24, 12  # cases, and those of them that the whole catalogue is fitted to
 BATCH = 4  # cases that are simulated at once

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from hmmseg.rig import Rig
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
 from simgap.effects import decoys
 from simgap.gap import judge
 from simgap.gap.adapt import adapted

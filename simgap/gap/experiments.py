@@ -20,8 +20,8 @@ import numpy as np
 
 from estimation.actual import Actual
 from hmmseg.errors import InputError
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
+from hmmseg.hand.signals import task_space
+from hmmseg.segment.align import align_trials
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, slots
@@ -29,9 +29,9 @@ from simgap.gap.frame import TRIALS, build
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import Values, performed, recorded
 from simgap.gap.verdict import DELAYING, TIE, brief, form_share
-from simgap.operator import OperatorSettings
-from simgap.properties import Block, Blocks
-from simgap.writing import task_table
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block, Blocks
+from simgap.world.writing import task_table
 
 LEAST = 1e-4  # an estimated property below this is not one
 ENOUGH = 4 * TIE  # nats (tempered): gains have a standard deviation of the square root of twice their mean

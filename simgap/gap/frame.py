@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmmseg.decompose import ABOVE_GROUND, FREE, Subtask, height_equations
-from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials, TrialAlignment
-from hmmseg.signals import task_space
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask, height_equations
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import AlignedTrials, TrialAlignment
 from simgap.effects.base import FORCES, World
 from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials, align_trials
-from hmmseg.signals import task_space
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import AlignedTrials, align_trials
 from simgap.effects import decoys
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.fft import dct
 from scipy.stats import gumbel_r
 
-from hmmseg.decompose import Subtask
+from hmmseg.contact.decompose import Subtask
 from simgap.gap.fit import Problem
 from simgap.gap.frame import CHANNELS
 

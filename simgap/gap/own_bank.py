@@ -11,10 +11,10 @@ from pathlib import Path
 
 import hmmseg
 from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import cache_folder
-from hmmseg.rig import Rig
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
 from simgap.gap.adapt import fingerprint, rate_of
 from simgap.gap.bank import CALIBRATED, FILE, Bank, load_bank, parse_bank
 from simgap.gap.calibrate import learned

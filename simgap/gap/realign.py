@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials, align_trials
-from hmmseg.signals import task_space
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import AlignedTrials, align_trials
 from simgap.effects.base import tips
 from simgap.gap.fit import Fitted, Problem, world_without
 from simgap.gap.frame import thinned

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig
-from hmmseg.segmentation import AlignedTrials, align_trials
-from hmmseg.signals import task_space
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import AlignedTrials, align_trials
 from simgap.effects import catalogue, decoys
 from simgap.gap import judge
 from simgap.gap.bank import Bank

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmmseg.rig import Rig
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
-from simgap.operator import OperatorSettings
-from simgap.properties import Block, Blocks
-from simgap.scene import Surroundings
-from simgap.sensors import record
-from simgap.simulate import SimulatedTrial, simulate_trials
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block, Blocks
+from simgap.world.scene import Surroundings
+from simgap.world.sensors import record
+from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 Values = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value
 

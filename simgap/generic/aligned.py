@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.fit import fit_sequence
-from hmmseg.sequence_model import SequenceModel
-from hmmseg.sequence_segment import segment_sequence
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.model import SequenceModel
+from hmmseg.sequence.segment import segment_sequence
 
 SPREAD = (0.05, 0.95)  # quantiles whose distance is a channel's scale
 

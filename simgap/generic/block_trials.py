@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
-from hmmseg.task import BlockTask
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import align_trials
 from simgap.generic.aligned import Cut, Ensembles
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")

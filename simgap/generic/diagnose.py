@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.rig import Rig
-from hmmseg.sequence_model import SequenceModel
-from hmmseg.task import BlockTask, SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask, SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.sequence.model import SequenceModel
 from simgap.gap.judge import Calibration, joined, probabilities
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles

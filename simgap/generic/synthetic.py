@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
 from simgap.generic.effects import smoothed
 
 TASK = SequenceTask(("approach", "press", "hold"))

@@ -10,8 +10,8 @@ from estimation.mode import find_mode
 from estimation.observations import aligned_weights
 from estimation.posterior import pack
 from experiments.bank import simulated_cases
-from hmmseg.rig import Fingertip, Rig, Systematic
-from hmmseg.segmentation import align_trials
+from hmmseg.io.rig import Fingertip, Rig, Systematic
+from hmmseg.segment.align import align_trials
 
 EVERY = Systematic(
     force_bias=(0.01,) * 4, force_gain=(0.02,) * 4, joint_offset=(0.001,) * 4,

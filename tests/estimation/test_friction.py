@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.friction import FrictionPosterior, friction_posteriors
+from estimation.friction.posterior import FrictionPosterior, friction_posteriors
+from estimation.friction.ratio_bound import largest_ratio
+from estimation.friction.slip import Stretch, slip_evidence
 from estimation.observations import Aligned, Weights, subtask_masks
-from estimation.ratio_bound import largest_ratio
-from estimation.slip import Stretch, slip_evidence
-from hmmseg.decompose import FREE, subtasks
-from hmmseg.rig import Fingertip, Rig, Systematic, read_rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.task import BlockTask, parse_task, read_task
-from hmmseg.trial import read_trial
+from hmmseg.contact.decompose import FREE, subtasks
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import Fingertip, Rig, Systematic, read_rig
+from hmmseg.io.task import BlockTask, parse_task, read_task
+from hmmseg.io.trial import read_trial
 
 SD = 0.012  # N
 RIG = Rig(fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))

@@ -13,11 +13,11 @@ from estimation.observations import (
     robust_weights,
     subtask_masks,
 )
-from hmmseg.boundaries import BoundaryPosterior
-from hmmseg.contact_emissions import TAIL
-from hmmseg.rig import Fingertip, Rig
-from hmmseg.segmentation import TrialAlignment
-from hmmseg.signals import Signals
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import Fingertip, Rig
+from hmmseg.segment.align import TrialAlignment
+from hmmseg.segment.boundaries import BoundaryPosterior
+from hmmseg.segment.emissions import TAIL
 
 
 def made_signals(t, **columns):

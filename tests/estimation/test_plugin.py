@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.plugin import Estimate, FrictionBound, estimate_plugin
-from hmmseg.decompose import ABOVE_GROUND, FREE, subtasks
-from hmmseg.qualitative import StateLabels, segment_qualitative
-from hmmseg.rig import read_rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.spans import Segmentation, Span
-from hmmseg.task import BlockTask, Move, read_task
-from hmmseg.trial import read_trial
+from estimation.paper_formulas import Estimate, FrictionBound, estimate_plugin
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, subtasks
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, Move, read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segment.spans import Segmentation, Span
+from hmmseg.segment.thresholds import StateLabels, segment_qualitative
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))

@@ -16,10 +16,10 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
-from hmmseg.decompose import subtasks
+from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
-from hmmseg.spans import Segmentation, Span
-from hmmseg.task import BlockTask, Move
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.segment.spans import Segmentation, Span
 
 STEPS = subtasks(BlockTask({"block": "ground"}, (Move("block", "ground"),)))
 TRUTH = (1.0, 2.0, 3.0, 4.0)

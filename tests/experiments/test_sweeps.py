@@ -26,8 +26,8 @@ from experiments.sweeps.runner import SweepFailed, run_sweep
 from experiments.sweeps.store import Store
 from experiments.sweeps.tables import BEGIN, END, between
 from experiments.sweeps.trials import interpolated, record_cell, recording_rig, ringing, scene, stated_rig
-from hmmseg.decompose import subtasks
-from hmmseg.signals import task_space
+from hmmseg.contact.decompose import subtasks
+from hmmseg.hand.signals import task_space
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,7 +10,7 @@ from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, markdown
 from experiments.write_tables import fill
-from hmmseg.signals import task_space
+from hmmseg.hand.signals import task_space
 
 
 def test_fill_replaces_what_stands_between_the_markers():

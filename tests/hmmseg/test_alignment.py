@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from hmmseg.alignment import InfeasibleAlignment, forward, forward_backward, sample_alignments, viterbi
-from hmmseg.padded import align, align_many, bucket, draw_alignments
+from hmmseg.hmm.banded import InfeasibleAlignment, forward, forward_backward, sample_alignments, viterbi
+from hmmseg.hmm.padding import align, align_many, bucket, draw_alignments
 
 SIZES = [(1, 1), (4, 1), (2, 2), (5, 2), (4, 4), (6, 3), (8, 4)]
 
@@ -158,7 +158,7 @@ def test_padding_changes_nothing(fill):
 
 
 def test_one_compilation_serves_recordings_of_many_lengths():
-    from hmmseg import alignment
+    from hmmseg.hmm import banded as alignment
 
     alignment._smooth.clear_cache()
     for n in (5, 100, 200, 256):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hmmseg.boundaries import (
+from hmmseg.segment.boundaries import (
     LAUNCH,
     MOTION,
     ONSET,

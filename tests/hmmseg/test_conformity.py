@@ -11,11 +11,11 @@ import pytest
 
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import list_cases, read_case
-from hmmseg.rig import read_rig
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
-from hmmseg.task import BlockTask, Move
-from hmmseg.trial import Trial, read_trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.io.trial import Trial, read_trial
+from hmmseg.segment.align import align_trials
 
 STACK = Path(__file__).parents[1] / "data" / "stack"
 RIG = read_rig(STACK / "rig.toml")

@@ -7,7 +7,9 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from hmmseg.contact_emissions import (
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.segment.emissions import (
     STRAY,
     TAIL,
     Features,
@@ -17,8 +19,6 @@ from hmmseg.contact_emissions import (
     log_likelihoods,
     log_student,
 )
-from hmmseg.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
-from hmmseg.task import BlockTask, Move
 
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
 SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))

@@ -7,10 +7,10 @@ import pytest
 from contact_scene import LEVELS, PLANTED, STEPS, planted
 from scipy import optimize, stats
 
-from hmmseg import contact_fit
-from hmmseg.alignment import InfeasibleAlignment
-from hmmseg.contact_emissions import TAIL
-from hmmseg.contact_fit import _location, _scale, _weighted_median, fit, initial_parameters, otsu, transitions
+from hmmseg.hmm.banded import InfeasibleAlignment
+from hmmseg.segment import fit as contact_fit
+from hmmseg.segment.emissions import TAIL
+from hmmseg.segment.fit import _location, _scale, _weighted_median, fit, initial_parameters, otsu, transitions
 
 
 def test_otsu_against_trying_every_split():

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hmmseg.constraints import contact_states
-from hmmseg.decompose import VARYING_LOAD, Decomposition, decompose, height_equations, subtasks
-from hmmseg.identifiability import Equation, Source, balance, determined
-from hmmseg.task import GROUND, BlockTask, Move, SequenceTask
+from hmmseg.contact.decompose import VARYING_LOAD, Decomposition, decompose, height_equations, subtasks
+from hmmseg.contact.identifiability import Equation, Source, balance, determined
+from hmmseg.contact.states import contact_states
+from hmmseg.io.task import GROUND, BlockTask, Move, SequenceTask
 
 PAPER = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
 TOWER = BlockTask(

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hmmseg.ergodic import log_evidence, viterbi
+from hmmseg.hmm.dense import log_evidence, viterbi
 
 
 def problem(num_timesteps, num_states, seed=0):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
-from hmmseg.fit import fit_sequence
-from hmmseg.sequence_model import load_model, save_model
-from hmmseg.sequence_segment import segment_sequence
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.model import load_model, save_model
+from hmmseg.sequence.segment import segment_sequence
 
 TASK = SequenceTask(("wait", "push", "turn", "pull"))
 LEVELS = {"wait": (0.0, 0.0), "push": (4.0, 0.5), "turn": (4.0, 3.0), "pull": (-2.0, 1.0)}

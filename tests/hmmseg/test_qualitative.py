@@ -10,9 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hmmseg.decompose import subtasks
+from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
-from hmmseg.qualitative import (
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, Move, SequenceTask, read_task
+from hmmseg.io.trial import Trial, read_trial
+from hmmseg.segment.thresholds import (
     NUMBERS,
     StateLabels,
     agreement,
@@ -22,10 +26,6 @@ from hmmseg.qualitative import (
     segment_qualitative,
     threshold,
 )
-from hmmseg.rig import read_rig
-from hmmseg.signals import Signals, task_space
-from hmmseg.task import BlockTask, Move, SequenceTask, read_task
-from hmmseg.trial import Trial, read_trial
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig, parse_rig, read_rig
+from hmmseg.io.rig import Rig, parse_rig, read_rig
 
 FINGER = {"base": [0.05, 0.17], "links": [0.12, 0.12]}
 HAND = {"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.21, 0.17]}}}

@@ -9,13 +9,13 @@ import pytest
 
 from experiments.bank import nominal, simulated_cases
 from experiments.recordings import read_case
-from hmmseg.rig import Fingertip, Noise, Rig
-from hmmseg.segmentation import align_trials, segment_trials
-from hmmseg.signals import task_space
-from hmmseg.task import BlockTask, Move
-from hmmseg.trial import Trial
-from simgap.properties import random_properties
-from simgap.simulate import simulate_trials
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Fingertip, Noise, Rig
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import align_trials, segment_trials
+from simgap.world.properties import random_properties
+from simgap.world.simulate import simulate_trials
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 NEAR = 0.05  # s

@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from hmmseg.changepoints import partition
-from hmmseg.sequence_detectors import learn
-from hmmseg.sequence_emissions import from_weights, independent_share
-from hmmseg.sequence_features import cell_means, feature_map, features
-from hmmseg.sequence_transitions import transitions
-from hmmseg.trial import Trial
+from hmmseg.io.trial import Trial
+from hmmseg.sequence.changepoints import partition
+from hmmseg.sequence.detectors import learn
+from hmmseg.sequence.emissions import from_weights, independent_share
+from hmmseg.sequence.features import cell_means, feature_map, features
+from hmmseg.sequence.transitions import transitions
 
 
 def test_cells_average_samples_and_stay_empty_where_there_are_none():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hmmseg.errors import InputError
-from hmmseg.task import BlockTask, Move, SequenceTask, parse_task, read_task
+from hmmseg.io.task import BlockTask, Move, SequenceTask, parse_task, read_task
 
 STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
 SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from simgap_scenes import FAR, at, evolve, scene, tips
 
-from simgap.dynamics import energy, interact
-from simgap.properties import Block
-from simgap.virtual_model import rollout
+from simgap.world.dynamics import energy, interact
+from simgap.world.properties import Block
+from simgap.world.virtual_model import rollout
 
 G = 9.80665
 

@@ -10,9 +10,9 @@ from scipy.stats import gumbel_r
 from simgap_scenes import HAND, STACK
 
 from hmmseg.errors import InputError
-from hmmseg.rig import Rig, read_rig
-from hmmseg.task import GROUND, BlockTask, Move, read_task
-from hmmseg.trial import read_trial
+from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.task import GROUND, BlockTask, Move, read_task
+from hmmseg.io.trial import read_trial
 from simgap.gap import own_bank
 from simgap.gap.adapt import adapted, fingerprint, moved
 from simgap.gap.bank import Bank, Reference, load_bank, parse_bank

@@ -9,11 +9,11 @@ import pytest
 
 from hmmseg import jaxconfig  # noqa: F401
 from hmmseg.errors import InputError
-from hmmseg.rig import Finger, Fingertip, Rig
+from hmmseg.io.rig import Finger, Fingertip, Rig
 from simgap.effects import catalogue, decoys, effect_named, fitted
 from simgap.effects.base import FORCES, Performance, World, flat, tips
 from simgap.gap.residuals import contact
-from simgap.hand import inverse
+from simgap.world.hand import inverse
 
 CONTRACT = {
     "force_bias",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
-from hmmseg.trial import Trial
+from hmmseg.io.trial import Trial
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import alien

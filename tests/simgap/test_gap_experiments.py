@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
+from hmmseg.hand.signals import task_space
+from hmmseg.segment.align import align_trials
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import _inseparable
 from simgap.gap.experiments import ENOUGH, next_experiment, trusted

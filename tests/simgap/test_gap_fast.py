@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from demo_recordings import RIG, TASK
 
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
+from hmmseg.hand.signals import task_space
+from hmmseg.segment.align import align_trials
 from simgap.gap.bank import load_bank
 from simgap.gap.candidate import Candidate
 from simgap.gap.diagnose import diagnose
@@ -21,8 +21,8 @@ from simgap.gap.sensor_noise import _unresolved
 from simgap.gap.spread import clock
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.verdict import SHORTLY, TIE, _tie
-from simgap.operator import OperatorSettings
-from simgap.properties import Block
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
 BLOCKS = {"block1": Block(0.5, 0.018, 0.016), "block2": Block(0.6, 0.026, 0.016)}

@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from hmmseg.rig import read_rig
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
-from hmmseg.task import read_task
-from hmmseg.trial import read_trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segment.align import align_trials
 from simgap.gap.bank import load_bank
 from simgap.gap.fit import Start, fit, neutral, problem, residual_at, slots
 from simgap.gap.frame import build

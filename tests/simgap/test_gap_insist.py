@@ -9,9 +9,9 @@ import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
 from hmmseg.errors import InputError
-from hmmseg.segmentation import align_trials
-from hmmseg.signals import task_space
-from hmmseg.trial import Trial
+from hmmseg.hand.signals import task_space
+from hmmseg.io.trial import Trial
+from hmmseg.segment.align import align_trials
 from simgap.gap.diagnose import diagnose
 
 

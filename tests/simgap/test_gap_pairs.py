@@ -9,7 +9,7 @@ import pytest
 from demo_recordings import FOLDER, RIG, TASK, TRIALS
 
 from estimation.actual import read_actual
-from hmmseg.trial import Trial
+from hmmseg.io.trial import Trial
 from simgap.effects.base import FORCES
 from simgap.gap.affected import HAND, shifts
 from simgap.gap.diagnose import Diagnosis, diagnose

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import commands
-from hmmseg.boundaries import BoundaryPosterior
-from hmmseg.rig import read_rig
-from hmmseg.segmentation import AlignedTrials, align_trials
-from hmmseg.signals import task_space
-from hmmseg.task import read_task
-from hmmseg.trial import read_trial
+import hmmseg_cli
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segment.align import AlignedTrials, align_trials
+from hmmseg.segment.boundaries import BoundaryPosterior
 from simgap.effects import catalogue
 from simgap.gap.bank import load_bank
 from simgap.gap.candidate import scored
@@ -24,7 +24,7 @@ from simgap.gap.frame import CHANNELS, build
 from simgap.gap.residuals import HELD, LOOSE, _firm
 from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
 
-DEMO = Path(commands.__file__).parent / "demo_data"
+DEMO = Path(hmmseg_cli.__file__).parent / "demo_data"
 MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)
 
 

@@ -10,7 +10,7 @@ from demo_recordings import RIG, TASK, TRIALS
 
 from experiments.gap_cases import draw_case
 from hmmseg.errors import InputError
-from hmmseg.trial import Trial
+from hmmseg.io.trial import Trial
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import diagnose
 from simgap.gap.judge import ALIKE, alien, log_evidence

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from commands.diagnose import spread_against
-from commands.main import main
+from hmmseg_cli.diagnose import spread_against
+from hmmseg_cli.main import main
 from simgap.generic.synthetic import ensemble
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
-from hmmseg.task import SequenceTask
-from hmmseg.trial import Trial
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
 from simgap.generic.aligned import align
 from simgap.generic.diagnose import detect, diagnose
 from simgap.generic.effects import CANDIDATES, predicted, ring_waves, scene, smoothed

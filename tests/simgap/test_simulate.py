@@ -5,16 +5,16 @@ import pytest
 from simgap_scenes import HAND as RIG
 from simgap_scenes import STACK
 
-from hmmseg.decompose import subtasks
+from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
-from hmmseg.rig import Finger, Noise, Rig, read_rig
-from hmmseg.signals import task_space
-from hmmseg.task import GROUND, BlockTask, Move, read_task
-from hmmseg.trial import read_trial
-from simgap.operator import OperatorSettings, minimum_jerk
-from simgap.properties import PAPER_BLOCKS, Block, random_properties, read_properties
-from simgap.simulate import simulate_trial, simulate_trials
-from simgap.writing import toml, write_trials
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Finger, Noise, Rig, read_rig
+from hmmseg.io.task import GROUND, BlockTask, Move, read_task
+from hmmseg.io.trial import read_trial
+from simgap.world.operator import OperatorSettings, minimum_jerk
+from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
+from simgap.world.simulate import simulate_trial, simulate_trials
+from simgap.world.writing import toml, write_trials
 
 TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND}, (Move("a", GROUND), Move("b", "a"), Move("c", "b")))
 SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Move("b", "a")))

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from simgap_scenes import HAND, STACK
 
-from hmmseg.decompose import subtasks
-from hmmseg.rig import read_rig
-from hmmseg.task import read_task
-from hmmseg.trial import read_trial
-from simgap.properties import PAPER_BLOCKS, read_properties
-from simgap.replay import replay, residual_summary
-from simgap.scene import RIGID_PAD, physics, substeps_for
-from simgap.simulate import simulate_trial
-from simgap.smoothing import smooth
-from simgap.virtual_model import VirtualModel, rollout, standing
+from hmmseg.contact.decompose import subtasks
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from simgap.world.properties import PAPER_BLOCKS, read_properties
+from simgap.world.replay import replay, residual_summary
+from simgap.world.scene import RIGID_PAD, physics, substeps_for
+from simgap.world.simulate import simulate_trial
+from simgap.world.smoothing import smooth
+from simgap.world.virtual_model import VirtualModel, rollout, standing
 
 STATES = [s.state for s in subtasks(STACK)]
 

@@ -1,0 +1,1 @@
+"""Friction coefficients: bounds, slip and supports."""

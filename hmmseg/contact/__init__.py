@@ -1,0 +1,1 @@
+"""Contact states of a task, and what each reveals."""

@@ -1,0 +1,298 @@
+"""Task decomposition: from objects and moves to subtasks and the properties each can reveal.
+
+The task is cut at each anticipated change of the active constraint set (constraints.py); the
+quasistatic balance of each contact state then says what that subtask, alone or with another of
+the same move, determines (identifiability.py). What no pair determines is sought in all moves
+together, as the heights in a tower of three are.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+
+from hmmseg.contact.identifiability import (
+    FRICTION,
+    FRICTION_ON,
+    HEIGHT,
+    PROPERTIES,
+    WEIGHT,
+    WIDTH,
+    X_FORCES,
+    Y_FORCES,
+    Equation,
+    Source,
+    Unknown,
+    balance,
+    determined,
+    is_property,
+)
+from hmmseg.contact.states import (
+    ABOVE_GROUND,
+    FREE,
+    ON_GROUND,
+    SLIDING,
+    ContactState,
+    contact_states,
+)
+from hmmseg.io.task import BlockTask, SequenceTask, Task
+
+VARYING_LOAD = "the vertical force must vary while the object slides"
+
+
+@dataclass(frozen=True)
+class Subtask:
+    """One step of a task: its name, contact state and manipulated object.
+
+    `move` is the 0-based index in `task.performed` of the move it belongs to (None in a plain
+    ordered task); a pregrasp belongs to the first move, a release to the move it ends. `support`
+    is what the held object touches besides the fingers, None while free or lifted; `constraints`
+    are the active contacts of the hand and the held object.
+    """
+
+    index: int
+    name: str
+    object: str | None
+    state: str
+    move: int | None
+    support: str | None = None
+    constraints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One way to learn a property: the signals of the subtasks that are needed together.
+
+    `bound`: it gives a lower bound only (a friction coefficient without slip). `given` are
+    properties, determined elsewhere, that it takes as known. `condition`, where not None, says
+    what the recording must show besides.
+    """
+
+    sources: tuple[Source, ...]
+    bound: bool = False
+    given: tuple[Unknown, ...] = ()
+    condition: str | None = None
+
+    @property
+    def subtasks(self) -> tuple[int, ...]:
+        """Indices of the subtasks needed, in order."""
+        return tuple(sorted({source.subtask for source in self.sources}))
+
+    def signals(self, subtask: int | None = None) -> tuple[str, ...]:
+        """Names of the signals needed, of one subtask or of all."""
+        wanted = (s.signal for s in self.sources if subtask in (None, s.subtask))
+        return tuple(sorted(set(wanted)))
+
+
+@dataclass(frozen=True)
+class Property:
+    """A property of an object: every way to learn it, or the reason why there is none.
+
+    Any one of `evidence` is enough by itself, the strongest first. `name` is weight, width, height,
+    friction (of the fingers on the object) or friction_on_SUPPORT.
+    """
+
+    object: str
+    name: str
+    evidence: tuple[Evidence, ...]
+    reason: str | None = None
+
+    @property
+    def kind(self) -> str | None:
+        """ "value", "bound" where only a lower bound can be had, None where nothing can."""
+        if not self.evidence:
+            return None
+        return "bound" if all(evidence.bound for evidence in self.evidence) else "value"
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """A task's subtasks in order, and for each object's properties what reveals them."""
+
+    task: Task
+    subtasks: tuple[Subtask, ...]
+    properties: dict[str, dict[str, Property]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def reveals(self, index: int) -> list[tuple[Property, Evidence]]:
+        """All that subtask `index` helps to reveal, by its first evidence for each property."""
+        found = []
+        for entry in (entry for entries in self.properties.values() for entry in entries.values()):
+            evidence = next((e for e in entry.evidence if index in e.subtasks), None)
+            if evidence is not None:
+                found.append((entry, evidence))
+        return sorted(found, key=lambda pair: _rank(pair[0].name))
+
+    def in_paper(self, index: int, entry: Property) -> bool:
+        """Whether the paper's Table 1 would list the property for this subtask.
+
+        It reads weight and width only while an object is held above the ground, and speaks of
+        friction with a support only in sliding contact (its Sections 2.1 and 3.2).
+        """
+        state = self.subtasks[index].state
+        if entry.name in (WEIGHT, WIDTH):
+            return state == ABOVE_GROUND
+        return state == SLIDING or not entry.name.startswith(FRICTION_ON)
+
+    def minimal(self, wanted: Collection[str] | None = None) -> tuple[Subtask, ...]:
+        """The minimal sequence: subtasks that reveal a wanted property name (None: any).
+
+        Free motions stay where a move reveals something, as they delimit it in time.
+        """
+        if not self.properties:
+            return self.subtasks
+        revealed = {s.index: [entry.name for entry, _ in self.reveals(s.index)] for s in self.subtasks}
+        useful = {
+            i for i, names in revealed.items() if names and (wanted is None or set(names) & set(wanted))
+        }
+        moves = {self.subtasks[index].move for index in useful}
+        delimiting = {s.index for s in self.subtasks if s.state == FREE and s.move in moves}
+        first = {0} if moves else set()  # delimits whichever move is the first to stay
+        return tuple(s for s in self.subtasks if s.index in useful | delimiting | first)
+
+
+def _rank(name: str) -> int:
+    order = (WEIGHT, WIDTH, HEIGHT, FRICTION)
+    return order.index(name) if name in order else len(order)
+
+
+def subtasks(task: Task) -> tuple[Subtask, ...]:
+    """The ordered subtasks of a task."""
+    if isinstance(task, SequenceTask):
+        return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
+    return _named(list(contact_states(task)))
+
+
+def _named(states: list[ContactState]) -> tuple[Subtask, ...]:
+    named, held = [], False
+    for index, state in enumerate(states):
+        names = {FREE: "release" if index else "pregrasp", ON_GROUND: "place" if held else "pickup",
+                 SLIDING: "slide", ABOVE_GROUND: "carry"}  # fmt: skip
+        support = None if state.support is None else state.support.surface
+        contacts = tuple(sorted(str(contact) for contact in state.contacts))
+        named.append(Subtask(index, names[state.name], state.object, state.name, state.move,
+                             support, contacts))  # fmt: skip
+        held = state.held
+    return tuple(named)
+
+
+def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
+    """For each performed move, how far its object's bottom rises, as a sum of object heights.
+
+    Entries are (0-based index of the move, {object: coefficient}): bottom height at place minus
+    bottom height at pickup; the paper's height of the block beneath (its Table 3) is the case of
+    a single coefficient. A slide rises by nothing: {}.
+    """
+    states = list(contact_states(task))
+    equations = []
+    for index in range(len(task.performed)):
+        start, _, end = (state for state in states if state.held and state.move == index)
+        rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}
+        equations.append((index, {name: value for name, value in rise.items() if value}))
+    return equations
+
+
+def decompose(task: Task) -> Decomposition:
+    """Subtasks of a task and what each object's properties can be learned from."""
+    if isinstance(task, SequenceTask):
+        note = "a plain ordered task has no block physics: no properties"
+        return Decomposition(task, subtasks(task), notes=(note,))
+    states = list(contact_states(task))
+    learned = _learn(states)
+    properties: dict[str, dict[str, Property]] = {}
+    for name in task.objects:
+        rubbed = [key for key, owner in learned if owner == name and key.startswith(FRICTION_ON)]
+        properties[name] = {}
+        for key in (*PROPERTIES, FRICTION, *sorted(set(rubbed))):
+            evidence = tuple(sorted(learned.get((key, name), ()), key=_strength))
+            reason = None if evidence else _reason(task, states, name, key)
+            properties[name][key] = Property(name, key, evidence, reason)
+    notes = ()
+    if task.repeat == "unknown":
+        notes = ("the moves repeat as often as the recording shows; one round is decomposed",)
+    return Decomposition(task, _named(states), properties, notes)
+
+
+def _strength(evidence: Evidence) -> tuple[bool, bool, tuple[int, ...]]:
+    return evidence.bound, evidence.condition is not None, evidence.subtasks
+
+
+def _learn(states: list[ContactState]) -> dict[Unknown, list[Evidence]]:
+    """Every way to learn each property, from the contact states in order."""
+    learned: dict[Unknown, list[Evidence]] = {}
+    moves: dict[object, list[list[int]]] = {}  # moves alike in all contacts determine alike
+    for _, group in itertools.groupby((i for i, s in enumerate(states) if s.held), lambda i: states[i].move):
+        indices = list(group)
+        moves.setdefault(tuple((states[i].contacts, states[i].beneath) for i in indices), []).append(indices)
+    for alike in moves.values():
+        _learn_within(states, alike, learned)
+    equations = [e for alike in moves.values() for i in alike[0] for e in balance(i, states[i])]
+    for unknown, row in determined(equations).items():
+        if unknown[0] in PROPERTIES:
+            learned.setdefault(unknown, [_evidence(row)])
+    for alike in moves.values():
+        for indices in alike:
+            for index in indices:
+                _learn_friction(index, states[index], learned)
+    return learned
+
+
+def _learn_within(states: list[ContactState], alike: list[list[int]],
+                  learned: dict[Unknown, list[Evidence]]) -> None:  # fmt: skip
+    """What one subtask of a move determines alone, and what only two of them do together."""
+    first, alone = alike[0], set()
+    for size in (1, 2):
+        for subset in itertools.combinations(first, size):
+            rows = determined(e for i in subset for e in balance(i, states[i]))
+            for unknown in filter(is_property, rows):
+                if size == 1:
+                    alone.add(unknown)
+                elif unknown in alone:
+                    continue
+                for indices in alike:
+                    moved = dict(zip(first, indices, strict=True))
+                    learned.setdefault(unknown, []).append(_evidence(rows[unknown], moved))
+
+
+def _learn_friction(index: int, state: ContactState, learned: dict[Unknown, list[Evidence]]) -> None:
+    """Coefficients of the contacts of one state: known where the contact's forces are known.
+
+    A fingertip's forces are measured; a support's follow from the balance once the weight is
+    given. Slip determines the coefficient, sticking bounds it from below.
+    """
+    forces = (Source(index, X_FORCES), Source(index, Y_FORCES))
+    learned.setdefault((FRICTION, state.object), []).append(Evidence(forces, bound=True))
+    if state.support is None:
+        return
+    friction = (FRICTION_ON + state.support.surface, state.object)
+    target = friction if state.support.slips else ("load", str(index), "0")
+    equations = balance(index, state)
+    known = {unknown for equation in equations for unknown in equation.unknowns
+             if any(way.condition is None for way in learned.get(unknown, ()))} - {friction}  # fmt: skip
+    if target in determined(equations, known):
+        given = tuple(u for u in known if target not in determined(equations, known - {u}))
+        learned.setdefault(friction, []).append(Evidence(forces, not state.support.slips, given))
+        return
+    for unknown, row in determined(balance(index, state, loads=3), known).items():
+        if is_property(unknown):
+            learned.setdefault(unknown, []).append(_evidence(row, condition=VARYING_LOAD))
+
+
+def _evidence(row: Equation, moved: dict[int, int] | None = None, condition: str | None = None) -> Evidence:
+    sources = {((moved or {}).get(source.subtask, source.subtask), source.signal) for source in row.sources}
+    return Evidence(tuple(Source(*source) for source in sorted(sources)), condition=condition)
+
+
+def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str) -> str:
+    """Why nothing reveals a property, in plain words."""
+    if key == HEIGHT:
+        rises = {str(i + 1): rise for i, rise in height_equations(task) if name in rise}
+        if not rises:
+            return f"no recorded move changes the height at which something rests by {name}'s height"
+        move, rise = next(iter(rises.items()))
+        others = ", ".join(sorted(set(rise) - {name}))
+        return f"move {move} changes heights by {name}'s only together with the height of {others}"
+    if not any(state.held and state.object == name for state in states):
+        return f"no recorded move grips {name}"
+    return f"no recorded move lifts {name} clear of its support"

@@ -1,0 +1,1 @@
+"""The hand: kinematics and task-space signals."""

@@ -1,0 +1,1 @@
+"""Hidden Markov models over plain log-likelihoods; usable without blocks."""

@@ -1,0 +1,1 @@
+"""Readers: task description, rig and trial files."""

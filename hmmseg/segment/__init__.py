@@ -1,0 +1,1 @@
+"""Segmentation of block tasks: contact emissions, boundaries, conformity."""

@@ -1,0 +1,314 @@
+"""Does a trial show its task? The task's order against contact states in any order.
+
+One hidden Markov model holds both: the chain of the task's subtasks, and the states of
+free_contacts, into which a path may leave the chain for good. P(leaving) is small (DEPARTURE), so
+that a trial counts as a misfit only where leaving gains more evidence than that (posterior odds
+above 1); the subtask that the path then does not reach is the one that fails. Ending before the
+last subtask, or starting outside of the first one, is leaving as well.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmmseg.contact.decompose import FREE, Subtask, height_equations, subtasks
+from hmmseg.hmm.padding import align
+from hmmseg.io.task import BlockTask
+from hmmseg.segment.emissions import Features
+from hmmseg.segment.free_contacts import (
+    IMPOSSIBLE,
+    Block,
+    FreeContacts,
+    fit_free_contacts,
+    log_evidence,
+    most_probable,
+    switching,
+)
+
+DEPARTURE = 1e-4  # prior probability that a trial leaves its task at any one boundary
+ENDING = 1e-3  # and that its recording stops before the task's end
+SETTLING, STAGES = 0.2, 3  # s, and most stages in which a contact state settles; to end before ...
+RINGING = 0.1  # share of samples that ring while a contact settles
+BRIEF = 1e-8  # ... is less likely by this: a bounce is no new grip, a halt in the air no place
+MAX_RATE = 50.0  # Hz
+MAX_ASSIGNMENTS = 24
+MAX_ROUNDS = 6  # of a task repeated an unknown number of times
+BETWEEN_TRIALS = 2.0  # slack of like blocks: poses, pads and cables shift widths and weights as well
+WRONG_RISE = 3e-3  # m against the task's direction; blocks are taller than that, slips shorter
+
+
+@dataclass(frozen=True)
+class Run:
+    """Samples [start, stop) of a path in one state: its contact state and the trial's own block.
+
+    `subtask` is the index in the task, None once the trial has left its task.
+    """
+
+    state: str
+    block: int | None
+    start: int
+    stop: int
+    subtask: int | None
+
+
+@dataclass(frozen=True)
+class Conformity:
+    """How far a trial follows its task.
+
+    `failing` is the index of the first subtask that it does not show, None where it shows all.
+    `log_odds`: log posterior odds of leaving the task against completing it (nats; the prior's are
+    about log(K DEPARTURE)); `log_evidence` is that of both together. `assignment` gives each object
+    its block in `free.blocks`, None for one that the trial does not show. `wrong_rise` [m]: how far
+    the object of the failing subtask went up between pickup and place, where that is what fails.
+    """
+
+    free: FreeContacts
+    assignment: dict[str, int | None]
+    runs: tuple[Run, ...]
+    failing: int | None
+    log_odds: float
+    log_evidence: float
+    wrong_rise: float | None = None
+
+    def block(self, name: str) -> Block | None:
+        """The trial's own block that stands for an object of the task."""
+        index = self.assignment.get(name)
+        return None if index is None else self.free.blocks[index]
+
+
+def judge(features: Sequence[Features], task: BlockTask) -> tuple[BlockTask, list[Conformity]]:
+    """Conformity of every trial of one task, and the task with its number of rounds settled.
+
+    `features` need no more than MAX_RATE: contact states last longer than its samples.
+
+    Each trial is judged by its own parameters; what most others have learned of the blocks then
+    tells whether it moved the same ones. An unknown number of rounds is the one that explains all
+    trials best.
+    """
+    free = [fit_free_contacts(f, any(move.slide for move in task.moves)) for f in features]
+    if task.repeat != "unknown":
+        return task, _judge(features, free, task)
+    rounds = max(f.num_grips for f in free) // len(task.moves) + 1
+    candidates = [replace(task, repeat=n) for n in range(1, min(rounds, MAX_ROUNDS) + 1)]
+    judged = [(each, _judge(features, free, each)) for each in candidates]
+    return max(judged, key=lambda pair: sum(c.log_evidence for c in pair[1]))
+
+
+def _judge(features: Sequence[Features], free: Sequence[FreeContacts], task: BlockTask) -> list[Conformity]:
+    steps = subtasks(task)
+    alone = [conformity(each, steps) for each in free]
+    found = []
+    for i, (f, c) in enumerate(zip(features, alone, strict=True)):
+        known = _consensus([other for j, other in enumerate(alone) if j != i and other.failing is None])
+        if known and (c.failing is not None or any(_differ(c.block(n), b) for n, b in known.items())):
+            c = conformity(c.free, steps, known)
+        found.append(_check_rises(f, c, steps, task))
+    return found
+
+
+def _consensus(others: Sequence[Conformity]) -> dict[str, Block]:
+    """Median width and weight per object where most of at least two other trials agree."""
+    out = {}
+    for name in others[0].assignment if len(others) > 1 else ():
+        blocks = [b for c in others if (b := c.block(name)) is not None]
+        if len(blocks) < 2:
+            continue
+        weights = [b.weight for b in blocks if np.isfinite(b.weight)]
+        median = Block(float(np.median([b.width for b in blocks])),
+                       float(np.median(weights)) if weights else np.nan)  # fmt: skip
+        if 2 * sum(not _differ(b, median) for b in blocks) > len(blocks):
+            out[name] = median
+    return out
+
+
+def _differ(own: Block | None, known: Block) -> bool:
+    return own is None or not own.like(known, BETWEEN_TRIALS)
+
+
+def _check_rises(f: Features, c: Conformity, steps: tuple[Subtask, ...], task: BlockTask) -> Conformity:
+    """The verdict, with blocks put down on the wrong side of where they were picked up.
+
+    One such move was put in another place; several are other blocks than the task's from the start.
+    """
+    wrong = []
+    for move, rise in height_equations(task):
+        held = [s.index for s in steps if s.move == move and s.state != FREE]
+        spans = {r.subtask: slice(r.start, r.stop) for r in c.runs if r.subtask in (held[0], held[-1])}
+        if len(spans) < 2 or not rise or len({np.sign(v) for v in rise.values()}) > 1:
+            continue
+        fy = f.force[:, 1] + f.force[:, 3] - c.free.parameters.bias[[1, 3]].sum()
+        height = f.y - np.nan_to_num(fy) * f.compliance
+        if not all(np.isfinite(height[span]).any() for span in spans.values()):
+            continue
+        risen = float(np.nanmedian(height[spans[held[-1]]]) - np.nanmedian(height[spans[held[0]]]))
+        if risen * np.sign(next(iter(rise.values()))) < -WRONG_RISE:
+            wrong.append((held[0], held[-1], risen))
+    if not wrong:
+        return c
+    failing = wrong[0][0] if len(wrong) > 1 else wrong[0][1]
+    return replace(c, failing=failing, wrong_rise=wrong[0][2])
+
+
+def conformity(
+    free: FreeContacts, steps: tuple[Subtask, ...], known: dict[str, Block] | None = None
+) -> Conformity:
+    """Compare the task's order with the alternative.
+
+    Which of the trial's blocks is which object is the assignment of highest evidence among all
+    distinct ones (the first with which the trial fits, if any), unless `known` blocks say it.
+    """
+    names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
+    candidates = _assignments(free, names)
+    if known:
+        fixed = _recognised(free, known)
+        candidates = [assignment | fixed for assignment in candidates]
+    found = []
+    for assignment in candidates:
+        found.append(_compare(free, steps, assignment))
+        if found[-1].failing is None:
+            return found[-1]
+    return max(found, key=lambda c: c.log_evidence)
+
+
+def _recognised(free: FreeContacts, known: dict[str, Block]) -> dict[str, int | None]:
+    """Nearest of the trial's blocks that may be the known one, None where there is none."""
+    out: dict[str, int | None] = {}
+    for name, block in known.items():
+        alike = [i for i, own in enumerate(free.blocks) if own.like(block, BETWEEN_TRIALS)]
+        out[name] = min(alike, key=lambda i: abs(free.blocks[i].width - block.width), default=None)
+    return out
+
+
+def _assignments(free: FreeContacts, names: list[str]) -> list[dict[str, int | None]]:
+    """Assignments of objects to the trial's blocks: distinct ones as long as there are enough."""
+    numbers = range(len(free.blocks))
+    if not numbers:
+        return [dict.fromkeys(names)]
+    if len(numbers) < len(names):  # some objects look alike, or are never touched
+        orders = itertools.product(numbers, repeat=len(names))
+        orders = (order for order in orders if len(set(order)) == len(numbers))
+    else:
+        orders = itertools.permutations(numbers, len(names))
+    return [dict(zip(names, order, strict=True)) for order in itertools.islice(orders, MAX_ASSIGNMENTS)]
+
+
+def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[str, int | None]) -> Conformity:
+    n, num_subtasks = len(free.table), len(steps)
+    columns = [_column(free, s, assignment) for s in steps]
+    chain = [np.full(n, IMPOSSIBLE) if c is None else free.table[:, c] for c in columns]
+    table = np.column_stack([*chain, free.table])
+    table[-1, : num_subtasks - 1] += np.log(ENDING)
+    num_states = table.shape[1]
+    stages = int(np.clip(round(SETTLING / free.interval / 2), 1, STAGES))
+    model = _settling(
+        *_departing(free.states, columns, n), stages, min(0.5, stages * free.interval / SETTLING)
+    )
+    last = np.arange(num_states) == num_subtasks - 1
+
+    settling = _settling_table(
+        table, np.r_[[-1 if c is None else c for c in columns], np.arange(len(free.states))], free.states
+    )
+
+    def ending(in_these: np.ndarray) -> np.ndarray:
+        every = np.hstack([np.tile(settling, stages), table])
+        every[-1, : stages * num_states] += np.log(ENDING)  # to end amid a change of contact is rare
+        every[-1, ~np.tile(in_these, stages + 1)] = -np.inf
+        return every
+
+    log_left, log_complete = (log_evidence(ending(ends), *model) for ends in (~last, last))
+    failing = None
+    if log_left > log_complete:
+        runs = _runs(most_probable(ending(~last), *model) % num_states, steps, free, columns)
+        failing = min(sum(r.subtask is not None for r in runs), num_subtasks - 1)
+    else:
+        leave = np.full(num_subtasks, _leaving(num_subtasks, n))
+        path = align(table[:, :num_subtasks], np.log1p(-leave), np.log(leave[:-1])).path
+        runs = _runs(path, steps, free, columns)
+    total = float(np.logaddexp(log_left, log_complete))
+    return Conformity(free, assignment, runs, failing, log_left - log_complete, total)
+
+
+def _leaving(num_subtasks: int, n: int) -> float:
+    """Probability per sample that a contact state ends: as many of them as the task has."""
+    return min(0.5, num_subtasks / n)
+
+
+def _settling(
+    log_initial: np.ndarray, log_transition: np.ndarray, stages: int, settle: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every state stages + 1 times: it is entered in the first and settled in the last.
+
+    A stage passes to the next with `settle` per sample, so that durations are Erlang rather than
+    geometric; before the last, leaving the state has BRIEF of its probability. A recording starts
+    settled. Log initial and transition probabilities over (stages, states).
+    """
+    same = np.eye(log_initial.size, dtype=bool)
+    stay, move = np.where(same, log_transition, -np.inf), np.where(same, -np.inf, log_transition)
+    blocks = [[np.full_like(stay, -np.inf)] * (stages + 1) for _ in range(stages + 1)]
+    for i in range(stages):
+        blocks[i][i], blocks[i][i + 1] = stay + np.log1p(-settle), stay + np.log(settle)
+        blocks[i][0] = np.logaddexp(blocks[i][0], move + np.log(BRIEF))
+    blocks[-1][-1], blocks[-1][0] = stay, move
+    return np.r_[np.full(stages * log_initial.size, -np.inf), log_initial], np.block(blocks)
+
+
+def _settling_table(
+    table: np.ndarray, columns: np.ndarray, states: tuple[tuple[str, int | None], ...]
+) -> np.ndarray:
+    """Log-likelihoods (num_timesteps, num_states) while a contact settles.
+
+    Fingers and block ring for a while after any contact change. What the forces of a ringing sample
+    do says which block is held, but not how: every hold of it scores as the likeliest of them.
+    """
+    out = table.copy()
+    blocks = np.array([-1 if block is None else block for _, block in states])
+    block = np.where(columns < 0, -1, blocks[columns])
+    for number in np.unique(block[block >= 0]):
+        same = block == number
+        ringing = np.log(RINGING) + table[:, same].max(axis=1, keepdims=True)
+        out[:, same] = np.logaddexp(np.log1p(-RINGING) + table[:, same], ringing)
+    return out
+
+
+def _column(free: FreeContacts, step: Subtask, assignment: dict[str, int | None]) -> int | None:
+    state = (step.state, None if step.state == FREE else assignment.get(str(step.object)))
+    return free.states.index(state) if state in free.states else None
+
+
+def _departing(
+    states: tuple[tuple[str, int | None], ...], columns: Sequence[int | None], n: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log initial and transition probabilities of the chain followed by the free states."""
+    k, num_states = len(columns), len(states)
+    leave = _leaving(k, n)
+    out = np.full((k + num_states, k + num_states), -np.inf)
+    out[k:, k:] = switching(states, leave)
+    index = np.arange(k)
+    out[index, index] = np.log1p(-leave)
+    out[index[:-1], index[1:]] = np.log(leave) + np.log1p(-DEPARTURE)
+    for i, column in enumerate(columns):
+        if column is not None:
+            follows = np.isfinite(out[k + column, k:])
+            follows[column] = False  # to go on in the same state is not to leave
+            out[i, k:][follows] = np.log(leave * DEPARTURE / max(follows.sum(), 1))
+    initial = np.full(k + num_states, np.log(DEPARTURE / num_states))
+    initial[: k + 1] = -np.inf  # whatever is free motion at the start is the task's own
+    initial[0] = np.log1p(-DEPARTURE)
+    return initial, out
+
+
+def _runs(path: np.ndarray, steps: Sequence[Subtask], free: FreeContacts,
+          columns: Sequence[int | None]) -> tuple[Run, ...]:  # fmt: skip
+    edges = np.flatnonzero(np.diff(path, prepend=-1, append=-1))
+    out = []
+    for start, stop in itertools.pairwise(edges):
+        k = int(path[start])
+        chained = k < len(steps)
+        column = columns[k] if chained else k - len(steps)
+        state, block = (steps[k].state, None) if column is None else free.states[column]
+        out.append(Run(state, block, int(start), int(stop), k if chained else None))
+    return tuple(out)

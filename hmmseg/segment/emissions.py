@@ -1,0 +1,168 @@
+"""Emissions of the contact states of a two-finger grip, from the physics of each state.
+
+Per sample the features are the four fingertip forces, the mean velocity (vx, vy), the height y
+and the distance d of the fingers. With g = (fx1 - fx2) / 2 the grip and fy the net vertical force:
+
+- free motion: every force is its sensor bias, but for the moments at which one finger alone
+  touches (the grip begins when the second touches and ends when the first lets go); motion is free.
+- hold on ground: grip is positive, the support carries the rest, so fy <= weight; the block
+  rests, so vx = vy = 0 and y - fy / (2 k_s) (pads' shear deflection taken out) stays at one level.
+- sliding on ground: the same with vx free.
+- hold above ground: grip is positive and fy = weight (1 + a_y / gravity); motion is free.
+- in every grip the fingers are the block's width apart, less what the pads give:
+  d = width - (fx1 - fx2) / k_n.
+
+Free quantities have broad densities over the range the recording shows, so that all states
+score the same features and log-likelihoods compare. Residuals are Student-t (transients).
+Derivation and sources: docs/model.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import gammaln, log_ndtr
+
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+
+TAIL = 4.0  # degrees of freedom of the Student-t residuals
+STRAY = 0.02  # share of resting samples that move for a moment (a grip settling, a bounce)
+TOUCHING = 1e-4  # share of gripped samples whose distance is not the block's (foam giving late)
+ONE_FINGER = 0.02  # prior share of free samples at which one finger alone touches
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the emissions score, arrays (num_timesteps,), NaN where missing.
+
+    `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N]; vx, vy, ay: mean velocity and vertical
+    acceleration of the fingers; y: mean height [m]; d: distance of the fingers [m];
+    `compliance`: 1 / (2 k_s), `squeeze`: 1 / k_n [m/N].
+    `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force [N]).
+    """
+
+    t: np.ndarray
+    force: np.ndarray
+    vx: np.ndarray
+    vy: np.ndarray
+    ay: np.ndarray
+    y: np.ndarray
+    d: np.ndarray
+    sd_y: np.ndarray
+    sd_d: np.ndarray
+    sd_vx: np.ndarray
+    sd_vy: np.ndarray
+    compliance: float
+    squeeze: float
+    gravity: float
+    span: dict[str, float]
+
+    @property
+    def grip(self) -> np.ndarray:
+        """Mean grip force (fx1 - fx2) / 2 [N]."""
+        return (self.force[:, 0] - self.force[:, 2]) / 2
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What the emissions learn from the recording.
+
+    `bias` (4,) [N]; `weight` [N] and `width` [m] per object (no width: not known yet). `scale`
+    holds the scales of the Student-t residuals: "force" in free motion, "carry" (net vertical force
+    while carried), "net_x" and "shear" while held [N], "velocity" [m/s] and "level" [m] while held
+    on the ground, "width" [m]. `levels` [m] per trial and subtask.
+    """
+
+    bias: np.ndarray
+    weight: dict[str, float]
+    scale: dict[str, float]
+    width: dict[str, float] = field(default_factory=dict)
+    levels: tuple[dict[int, float], ...] = ()
+
+
+def log_student(residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
+    """Log density of a Student-t residual; 0 where the residual is missing (NaN)."""
+    constant = gammaln((TAIL + 1) / 2) - gammaln(TAIL / 2) - 0.5 * np.log(TAIL * np.pi)
+    value = constant - np.log(scale) - (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL)
+    return np.where(np.isfinite(value), value, 0.0)
+
+
+def _log_between(value: np.ndarray, low: float, high: float, scale: float) -> np.ndarray:
+    """Log density of a uniform on [low, high] with noise-softened edges; 0 where missing."""
+    soft = log_ndtr((value - low) / scale) + log_ndtr((high - value) / scale)
+    # Bounded below: one wild sample is a transient, not proof against a state.
+    return np.where(np.isfinite(value), np.maximum(soft, -25.0) - np.log(high - low), 0.0)
+
+
+def _log_mostly(residual: np.ndarray, scale: np.ndarray, span: float, stray: float) -> np.ndarray:
+    """Log density of a residual that is small but for a share `stray` of samples; 0 where missing."""
+    close = np.log1p(-stray) + log_student(residual, scale)
+    either = np.logaddexp(close, np.log(stray) - np.log(span))
+    return np.where(np.isfinite(residual), either, 0.0)
+
+
+def _log_ungripped(force: np.ndarray, scale: float, span: float) -> np.ndarray:
+    """Log density of forces (num_timesteps, 4) without a grip: no contact, or one finger's."""
+    silent = log_student(force, scale)
+    fingers = silent[:, :2].sum(axis=1), silent[:, 2:].sum(axis=1)
+    touching = [
+        _log_between(sign * force[:, c], 0.0, span, scale) + _log_between(force[:, c + 1], -span, span, scale)
+        for sign, c in ((1.0, 0), (-1.0, 2))
+    ]
+    return np.logaddexp.reduce(
+        [
+            np.log1p(-ONE_FINGER) + fingers[0] + fingers[1],
+            np.log(ONE_FINGER / 2) + touching[0] + fingers[1],
+            np.log(ONE_FINGER / 2) + fingers[0] + touching[1],
+        ]
+    )
+
+
+def log_likelihoods(
+    features: Features,
+    subtasks: tuple[Subtask, ...],
+    parameters: Parameters,
+    trial: int,
+    stray: float = STRAY,
+) -> np.ndarray:
+    """Emission log-likelihoods (num_timesteps, num_subtasks) of one trial."""
+    return np.stack([_log_likelihood(features, s, parameters, trial, stray) for s in subtasks], axis=1)
+
+
+def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, stray: float) -> np.ndarray:
+    scale, span = p.scale, f.span
+    force = f.force - p.bias
+    broad_v = -np.log(span["vx"]) * np.isfinite(f.vx) - np.log(span["vy"]) * np.isfinite(f.vy)
+    broad_y = -np.log(span["y"]) * np.isfinite(f.y)
+    broad_d = -np.log(span["d"]) * np.isfinite(f.d)
+    if subtask.state == FREE:
+        return _log_ungripped(force, scale["force"], span["force"]) + broad_v + broad_y + broad_d
+    grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
+    fy, shear = force[:, 1] + force[:, 3], (force[:, 1] - force[:, 3]) / 2
+    out = _log_between(grip, 0.0, span["force"], scale["force"])
+    out += log_student(net_x, scale["net_x"]) + log_student(shear, scale["shear"])
+    width = p.width.get(str(subtask.object))
+    if width is None:  # the first pass knows neither widths nor where a block rests
+        out += broad_d
+    else:
+        unsqueezed = f.d + 2 * np.where(np.isfinite(grip), grip, 0.0) * f.squeeze
+        spread = np.hypot(f.sd_d, scale["width"])
+        out += _log_mostly(unsqueezed - width, spread, span["d"], TOUCHING)
+    weight = p.weight[str(subtask.object)]
+    if subtask.state == ABOVE_GROUND:
+        inertial = np.where(np.isfinite(f.ay), f.ay, 0.0) / f.gravity
+        return out + log_student(fy - weight * (1 + inertial), scale["carry"]) + broad_v + broad_y
+    if subtask.state not in (ON_GROUND, SLIDING):
+        raise ValueError(f"no emission for the contact state {subtask.state!r}")
+    out += _log_between(fy, -span["force"], weight, scale["carry"])
+    out += _log_mostly(f.vy, np.hypot(f.sd_vy, scale["velocity"]), span["vy"], stray)
+    if subtask.state == ON_GROUND:
+        out += _log_mostly(f.vx, np.hypot(f.sd_vx, scale["velocity"]), span["vx"], stray)
+    else:
+        out += -np.log(span["vx"]) * np.isfinite(f.vx)
+    level = p.levels[trial].get(subtask.index) if p.levels else None
+    if level is None:
+        return out + broad_y
+    resting = f.y - np.where(np.isfinite(fy), fy, 0.0) * f.compliance
+    return out + _log_mostly(resting - level, np.hypot(f.sd_y, scale["level"]), span["y"], stray)

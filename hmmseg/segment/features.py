@@ -1,0 +1,89 @@
+"""From task-space signals to the features that the emissions score."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import Rig
+from hmmseg.segment.emissions import Features
+
+MAX_RATE = 40.0  # Hz; faster recordings are read at this rate, fast enough for a hand
+WINDOW = 6e-3  # s over which such a reading is averaged; a contact changes no faster
+
+
+def noise_sd(values: np.ndarray) -> float:
+    """Robust standard deviation of white sample noise, from second differences.
+
+    The second difference of white noise of variance s^2 has variance 6 s^2; its median absolute
+    value is blind to the few samples at which the signal itself bends.
+    """
+    bend = np.diff(values[np.isfinite(values)], 2)
+    return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(6.0)) if bend.size else np.nan
+
+
+def thin(signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf) -> Signals:
+    """Signals read at a rate of at most `max_rate` [Hz], each reading a mean over up to `window` s.
+
+    White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing.
+    A short window keeps what changes within a reading apart.
+    """
+    rate = 1.0 / np.median(np.diff(signals.t))
+    group = int(np.ceil(rate / max_rate - 1e-6))
+    if group <= 1:
+        return signals
+    width = int(np.clip(min(window, 1.0) * rate, 1, group))
+    starts = np.arange(0, signals.t.size - width + 1, group)
+    index = starts[:, None] + np.arange(width)
+    thinned = {}
+    for name, values in vars(signals).items():
+        if not isinstance(values, np.ndarray):
+            thinned[name] = values
+            continue
+        block = values[index]
+        there = np.isfinite(block)
+        count = there.sum(axis=1)
+        mean = np.where(there, block, 0.0).sum(axis=1) / np.maximum(count, 1)
+        mean = np.where(count > 0, mean, np.nan)
+        thinned[name] = mean / np.sqrt(np.maximum(count, 1)) if name.startswith("sd_") else mean
+    thinned["sd_force"] = signals.sd_force / np.sqrt(width)
+    return Signals(**thinned)
+
+
+def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Mean acceleration over the neighbouring samples [m/s^2]; NaN where it cannot be had."""
+    out, there = np.full_like(velocity, np.nan), np.flatnonzero(np.isfinite(velocity))
+    if there.size > 2:
+        out[there] = np.gradient(velocity[there], t[there])
+    return out
+
+
+def features(signals: Signals, rig: Rig) -> Features:
+    """Features of one trial; noise the rig does not state is learned from the recording."""
+    s, root2 = signals, np.sqrt(2.0)
+
+    def stated(sd: np.ndarray, values: np.ndarray) -> np.ndarray:
+        known = np.isfinite(sd)  # not where a sample is missing, whose own does not matter
+        usual = np.median(sd[known]) / root2 if known.any() else max(noise_sd(values), 1e-9)
+        return np.where(known, sd / root2, usual)
+
+    force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1)
+    span = {
+        "vx": _range(s.vx, 1e-3),
+        "vy": _range(s.vy, 1e-3),
+        "y": _range(s.y, 1e-4),
+        "d": _range(s.distance, 1e-4),
+        "force": 1.5 * float(np.nanmax(np.abs(force))) + 1e-3,
+    }
+    return Features(
+        t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y,
+        d=s.distance, sd_y=stated(s.sd_y, s.y), sd_d=2 * stated(s.sd_x, s.distance / 2),
+        sd_vx=stated(s.sd_vx, s.vx), sd_vy=stated(s.sd_vy, s.vy),
+        compliance=0.5 / rig.fingertip.shear_stiffness, squeeze=1 / rig.fingertip.normal_stiffness,
+        gravity=rig.gravity, span=span,
+    )  # fmt: skip
+
+
+def _range(values: np.ndarray, least: float) -> float:
+    there = values[np.isfinite(values)]  # none at all where some joint is always missing
+    return max(float(np.ptp(there)), least) if there.size else least

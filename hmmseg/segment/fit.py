@@ -1,0 +1,232 @@
+"""Maximum likelihood of the contact emissions within the task's forced order, by EM.
+
+No threshold is the user's to choose: the start splits grip forces into two groups by Otsu's
+criterion, and EM (expectation over alignments, robust weighted updates) does the rest. Trials
+of one task are pooled: they share weights, biases and scales, not the resting levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+from hmmseg.hmm.padding import Alignment, align
+from hmmseg.segment.emissions import TAIL, Features, Parameters, log_likelihoods
+
+MAX_ITERATIONS = 40
+TOLERANCE = 1e-3  # nats of log evidence between iterations
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fitted emissions with the alignment posterior and log-likelihoods of every trial."""
+
+    parameters: Parameters
+    posteriors: tuple[Alignment, ...]
+    log_likelihoods: tuple[np.ndarray, ...]
+    log_stay: np.ndarray
+    log_advance: np.ndarray
+
+
+def otsu(values: np.ndarray) -> float:
+    """Threshold between two groups of largest between-group variance (Otsu 1979)."""
+    v = np.sort(values[np.isfinite(values)])
+    n = np.arange(1, v.size)
+    cumulative = np.cumsum(v)[:-1]
+    low, high = cumulative / n, (v.sum() - cumulative) / (v.size - n)
+    best = int(np.argmax(n * (v.size - n) * (high - low) ** 2))
+    return float((v[best] + v[best + 1]) / 2)
+
+
+def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ...]) -> Parameters:
+    """A rough start: biases from ungripped samples, one weight from samples gripped and moving."""
+    force = np.concatenate([f.force for f in features])
+    grip = np.concatenate([f.grip for f in features])
+    speed = np.concatenate([np.hypot(f.vx, f.vy) for f in features])
+    held = grip > otsu(grip)
+    free = force[~held]
+    bias = np.nan_to_num(np.nanmedian(free, axis=0))
+    noise = float(np.nanmedian(1.4826 * np.nanmedian(np.abs(free - bias), axis=0)))
+    fy = force[:, 1] + force[:, 3] - bias[1] - bias[3]
+    known = held & np.isfinite(speed)
+    moving = known & (speed > np.median(speed[known])) if known.any() else held
+    lifted = fy[moving & np.isfinite(fy)]
+    span = max(f.span["force"] for f in features)
+    weight = max(float(np.median(lifted)) if lifted.size else 0.0, 3 * noise, 0.01 * span)
+    names = {str(s.object) for s in subtasks if s.state != FREE}
+    scale = {
+        "force": max(noise, 1e-6), "carry": 0.3 * weight, "net_x": 0.1 * span, "shear": 0.1 * span,
+        "velocity": 0.01, "level": 1e-3, "width": 1e-3,
+    }  # fmt: skip
+    return Parameters(bias, dict.fromkeys(names, weight), scale)
+
+
+def transitions(num_timesteps: int, mean_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log probabilities to stay (K,) and to advance (K-1,) for given mean shares of the trial."""
+    advance = np.clip(1.0 / np.maximum(mean_share * num_timesteps, 1.5), 1e-6, 0.6)
+    return np.log1p(-advance), np.log(advance[:-1])
+
+
+def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Parameters | None = None) -> Fit:
+    """Fit emissions and durations to the given trials, pooled, within the forced order.
+
+    EM begins with `start`, or else with what `initial_parameters` makes of the trials.
+    Raises `hmmseg.hmm.banded.InfeasibleAlignment` where a trial is too short for its subtasks.
+    """
+    parameters = start or initial_parameters(features, subtasks)
+    share = np.full(len(subtasks), 1.0 / len(subtasks))
+    before = -np.inf
+    for iteration in range(MAX_ITERATIONS):
+        current = _expectation(features, subtasks, parameters, share)
+        evidence = sum(p.log_evidence for p in current.posteriors)
+        gammas = [np.exp(p.log_smoothed) for p in current.posteriors]
+        if iteration > 5 and abs(evidence - before) < TOLERANCE:
+            break
+        before = evidence
+        parameters = maximisation(features, subtasks, parameters, gammas)
+        share = _mean_share(gammas)
+    return current
+
+
+def _expectation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
+                 parameters: Parameters, share: np.ndarray) -> Fit:  # fmt: skip
+    tables, posteriors = [], []
+    for i, f in enumerate(features):
+        table = log_likelihoods(f, subtasks, parameters, i)
+        stay, advance = transitions(f.t.size, share)
+        tables.append(table)
+        posteriors.append(align(table, stay, advance))
+    return Fit(parameters, tuple(posteriors), tuple(tables), stay, advance)
+
+
+def _mean_share(gammas: Sequence[np.ndarray]) -> np.ndarray:
+    """Posterior mean share of each subtask under a weak Dirichlet prior of equal shares."""
+    counts = np.sum([g.sum(axis=0) / g.shape[0] for g in gammas], axis=0)
+    prior = 1.0 / counts.size
+    return (counts + prior) / (counts.sum() + 1.0)
+
+
+def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
+                 old: Parameters, gammas: Sequence[np.ndarray]) -> Parameters:  # fmt: skip
+    """Update every parameter by its expected weighted Student-t likelihood (ECM)."""
+    force = np.concatenate([f.force for f in features])
+    states = np.array([s.state for s in subtasks])
+    every = np.concatenate(gammas)
+    free = every[:, states == FREE].sum(axis=1)
+    above = every[:, states == ABOVE_GROUND].sum(axis=1)
+    ground = every[:, np.isin(states, (ON_GROUND, SLIDING))].sum(axis=1)
+    bias = np.array([_location(force[:, c], free, old.scale["force"], old.bias[c]) for c in range(4)])
+    unbiased = force - bias
+    fy, net_x = unbiased[:, 1] + unbiased[:, 3], unbiased[:, 0] + unbiased[:, 2]
+    shear = (unbiased[:, 1] - unbiased[:, 3]) / 2
+    factor = 1 + np.nan_to_num(np.concatenate([f.ay for f in features])) / features[0].gravity
+    weight, residual = dict(old.weight), np.full(fy.size, np.nan)
+    for name in weight:
+        columns = [i for i, s in enumerate(subtasks) if s.object == name and s.state == ABOVE_GROUND]
+        gamma = every[:, columns].sum(axis=1)
+        if gamma.sum() > 1:
+            found = _location(fy / factor, gamma, old.scale["carry"], old.weight[name])
+            weight[name] = max(found, 1e-3)
+            residual = np.where(gamma > 0.5, fy - weight[name] * factor, residual)
+    noise = old.scale["force"]
+    scale = {
+        "force": _scale(unbiased.ravel(), np.repeat(free, 4), noise, 1e-6),
+        "carry": _scale(residual, above, old.scale["carry"], noise),
+        "net_x": _scale(net_x, above + ground, old.scale["net_x"], noise),
+        "shear": _scale(shear, above + ground, old.scale["shear"], noise),
+    }
+    rest = _rest(features, subtasks, old, bias, gammas)
+    width, width_scale = _widths(features, subtasks, old, unbiased, every)
+    scale |= {"velocity": rest[0], "level": rest[1], "width": width_scale}
+    return Parameters(bias, weight, scale, width, rest[2])
+
+
+def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Parameters,
+            unbiased: np.ndarray, every: np.ndarray) -> tuple[dict[str, float], float]:  # fmt: skip
+    """Distance of the fingers per held object, pads' squeeze taken out, and its scale."""
+    squeeze = np.nan_to_num(unbiased[:, 0] - unbiased[:, 2]) * features[0].squeeze
+    unsqueezed = np.concatenate([f.d for f in features]) + squeeze
+    spread = float(np.hypot(np.median(features[0].sd_d), old.scale["width"]))
+    width, residuals, weights = {}, [], []
+    for name in old.weight:
+        held = [i for i, s in enumerate(subtasks) if s.object == name and s.state != FREE]
+        gamma = every[:, held].sum(axis=1)
+        if not (np.isfinite(unsqueezed) & (gamma > 0)).any():
+            continue  # never held where the distance is known
+        start = old.width.get(name, None)
+        if start is None:
+            start = _weighted_median(unsqueezed, gamma)
+        width[name] = _location(unsqueezed, gamma, spread, start)
+        residuals.append(unsqueezed - width[name])
+        weights.append(gamma)
+    least = 0.3 * float(np.median(features[0].sd_d))
+    if not width:
+        return width, old.scale["width"]
+    residual, weight = np.concatenate(residuals), np.concatenate(weights)
+    return width, _scale(residual, weight, max(old.scale["width"], least), least)
+
+
+def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Parameters,
+          bias: np.ndarray, gammas: Sequence[np.ndarray]):  # fmt: skip
+    """Velocity scale, level scale and resting levels of the holds on the ground."""
+    velocity, level, weights, levels = [], [], [], []
+    columns = [s.index for s in subtasks if s.state in (ON_GROUND, SLIDING)]
+    for i, (f, gamma) in enumerate(zip(features, gammas, strict=True)):
+        fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
+        resting = f.y - np.nan_to_num(fy) * f.compliance
+        found = {}
+        for k in columns:
+            spread = np.hypot(np.median(f.sd_y), old.scale["level"])
+            if not (np.isfinite(resting) & (gamma[:, k] > 0)).any():
+                continue  # nothing tells where the block rests
+            start = old.levels[i].get(k) if old.levels else None
+            start = _weighted_median(resting, gamma[:, k]) if start is None else start
+            found[k] = _location(resting, gamma[:, k], spread, start)
+            velocity.append(f.vy)
+            level.append(resting - found[k])
+            weights.append(gamma[:, k])
+        levels.append(found)
+    if not weights:  # nothing rests on the ground where its height is known
+        return old.scale["velocity"], old.scale["level"], tuple(levels)
+    gamma = np.concatenate(weights)
+    least_v = 0.3 * float(np.median(np.concatenate([f.sd_vy for f in features])))
+    least_y = 0.3 * float(np.median(np.concatenate([f.sd_y for f in features])))
+    return (
+        _scale(np.concatenate(velocity), gamma, max(old.scale["velocity"], least_v), least_v),
+        _scale(np.concatenate(level), gamma, max(old.scale["level"], least_y), least_y),
+        tuple(levels),
+    )
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    keep = np.isfinite(values) & (weights > 0)
+    order = np.argsort(values[keep])
+    cumulative = np.cumsum(weights[keep][order])
+    return float(values[keep][order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+def _location(values: np.ndarray, weights: np.ndarray, scale: float, start: float) -> float:
+    """Weighted Student-t location by iterative reweighting, from `start`."""
+    keep = np.isfinite(values)
+    v, w, centre = values[keep], weights[keep], start
+    if w.sum() < 1e-6:
+        return start
+    for _ in range(5):
+        robust = w * (TAIL + 1) / (TAIL + ((v - centre) / scale) ** 2)
+        centre = float(robust @ v / robust.sum())
+    return centre
+
+
+def _scale(residual: np.ndarray, weights: np.ndarray, start: float, least: float) -> float:
+    """Weighted Student-t scale by iterative reweighting, with a weak pull towards `start`."""
+    keep = np.isfinite(residual)
+    r2, w, variance = residual[keep] ** 2, weights[keep], start**2
+    if w.sum() < 1e-6:
+        return start
+    for _ in range(5):
+        robust = w * (TAIL + 1) / (TAIL + r2 / variance)
+        variance = float((robust @ r2 + variance) / (w.sum() + 1))
+    return max(float(np.sqrt(variance)), least)

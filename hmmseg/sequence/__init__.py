@@ -1,0 +1,1 @@
+"""Plain ordered tasks over arbitrary channels."""

@@ -1,0 +1,107 @@
+"""Features of plain ordered tasks: any channels on an even grid, robustly standardised.
+
+Each channel gives its value and its smoothed slope. Samples are averaged in cells of one width for
+all trials of a model, so that rate, gaps and uneven times do not matter; a cell without a sample is
+NaN and says nothing about the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.errors import InputError
+from hmmseg.io.trial import Trial
+
+CELLS_PER_TRIAL = 1500  # resolves a boundary to under 0.1 % of a trial's duration
+SMOOTHING = 0.01  # slope window, as a share of the median trial's duration
+
+
+@dataclass(frozen=True)
+class FeatureMap:
+    """From channels to features, fixed once for all trials of a model.
+
+    `step` [s] is the width of a cell, `window` [cells] the smoothing of slopes. `center` and
+    `scale` (num_features,) standardise: values of all channels first, then their slopes.
+    """
+
+    channels: tuple[str, ...]
+    step: float
+    window: int
+    center: np.ndarray
+    scale: np.ndarray
+
+
+@dataclass(frozen=True)
+class Features:
+    """One trial on the grid: `edges` (num_cells + 1,) [s]; `values` (num_cells, num_features)."""
+
+    edges: np.ndarray
+    values: np.ndarray
+
+
+def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Edges (num_cells + 1,) and mean of each channel (num_cells, num_channels), NaN in empty cells.
+
+    InputError where the trial lacks a channel.
+    """
+    for name in channels:
+        if name not in trial.channels:
+            raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")
+    start = float(trial.t[0])
+    num_cells = max(int(np.ceil((trial.t[-1] - start) / step * (1 - 1e-9))), 1)
+    cell = np.minimum(((trial.t - start) / step).astype(int), num_cells - 1)
+    means = np.full((num_cells, len(channels)), np.nan)
+    for j, name in enumerate(channels):
+        x = trial.channels[name]
+        finite = np.isfinite(x)
+        count = np.bincount(cell[finite], minlength=num_cells)
+        total = np.bincount(cell[finite], x[finite], minlength=num_cells)
+        means[count > 0, j] = total[count > 0] / count[count > 0]
+    return start + step * np.arange(num_cells + 1), means
+
+
+def _moving_average(x: np.ndarray, window: int) -> np.ndarray:
+    """Centred average over `window` cells along axis 0, shorter at the ends."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, 0)])
+    index = np.arange(len(x))
+    low, high = np.maximum(index - window // 2, 0), np.minimum(index + window // 2 + 1, len(x))
+    return (total[high] - total[low]) / (high - low)[:, None]
+
+
+def filled(x: np.ndarray) -> np.ndarray:
+    """Missing cells bridged linearly (held at the ends), column by column."""
+    out = np.zeros_like(x)
+    index = np.arange(len(x))
+    for j in range(x.shape[1]):
+        known = np.isfinite(x[:, j])
+        if known.any():
+            out[:, j] = np.interp(index, index[known], x[known, j])
+    return out
+
+
+def _raw(means: np.ndarray, step: float, window: int) -> np.ndarray:
+    slopes = np.zeros_like(means)
+    if len(means) > 1:
+        slopes = np.gradient(_moving_average(filled(means), window), step, axis=0)
+    return np.hstack([means, np.where(np.isfinite(means), slopes, np.nan)])
+
+
+def feature_map(trials: Sequence[Trial], channels: Sequence[str]) -> FeatureMap:
+    """Grid and standardisation learned from trials: median, and spread without the outer 2 %."""
+    duration = float(np.median([trial.t[-1] - trial.t[0] for trial in trials]))
+    step = max(float(np.median([1 / trial.rate for trial in trials])), duration / CELLS_PER_TRIAL)
+    window = max(round(SMOOTHING * duration / step), 3)
+    raw = np.vstack([_raw(cell_means(trial, channels, step)[1], step, window) for trial in trials])
+    center = np.nanmedian(raw, 0)
+    low, high = np.nanquantile(raw, [0.02, 0.98], axis=0)
+    scale = np.nanstd(np.clip(raw, low, high), 0)
+    return FeatureMap(tuple(channels), step, window, center, np.where(scale > 0, scale, 1.0))
+
+
+def features(trial: Trial, mapping: FeatureMap) -> Features:
+    """Standardised features of one trial; InputError where it lacks a channel."""
+    edges, means = cell_means(trial, mapping.channels, mapping.step)
+    return Features(edges, (_raw(means, mapping.step, mapping.window) - mapping.center) / mapping.scale)

@@ -1,0 +1,37 @@
+"""`hmmseg demo`: identify and diagnose recordings that come with the package, figures included."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg_cli import diagnose, identify
+from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption
+
+DATA = Path(__file__).parent / "demo_data"
+
+DemoFigures = Annotated[Path, typer.Option("--figures", metavar="DIR", help="Folder for the figures.")]
+
+
+def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: SeedOption = 0,
+         quiet: QuietOption = False) -> None:  # fmt: skip
+    """Identify two blocks, then find out why rigid fingertips would measure them too narrow; see demo/."""
+    from hmmseg.io.rig import read_rig
+
+    page, finding = figures / "report.html", figures / "diagnosis.html"
+    figures.mkdir(parents=True, exist_ok=True)
+    with Output("demo", json=json, figures=figures, report=page, seed=seed, quiet=quiet) as out:
+        trials, actual = sorted(DATA.glob("trial_*.csv")), DATA / "actual.toml"
+        body = identify.run(out, trials, DATA / "task.toml", DATA / "rig.toml", identify.Method.BAYES, actual)
+        task, rig = read_task(DATA / "task.toml"), read_rig(DATA / "rig.toml")
+        assert isinstance(task, BlockTask)
+        rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
+        out.print("\nThe same recordings, the fingertips thought rigid as the paper has them:")
+        out.report = finding
+        paper = rig.model_copy(update={"fingertip": rigid})
+        body["diagnosis"] = diagnose.run(out, trials, task, paper, None, [])
+        out.print(f"figures are in {figures}; the findings are told in {page} and {finding}")
+        out.finish(body)

@@ -1,0 +1,284 @@
+"""`hmmseg diagnose`: where the sim-to-real gap lies, what causes it, how far it shrinks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg_cli.console import (
+    ActualOption,
+    FiguresOption,
+    JsonOption,
+    Output,
+    QuietOption,
+    ReportOption,
+    SeedOption,
+    TaskOption,
+    TrialsArgument,
+    distinct_trials,
+)
+
+EffectOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
+    ),
+]
+RigFile = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="R", help="Nominal hand (TOML); a plain ordered task needs none."),
+]
+AgainstOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--against",
+        metavar="SIM",
+        help="Simulated trials to compare with instead of the virtual model, up to the next option. "
+        "A plain ordered task needs them.",
+    ),
+]
+ModelFile = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit."),
+]
+CalibrateOption = Annotated[
+    bool,
+    typer.Option(
+        "--calibrate",
+        help="Learn what healthy recordings of this rig and task look like from simulations of them "
+        "(a minute or two, once).",
+    ),
+]
+BANKS = {
+    "nominal": "Judged by healthy simulations of the paper's hand.",
+    "bootstrap": "Judged by healthy simulations of the paper's hand, thresholds moved to this rig and task "
+    "by a linearised bootstrap, which may raise false alarms with soft pads or another task; "
+    "--calibrate simulates them instead.",
+    "calibrated": "Judged by healthy simulations of this rig and task.",
+}
+
+
+def spread_against(args: list[str]) -> list[str]:
+    """Arguments with `--against A B` written `--against A --against B`, as the parser takes one a time."""
+    out: list[str] = []
+    taking = False
+    for arg in args:
+        if arg.startswith("-"):
+            taking = arg == "--against"
+        elif taking and out[-1] != "--against":
+            out.append("--against")
+        out.append(arg)
+    return out
+
+
+def diagnose(
+    trials: TrialsArgument,
+    task: TaskOption,
+    rig: RigFile = None,
+    actual: ActualOption = None,
+    effect: EffectOption = None,
+    against: AgainstOption = None,
+    model: ModelFile = None,
+    calibrate: CalibrateOption = False,
+    json: JsonOption = None,
+    figures: FiguresOption = None,
+    report: ReportOption = None,
+    seed: SeedOption = 0,
+    quiet: QuietOption = False,
+) -> None:
+    """The sim-to-real gap: where it lies, which unmodelled effect causes it, how far it shrinks."""
+    with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
+        paths = distinct_trials(trials)
+        description = read_task(task)
+        if against:
+            if calibrate:
+                raise InputError("--calibrate", "does not go with --against: no virtual model is used")
+            _against(out, paths, against, description, rig, actual, effect or [], model)
+            return
+        if not isinstance(description, BlockTask):
+            raise InputError(str(task), "a plain ordered task has no virtual model", "--against SIM")
+        if model is not None:
+            raise InputError(f"--model {model}", "goes only with a plain ordered task")
+        if rig is None:
+            raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
+        from hmmseg.io.rig import read_rig
+
+        out.finish(run(out, paths, description, read_rig(rig), actual, effect or [], calibrate))
+
+
+def run(
+    out: Output,
+    paths: Sequence[Path],
+    task: BlockTask,
+    rig: Rig,
+    actual: Path | None,
+    effect: Sequence[str],
+    calibrate: bool = False,
+) -> dict[str, Any]:
+    """Diagnose, put table, figures and page where `out` has them go, and give the document."""
+    from estimation.actual import read_actual
+    from hmmseg.io.trial import read_trial
+    from simgap.effects import effect_named
+    from simgap.gap.diagnose import STAGES
+    from simgap.gap.diagnose import diagnose as find
+
+    measured = None if actual is None else read_actual(actual, task.objects)
+    forced = [effect_named(name).name for name in dict.fromkeys(effect)]
+    recordings = [read_trial(path, rig) for path in paths]
+    bank = _own_bank(out, recordings, task, rig) if calibrate else None
+    with out.progress("diagnosing", total=STAGES) as advance:
+        found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1), bank)
+    for warning in found.warnings:
+        out.warn(warning)
+    out.print(sentence(found.body), BANKS[found.body["detection"]["bank"]], *tables(found.body))
+    _draw(out, found, measured)
+    return found.body
+
+
+def _own_bank(out: Output, recordings, task: BlockTask, rig: Rig):
+    """The bank learned on this rig and task, now or before."""
+    from simgap.gap.calibrate import steps
+    from simgap.gap.own_bank import own_bank
+
+    with out.progress("simulating healthy recordings", total=steps()) as advance:
+        return own_bank(recordings, task, rig, lambda text: advance(1))
+
+
+def _against(
+    out: Output, paths, against, task, rig_file, actual, effect: list[str], model_file: Path | None
+) -> None:
+    """The generic diagnosis, against given simulated trials."""
+    from hmmseg.io.trial import read_trial
+    from simgap.generic.diagnose import diagnose as compare
+    from simgap.generic.diagnose import diagnose_blocks
+
+    if actual is not None:
+        raise InputError(f"--actual {actual}", "does not go with --against: no properties are fitted")
+    every = distinct_trials([*paths, *against])
+    with out.progress("diagnosing", total=4) as advance:
+        tell = lambda text: advance(1)  # noqa: E731
+        if isinstance(task, BlockTask):
+            from hmmseg.io.rig import read_rig
+
+            if rig_file is None:
+                raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
+            if model_file is not None:
+                raise InputError(f"--model {model_file}", "goes only with a plain ordered task")
+            hand = read_rig(rig_file)
+            read = [read_trial(path, hand) for path in every]
+            real, sim = read[: len(paths)], read[len(paths) :]
+            found = diagnose_blocks(real, sim, task, hand, effect, out.seed, tell)
+        else:
+            from hmmseg.sequence.model import load_model
+
+            read = [read_trial(path, task=task) for path in every]
+            learned = None if model_file is None else load_model(model_file, task)
+            found = compare(read[: len(paths)], read[len(paths) :], task, learned, effect, out.seed, tell)
+    for warning in found.warnings:
+        out.warn(warning)
+    out.print(sentence(found.body), *tables(found.body))
+    if out.figures is not None:
+        from hmmseg_cli.figures.gap_generic import draw_all
+
+        draw_all(found, out.figure)
+    if out.report is not None:
+        from hmmseg_cli.gap_report import generic_page
+
+        told = generic_page(found, sentence(found.body), cells_title(found.body))
+        out.stage(out.report).write_text(told, encoding="utf-8")
+    out.finish(found.body)
+
+
+def _draw(out: Output, found, measured) -> None:
+    """Figures where asked for, and the page with the same figures inside."""
+    if out.figures is None and out.report is None:
+        return
+    from hmmseg_cli.figures.gap import draw_all
+    from hmmseg_cli.gap_report import page
+
+    if out.figures is not None:
+        draw_all(found, out.figure)
+    if out.report is not None:
+        told = f"{sentence(found.body)} {BANKS[found.body['detection']['bank']]}"
+        text = page(found, told, cells_title(found.body), measured)
+        out.stage(out.report).write_text(text, encoding="utf-8")
+
+
+def p_text(p: float) -> str:
+    """A p value; what is too small to be told apart is only bounded."""
+    return f"p = {p:.2g}" if p > 1e-16 else "p < 1e-16"
+
+
+def sentence(body: dict[str, Any]) -> str:
+    """The verdict in a sentence."""
+    p, causes = p_text(body["detection"]["p_value"]), " and ".join(body["causes"])
+    if body["verdict"] == "none":
+        return f"No gap beyond the sensors' noise was found ({p})."
+    if body["verdict"] == "unknown":
+        return f"There is a gap ({p}) that none of the candidate effects explains."
+    shrinkage, far = body["shrinkage"], ""
+    if shrinkage is not None and shrinkage["fraction"] is not None:
+        percent = f"{100 * shrinkage['fraction']:.0f} %"
+        far = f"; with it in the model the gap shrinks by {percent} on {shrinkage['evaluated_on']}"
+    if body["verdict"] == "set":
+        others = ", ".join(body["indistinguishable"])
+        return (
+            f"The gap is caused by {causes}, or by what these recordings cannot tell from it: {others}{far}."
+        )
+    return f"The gap is caused by {causes}{far}."
+
+
+def cells_title(body: dict[str, Any]) -> str:
+    """What the cells of `where` are: a named cause's own, judged by a bank, or all that are significant."""
+    if body["causes"] and "bank" in body["detection"]:
+        return f"cells that {' and '.join(body['causes'])} shifted, largest share of the excess first"
+    return "where the gap is largest"
+
+
+def tables(body: dict[str, Any]) -> list[Table]:
+    """Probabilities, parameters of the cause and the largest cells, for people to read."""
+    likely = Table(title="probabilities", title_justify="left")
+    likely.add_column("candidate", no_wrap=True)
+    likely.add_column("probability", justify="right")
+    for name, value in sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]:
+        likely.add_row(name, f"{value:.3f}")
+    out = [likely]
+    if body["causes"]:
+        values = Table(title="parameters", title_justify="left")
+        for head in ("parameter", "estimate", "90 % interval"):
+            values.add_column(head, no_wrap=True)
+        for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
+            low, high = p["interval_90"]
+            unit = "" if p["unit"] == "1" else f" {p['unit']}"
+            values.add_row(name, f"{p['mean']:.4g} +- {p['sd']:.2g}{unit}", f"{low:.4g} to {high:.4g}")
+        out.append(values)
+    if body["next_experiment"] is not None:
+        following = Table(title="next experiment", title_justify="left", show_header=False)
+        told = body["next_experiment"]
+        gain = f"by {told['expected_gain_nats']:.0f} nats at least"
+        following.add_row(told["do"])
+        following.add_row(f"expected to tell {', '.join(told['separates'])} apart, {gain}")
+        out.append(following)
+    if body["where"]:
+        cells = Table(title=cells_title(body), title_justify="left")
+        for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
+            cells.add_column(head, no_wrap=True)
+        for row in body["where"][:8]:
+            low, high = row["band"]
+            cells.add_row(
+                row["trial"],
+                row["channel"],
+                row["subtask"],
+                f"{low:g}-{high:g}",
+                f"{100 * row['share']:.0f} %",
+                f"{row['z']:.1f}",
+            )
+        out.append(cells)
+    return out

@@ -1,0 +1,83 @@
+"""Stacked panels over time with the subtasks of a segmentation behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from hmmseg.drawing import INK, state_colours
+from hmmseg.segment.spans import Segmentation
+
+LABEL_SLANT = 40  # degrees
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One signal over time: its axis label and values (num_timesteps,) as shown."""
+
+    label: str
+    values: np.ndarray
+
+
+def stacked_panels(
+    figure: Figure, t: np.ndarray, panels: Sequence[Panel], segmentation: Segmentation
+) -> list[Axes]:
+    """Draw signals at t (num_timesteps,) [s], one above the other, and the subtasks behind them."""
+    axes = list(np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)))
+    for ax, panel in zip(axes, panels, strict=True):
+        # Single samples between missing ones would not show as a line.
+        alone = np.isfinite(panel.values) & ~_beside_another(panel.values)
+        ax.plot(t, panel.values, color=INK, lw=0.8)
+        ax.plot(t[alone], panel.values[alone], ".", color=INK, ms=1.5)
+        ax.set_ylabel(panel.label)
+        ax.margins(y=0.08)
+        shade_spans(ax, segmentation)
+    figure.align_ylabels(axes)
+    axes[-1].set_xlabel("Time [s]")
+    axes[-1].set_xlim(t[0], t[-1])
+    name_spans(axes[0], segmentation)
+    if segmentation.failed is not None:
+        step = f"{segmentation.failed.subtask} {segmentation.failed.object or ''}".strip()
+        figure.suptitle(f"does not fit its task at {step}", fontsize=8, fontweight="bold")
+    state_legend(figure, segmentation)
+    return axes
+
+
+def _beside_another(values: np.ndarray) -> np.ndarray:
+    there = np.concatenate([[False], np.isfinite(values), [False]])
+    return there[:-2] | there[2:]
+
+
+def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
+    """Colour the subtasks by state; boundaries as a thin line in their 90 % interval."""
+    colours = state_colours([span.state for span in segmentation.spans])
+    for span in segmentation.spans:
+        ax.axvspan(span.start, span.end, color=colours[span.state], alpha=0.32, lw=0, zorder=0)
+    for span in segmentation.spans[1:]:
+        ax.axvspan(*span.start_90, color=INK, alpha=0.28, lw=0, zorder=1)
+        ax.axvline(span.start, color=INK, lw=0.45, zorder=1.5)
+
+
+def name_spans(ax: Axes, segmentation: Segmentation) -> None:
+    """Subtask names above a panel, slanted so that short subtasks keep theirs."""
+    for span in segmentation.spans:
+        name = f"{span.subtask} {span.object or ''}".strip()
+        anchor = 0.65 * span.start + 0.35 * span.end
+        ax.annotate(
+            name, (anchor, 1.0), xycoords=("data", "axes fraction"), xytext=(-2, 3),
+            textcoords="offset points", rotation=LABEL_SLANT, ha="left", va="bottom",
+            rotation_mode="anchor", fontsize=7,
+        )  # fmt: skip
+
+
+def state_legend(figure: Figure, segmentation: Segmentation) -> None:
+    """Legend of the states and of a boundary, below all panels."""
+    colours = state_colours([span.state for span in segmentation.spans])
+    handles = [Patch(color=colour, alpha=0.32, lw=0, label=state) for state, colour in colours.items()]
+    handles.append(Patch(facecolor=INK, alpha=0.28, lw=0, label="boundary, 90 % interval"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5))

@@ -1,0 +1,164 @@
+"""`hmmseg identify`: block properties with uncertainties, from recordings of one task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hmmseg.errors import InputError
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg_cli.console import (
+    ActualOption,
+    FiguresOption,
+    JsonOption,
+    Output,
+    QuietOption,
+    ReportOption,
+    RigOption,
+    SeedOption,
+    TaskOption,
+    TrialsArgument,
+    distinct_trials,
+)
+from hmmseg_cli.segment import warn_of_misfit
+
+
+class Method(StrEnum):
+    """How properties are estimated."""
+
+    BAYES = "bayes"
+    PAPER = "paper"
+
+
+MethodOption = Annotated[Method, typer.Option(help="Bayesian, or the paper's thresholds and formulas.")]
+SHOWN = {"weight": (1.0, "N", 4), "width": (100.0, "cm", 4), "height": (100.0, "cm", 4)}
+
+
+def identify(
+    trials: TrialsArgument, task: TaskOption, rig: RigOption, method: MethodOption = Method.BAYES,
+    actual: ActualOption = None, json: JsonOption = None, figures: FiguresOption = None,
+    report: ReportOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+) -> None:  # fmt: skip
+    """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
+    with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
+        out.finish(run(out, trials, task, rig, method, actual))
+
+
+def run(
+    out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Method, actual: Path | None
+) -> dict[str, Any]:
+    """Identify, put table, figures and page where `out` has them go, and give the document."""
+    paths = distinct_trials(trials)
+    description = read_task(task)
+    if not isinstance(description, BlockTask):
+        raise InputError(str(task), "a plain ordered task has no blocks to identify", "objects and moves")
+    from estimation.actual import read_actual
+    from hmmseg.hand.signals import task_space
+    from hmmseg.io.rig import read_rig
+    from hmmseg.io.trial import read_trial
+
+    hand = read_rig(rig)
+    measured = None if actual is None else read_actual(actual, description.objects)
+    recordings = [read_trial(path, hand) for path in paths]
+    signals = [task_space(trial, hand) for trial in recordings]
+    if method is Method.PAPER:
+        body, segmentations, found = _paper(out, signals, recordings, description)
+    else:
+        found = _bayes(out, signals, recordings, description, hand)
+        body, segmentations = found.to_json(), found.segmentations
+    if measured is not None:
+        body["actual"] = _compared(body["properties"], measured)
+    out.print(properties_table(body, measured))
+    for key, reason in body["reasons"].items():
+        out.print(f"{key}: {reason}")
+    if out.figures is not None:
+        from hmmseg_cli.figures.identification import draw_all
+
+        draw_all(out, signals, recordings, segmentations, body, found, measured)
+    if out.report is not None:
+        from hmmseg_cli.report import identification_page
+
+        page = identification_page(signals, recordings, segmentations, body, found, measured, out.warnings)
+        out.stage(out.report).write_text(page, encoding="utf-8")
+    return body
+
+
+def _paper(out: Output, signals, recordings, task: BlockTask):
+    from estimation.paper_formulas import estimate_plugin
+    from hmmseg.segment.thresholds import segment_qualitative
+
+    pairs = zip(recordings, signals, strict=True)
+    segmentations = [segment_qualitative(trial, s, task) for trial, s in pairs]
+    for segmentation in segmentations:
+        warn_of_misfit(out, segmentation)
+    estimates = estimate_plugin(signals, segmentations, task)
+    body = {"trials": [s.to_json() for s in segmentations], "method": "paper", "sampler": None}
+    return body | estimates.to_json(), segmentations, None
+
+
+def _bayes(out: Output, signals, recordings, task: BlockTask, hand):
+    from estimation.identify import identify_aligned
+    from hmmseg.segment.align import align_trials
+
+    aligned = align_trials([trial.file for trial in recordings], signals, task, hand)
+    with out.progress("sampling the posterior", total=100) as advance:
+        done = 0
+
+        def progress(step: int, of: int) -> None:
+            nonlocal done
+            advance(100 * step // of - done)
+            done = 100 * step // of
+
+        found = identify_aligned(recordings, signals, aligned, hand, out.seed, progress)
+    for warning in found.warnings:
+        out.warn(warning)
+    return found
+
+
+def _compared(properties: dict[str, Any], measured) -> dict[str, Any]:
+    """Estimates beside `--actual`: relative deviation, and whether the 95 % interval covers it."""
+    out: dict[str, Any] = {}
+    for obj, entries in measured.items():
+        for prop, (value, sd) in entries.items():
+            found = properties[obj].get(prop)
+            row: dict[str, Any] = {"value": value, "sd": sd}
+            if found is not None and found.get("mean") is not None:
+                low, high = found["interval_95"]
+                row["relative_deviation"] = found["mean"] / value - 1
+                row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
+            out.setdefault(obj, {})[prop] = row
+    return out
+
+
+def properties_table(body: dict[str, Any], measured=None) -> Table:
+    """The properties for people to read, lengths in cm as the paper has them."""
+    table = Table(title=f"properties ({body['method']})", title_justify="left")
+    for head in ("block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())):
+        table.add_column(head, no_wrap=head != "estimate")
+    for obj, entries in body["properties"].items():
+        for prop, entry in entries.items():
+            cells = [obj, prop, *_cells(prop, entry)]
+            if measured:
+                value = measured.get(obj, {}).get(prop)
+                factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
+                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}")
+            table.add_row(*cells)
+    return table
+
+
+def _cells(prop: str, entry: dict[str, Any] | None) -> tuple[str, str]:
+    if entry is None:
+        return "unknown", ""
+    factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
+    if entry.get("mean") is None:
+        return f">= {entry['lower_bound']:.{digits}f}", ""
+    low, high = (f"{v * factor:.{digits}f}" for v in entry["interval_95"])
+    return (
+        f"{entry['mean'] * factor:.{digits}f} +- {entry['sd'] * factor:.{digits}f} {unit}",
+        f"{low} to {high}",
+    )

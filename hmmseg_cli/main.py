@@ -1,0 +1,77 @@
+"""The `hmmseg` command and its exit codes.
+
+0: done, whatever was found. 2: the input is at fault; one line on standard error says where.
+Any other exception is a bug and shows its traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+import hmmseg
+from hmmseg.errors import InputError
+from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, segment, simulate
+
+# `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+
+app = typer.Typer(add_completion=False, context_settings={"help_option_names": ["-h", "--help"]})
+
+# In the order of `hmmseg --help`. Modules import what is heavy (jax, matplotlib, pandas) inside
+# their command, so that help and light commands start at once.
+for _command in (
+    decompose.decompose,
+    fit.fit,
+    segment.segment,
+    identify.identify,
+    simulate.simulate,
+    diagnose.diagnose,
+    effects.effects,
+    demo.demo,
+):
+    app.command()(_command)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(hmmseg.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _hmmseg(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version.")
+    ] = False,
+) -> None:
+    """Identify an object's weight, width, height and friction from what a robot hand felt."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code (0 or 2; 130 when interrupted)."""
+    args = list(sys.argv[1:] if args is None else args) or ["--help"]
+    args = diagnose.spread_against(args)
+    command = typer.main.get_command(app)
+    try:
+        return command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
+    except InputError as error:
+        return _at_fault(str(error))
+    except UsageError as error:
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context else "hmmseg"
+        return _at_fault(f"{path}: {error.format_message()} (see {path} --help)")  # type: ignore[attr-defined]
+    except typer.Abort:
+        return 130
+
+
+def _at_fault(line: str) -> int:
+    print(" ".join(line.split()), file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""`hmmseg segment`: recordings to subtask spans with uncertain boundaries."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from hmmseg.errors import InputError
+from hmmseg.io.task import SequenceTask, read_task
+from hmmseg.segment.spans import Segmentation
+from hmmseg_cli.console import (
+    FiguresOption,
+    JsonOption,
+    Output,
+    QuietOption,
+    SeedOption,
+    TaskOption,
+    TrialsArgument,
+    distinct_trials,
+)
+
+
+class Method(StrEnum):
+    """How recordings are segmented."""
+
+    HMM = "hmm"
+    QUALITATIVE = "qualitative"
+
+
+RigFile = Annotated[Path | None, typer.Option(
+    "--rig", metavar="R", help="Nominal hand (TOML); a plain ordered task needs none.")]  # fmt: skip
+ModelFile = Annotated[Path | None, typer.Option(
+    "--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit.")]  # fmt: skip
+ForceThreshold = Annotated[float, typer.Option(
+    "--force-threshold", metavar="N", min=0.0, help="Qualitative method: of forces [N].")]  # fmt: skip
+VelocityThreshold = Annotated[float, typer.Option(
+    "--velocity-threshold", metavar="M/S", min=0.0, help="Qualitative method: velocities.")]  # fmt: skip
+
+
+def segment(
+    trials: TrialsArgument, task: TaskOption, rig: RigFile = None, model: ModelFile = None,
+    method: Annotated[Method, typer.Option(help="hmm, or the paper's thresholds.")] = Method.HMM,
+    force_threshold: ForceThreshold = 0.05, velocity_threshold: VelocityThreshold = 0.05,
+    json: JsonOption = None, figures: FiguresOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+) -> None:  # fmt: skip
+    """Segment recordings into the task's subtasks, with the uncertainty of every boundary."""
+    with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
+        paths = distinct_trials(trials)
+        description = read_task(task)
+        if isinstance(description, SequenceTask):
+            found = _segment_sequence(out, paths, description, model, method, seed)
+        else:
+            if rig is None:
+                raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
+            if model is not None:
+                raise InputError(f"--model {model}", "goes only with a plain ordered task")
+            thresholds = (force_threshold, velocity_threshold)
+            found = _segment_blocks(out, paths, description, rig, method, thresholds)
+        for segmentation in found:
+            out.print(spans_table(segmentation))
+            warn_of_misfit(out, segmentation)
+        out.finish({"method": method.value, "trials": [s.to_json() for s in found]})
+
+
+def _segment_blocks(
+    out: Output, paths, task, rig_file: Path, method: Method, thresholds
+) -> list[Segmentation]:
+    from hmmseg.hand.signals import task_space
+    from hmmseg.io.rig import read_rig
+    from hmmseg.io.trial import read_trial
+    from hmmseg.segment.thresholds import segment_qualitative
+
+    rig = read_rig(rig_file)
+    recordings = [read_trial(path, rig) for path in paths]
+    signals = [task_space(trial, rig) for trial in recordings]
+    if method is Method.QUALITATIVE:
+        pairs = zip(recordings, signals, strict=True)
+        found = [segment_qualitative(trial, s, task, *thresholds) for trial, s in pairs]
+    else:
+        from hmmseg.segment.align import segment_trials
+
+        found = segment_trials([trial.file for trial in recordings], signals, task, rig)
+    if out.figures is not None:
+        from hmmseg_cli.figures.signals import draw_signals
+
+        for trial, s, segmentation in zip(recordings, signals, found, strict=True):
+            draw_signals(s, segmentation, out.figure(f"{Path(trial.name).stem}_segments.png"))
+    return found
+
+
+def _segment_sequence(out: Output, paths, task: SequenceTask, model_file, method: Method, seed: int):
+    from hmmseg.io.trial import read_trial
+    from hmmseg.sequence.model import load_model
+    from hmmseg.sequence.segment import segment_sequence
+
+    if method is Method.QUALITATIVE:
+        raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
+    recordings = [read_trial(path, task=task) for path in paths]
+    learned = None if model_file is None else load_model(model_file, task)
+    found = segment_sequence(recordings, task, learned, seed)
+    if out.figures is not None:
+        from hmmseg_cli.figures.channels import draw_channels
+
+        for trial, segmentation in zip(recordings, found, strict=True):
+            draw_channels(trial, segmentation, out.figure(f"{Path(trial.name).stem}_segments.png"))
+    return found
+
+
+def warn_of_misfit(out: Output, segmentation: Segmentation) -> None:
+    """Say which subtask a trial fails at, if it does."""
+    if segmentation.failed is not None:
+        out.warn(f"{segmentation.file}: {segmentation.failed}")
+
+
+def spans_table(segmentation: Segmentation) -> Table:
+    """The spans of one trial for people to read."""
+    table = Table(title=f"{Path(segmentation.file).name} ({segmentation.rate:.4g} Hz)", title_justify="left")
+    for head, justify in (("subtask", "left"), ("state", "left"), ("start [s]", "right"),
+                          ("90 % interval", "left"), ("end [s]", "right")):  # fmt: skip
+        table.add_column(head, justify=justify)  # type: ignore[arg-type]
+    for span in segmentation.spans:
+        low, high = span.start_90
+        interval = f"{low:.3f} to {high:.3f}" if high > low else ""
+        name = f"{span.subtask} {span.object or ''}".strip()
+        table.add_row(name, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}")
+    return table

@@ -1,0 +1,195 @@
+"""`hmmseg simulate`: the virtual model performs a task, or replays a recording's motions."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hmmseg.errors import InputError
+from hmmseg_cli.console import (
+    FiguresOption,
+    JsonOption,
+    Output,
+    QuietOption,
+    RigOption,
+    SeedOption,
+    TaskOption,
+    check_folder,
+)
+
+
+class Animation(StrEnum):
+    """Kinds of animation."""
+
+    GIF = "gif"
+    MP4 = "mp4"
+
+
+PropertiesOption = Annotated[Path | None, typer.Option(
+    "--properties", metavar="P", help="identify's JSON or an actual.toml; else the paper's.")]  # fmt: skip
+ReplayOption = Annotated[Path | None, typer.Option(
+    "--replay", metavar="TRIAL", help="Drive the model with this recording's motions.")]  # fmt: skip
+TrialsOption = Annotated[int, typer.Option("--trials", metavar="N", min=1, max=99, help="How many trials.")]
+OutputOption = Annotated[Path, typer.Option("--output", metavar="DIR", help="Folder to write into.")]
+OperatorOption = Annotated[Path | None, typer.Option(
+    "--operator", metavar="FILE", help="How the operator works (TOML or JSON).")]  # fmt: skip
+AnimationOption = Annotated[bool, typer.Option(
+    "--animation", help="Draw fingers and blocks in motion beside the forces.")]  # fmt: skip
+FormatOption = Annotated[Animation, typer.Option("--animation-format", help="Kind of animation.")]
+
+
+def simulate(
+    task: TaskOption, rig: RigOption, properties: PropertiesOption = None, replay: ReplayOption = None,
+    trials: TrialsOption = 1, output: OutputOption = Path("simulated"), operator: OperatorOption = None,
+    animation: AnimationOption = False, animation_format: FormatOption = Animation.GIF,
+    json: JsonOption = None, figures: FiguresOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+) -> None:  # fmt: skip
+    """Perform a task with the calibrated virtual model, or replay a recording through it."""
+    check_folder("--output", output)
+    with Output("simulate", json=json, figures=figures, seed=seed, quiet=quiet) as out:
+        from hmmseg.io.rig import read_rig
+        from hmmseg.io.task import BlockTask, read_task
+        from simgap.world.animation import require_encoder
+        from simgap.world.properties import PAPER_BLOCKS, paper_blocks, read_properties
+        from simgap.world.writing import scene_files
+
+        if animation:
+            require_encoder(f".{animation_format.value}")
+        description, hand = read_task(task), read_rig(rig)
+        if not isinstance(description, BlockTask):
+            raise InputError(str(task), "is a plain ordered task", "a task of blocks to simulate")
+        if replay is not None and (trials != 1 or operator is not None):
+            raise InputError("--replay", "goes with neither --trials nor --operator")
+        blocks = paper_blocks(description) if properties is None else read_properties(properties, description)
+        if properties is None and not set(description.objects) <= set(PAPER_BLOCKS):
+            out.warn("no --properties: the paper's two blocks stand in turn for the task's objects")
+        films: list[tuple[str, Any, Any]] = []
+        if replay is None:
+            files, document = _perform(out, description, hand, blocks, trials, operator, seed, films)
+        else:
+            files, document = _replay(out, replay, description, hand, blocks, seed, films)
+        files = scene_files(description, hand, blocks) | files
+        _spare_inputs(output, files, [task, rig, properties, replay, operator])
+        for name, text in files.items():
+            out.stage(output / name).write_text(text, encoding="utf-8")
+        written = [output / name for name in files]
+        if animation:
+            from simgap.world.animation import animate
+
+            for stem, scene, traces in films:
+                path = output / f"{stem}.{animation_format.value}"
+                staged = out.stage(path).with_suffix(path.suffix)
+                animate(staged, scene, traces)
+                written.append(path)
+        shown = {name: {"weight": b.weight, "width": b.width, "height": b.height, "friction": b.friction}
+                 for name, b in blocks.items()}  # fmt: skip
+        out.print(f"wrote {len(written)} files into {output}")
+        out.finish({"properties": shown, "files": written, **document})
+
+
+def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, films: list):
+    """Trials by the model's own operator: files by name, and their part of the document."""
+    import numpy as np
+
+    from hmmseg.hand.signals import task_space
+    from simgap.world.animation import Scene, Trace
+    from simgap.world.operator import OperatorSettings, read_operator
+    from simgap.world.simulate import simulate_trials
+    from simgap.world.writing import trial_files
+
+    settings = OperatorSettings() if operator is None else read_operator(operator)
+    seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
+    done = simulate_trials(task, rig, [blocks] * count, seeds, settings)
+    files, rows = {}, []
+    for k, simulated in enumerate(done, 1):
+        files |= trial_files(k, simulated.trial, simulated.boundaries, simulated.seed)
+        if not np.isfinite(simulated.boundaries).all():
+            out.warn(f"trial_{k:02d}: the task failed (a block was not lifted or was dropped)")
+        signals = task_space(simulated.trial, rig)
+        if out.figures is not None and np.isfinite(simulated.boundaries).all():
+            from hmmseg_cli.figures.signals import draw_signals
+
+            found = _segmentation(f"trial_{k:02d}.csv", signals, task, simulated.boundaries)
+            draw_signals(signals, found, out.figure(f"trial_{k:02d}_signals.png"))
+        t, force = simulated.t, simulated.motion.force
+        traces = [Trace("Grip [N]", [("", t, np.minimum(force[:, 0, 0], -force[:, 1, 0]))]),
+                  Trace("Net $f_y$ [N]", [("", t, force[..., 1].sum(1))]),
+                  Trace("Net $f_x$ [N]", [("", t, force[..., 0].sum(1))])]  # fmt: skip
+        scene = Scene(t, simulated.motion.position, simulated.motion.blocks,
+                      {name: blocks[name] for name in task.objects}, rig)  # fmt: skip
+        films.append((f"trial_{k:02d}", scene, traces))
+        rows.append({"file": f"trial_{k:02d}.csv", "seed": simulated.seed, "rate": simulated.trial.rate,
+                     "boundaries": simulated.boundaries})  # fmt: skip
+    return files, {"trials": rows}
+
+
+def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
+    """A recording's motions through the model: files by name, and their part of the document."""
+    import numpy as np
+
+    from hmmseg.contact.decompose import subtasks
+    from hmmseg.hand.signals import task_space
+    from hmmseg.io.trial import Trial, read_trial
+    from hmmseg.segment.align import segment_trials
+    from simgap.world.animation import Scene, Trace
+    from simgap.world.replay import replay, residual_summary
+    from simgap.world.writing import trial_files
+
+    recording = read_trial(path, rig)
+    segmentation = segment_trials([recording.file], [task_space(recording, rig)], task, rig)[0]
+    if segmentation.failed is not None:
+        out.warn(f"{recording.file}: {segmentation.failed}")
+    boundaries = np.array([span.start for span in segmentation.spans[1:]])
+    result = replay(recording, task, rig, blocks, boundaries=boundaries)
+    names = ("fx1", "fy1", "fx2", "fy2")
+    force = dict(zip(names, result.force.reshape(-1, 4).T, strict=True))
+    predicted = Trial("trial_01.csv", recording.t, recording.channels | force)
+    summary = {}
+    if rig.noise.force is not None:
+        summary = residual_summary(result, boundaries, [s.state for s in subtasks(task)])
+        out.print(_residual_table(summary))
+    if out.figures is not None:
+        from hmmseg_cli.figures.replay import draw_replay
+
+        draw_replay(result, segmentation, out.figure(f"{path.stem}_replay.png"))
+    signals, model = result.signals, result.predicted
+    traces = [Trace(f"{label} [N]", [("recording", signals.t, getattr(signals, key)),
+                                     ("virtual model", signals.t, model[key])])
+              for label, key in (("Grip", "grip"), ("Net $f_y$", "fy"), ("Shear", "shear"))]  # fmt: skip
+    films.append(("trial_01", Scene(result.t, result.tips, result.motion.blocks,
+                                    {name: blocks[name] for name in task.objects}, rig), traces))  # fmt: skip
+    document = {"replay": {"file": str(path), "boundaries": boundaries, "complete": segmentation.complete,
+                           "net_force_residual_over_noise": summary}}  # fmt: skip
+    return trial_files(1, predicted, boundaries, seed), document
+
+
+def _segmentation(file: str, signals, task, boundaries):
+    """The truth as a segmentation without uncertainty, for the figures."""
+    from hmmseg.contact.decompose import subtasks
+    from hmmseg.segment.spans import Segmentation, Span
+
+    edges = [float(signals.t[0]), *map(float, boundaries), float(signals.t[-1])]
+    spans = tuple(Span(s.name, s.object, s.state, a, b, 0.0, 0.0, (a, a), (b, b))
+                  for s, a, b in zip(subtasks(task), edges[:-1], edges[1:], strict=True))  # fmt: skip
+    return Segmentation(file, 1.0, 0.0, spans)
+
+
+def _residual_table(summary: dict[str, float]) -> Table:
+    table = Table(title="Net force, measured minus predicted", title_justify="left")
+    table.add_column("state")
+    table.add_column("rms over sensor noise", justify="right")
+    for state, value in summary.items():
+        table.add_row(state, f"{value:.2f}")
+    return table
+
+
+def _spare_inputs(folder: Path, names, inputs) -> None:
+    """InputError where writing would replace a file that was read."""
+    targets = {(folder / name).resolve() for name in names}
+    for path in inputs:
+        if path is not None and Path(path).resolve() in targets:
+            raise InputError(f"--output {folder}", f"would replace the input {path}", "another folder")

@@ -1,0 +1,1 @@
+"""The virtual model: hand, pads, blocks, operator and sensors."""

@@ -1,0 +1,165 @@
+"""Animation of fingers and blocks beside their force traces, as a GIF or an MP4."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from PIL import Image
+
+from hmmseg.drawing import BLUE, GREY, INK, OTHER_COLOURS, STYLE
+from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig
+from simgap.world.hand import inverse
+from simgap.world.properties import Block
+
+FRAMES = 15.0  # a second, in real time
+SIZE, DPI = (9.0, 3.8), 90  # in
+PAD = (0.003, 0.008)  # m, drawn width and height of a fingertip
+SUFFIXES = (".gif", ".mp4")
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One panel of forces over time: its label and curves (name, t [s], values)."""
+
+    label: str
+    curves: Sequence[tuple[str, np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What moves: t (T,) [s], tips (T, 2, 2) and block centres (T, B, 2) [m]; blocks by name."""
+
+    t: np.ndarray
+    tips: np.ndarray
+    centres: np.ndarray
+    blocks: dict[str, Block]
+    rig: Rig
+
+
+def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
+    """Write the animation to `path`, in real time; InputError for another suffix or a lacking ffmpeg."""
+    frames = _frames(scene, traces)
+    if path.suffix == ".gif":
+        first, *rest = (Image.fromarray(frame).quantize(64) for frame in frames)
+        first.save(path, save_all=True, append_images=rest, duration=round(1000 / FRAMES), loop=0)
+    elif path.suffix == ".mp4":
+        _write_mp4(path, frames)
+    else:
+        raise InputError(str(path), f"unknown kind of animation {path.suffix!r}", " or ".join(SUFFIXES))
+
+
+def require_encoder(suffix: str) -> None:
+    """InputError where an animation of this suffix cannot be written here."""
+    if suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise InputError("--animation mp4", "the program ffmpeg is not installed", "gif, or ffmpeg")
+
+
+def _write_mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
+    require_encoder(".mp4")
+    first = next(frames)
+    height, width = (n // 2 * 2 for n in first.shape[:2])  # the codec wants even numbers
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(FRAMES), "-i", "-"]
+    command = ["ffmpeg", "-y", "-loglevel", "error", *source, "-pix_fmt", "yuv420p", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as encoder:
+        assert encoder.stdin is not None
+        for frame in (first, *frames):
+            encoder.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
+    if encoder.returncode:
+        raise OSError(f"ffmpeg ended with exit code {encoder.returncode}")
+
+
+def _frames(scene: Scene, traces: Sequence[Trace]) -> Iterator[np.ndarray]:
+    """Pictures (height, width, 3) in bytes, FRAMES a second."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        stage, *panels = figure.subplot_mosaic(
+            [["scene", str(k)] for k in range(len(traces))], width_ratios=(1.0, 1.0)
+        ).values()
+        bodies, pads, links = _draw_scene(stage, scene)
+        clock = stage.text(0.02, 0.97, "", transform=stage.transAxes, va="top")
+        cursors = _draw_traces(panels, scene, traces)
+        joints = _joints(scene)
+        for k in _chosen(scene.t):
+            for body, centre in zip(bodies, scene.centres[k], strict=True):
+                body.set_xy((100 * centre[0] - body.get_width() / 2, 100 * centre[1] - body.get_height() / 2))
+            for finger, pad in enumerate(pads):
+                x, y = 100 * scene.tips[k, finger]
+                pad.set_xy((x - (100 * PAD[0] if finger == 0 else 0.0), y - 50 * PAD[1]))
+            for line, chain in zip(links, joints, strict=True):
+                line.set_data(*(100 * chain[k].T))
+            clock.set_text(f"{scene.t[k]:.1f} s")
+            for cursor in cursors:
+                cursor.set_xdata([scene.t[k]] * 2)
+            canvas.draw()
+            if figure.get_layout_engine() is not None:
+                figure.set_layout_engine("none")  # laid out once; the rest only moves
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _chosen(t: np.ndarray) -> np.ndarray:
+    """Rows of `t` nearest to every frame."""
+    return np.clip(np.searchsorted(t, np.arange(t[0], t[-1], 1 / FRAMES)), 0, len(t) - 1)
+
+
+def _draw_scene(stage, scene: Scene):
+    """Ground, blocks, pads and links at their first place; the artists that move."""
+    seen = np.concatenate([scene.tips.reshape(-1, 2), scene.centres.reshape(-1, 2)])
+    left, right = scene.tips[..., 0].min(), scene.tips[..., 0].max()
+    near = 100 * seen[(seen[:, 0] > left - 0.1) & (seen[:, 0] < right + 0.1)]  # a block never met is far
+    (left, _), (right, top) = near.min(axis=0), near.max(axis=0)
+    stage.set(
+        xlim=(left - 2, right + 2), ylim=(-0.4, top + 2), aspect="equal", xlabel="x [cm]", ylabel="y [cm]"
+    )
+    stage.axhline(0.0, color=INK, lw=1.0)
+    bodies = []
+    for k, (name, block) in enumerate(scene.blocks.items()):
+        body = Rectangle((0, 0), 100 * block.width, 100 * block.height, facecolor=OTHER_COLOURS[k % 7],
+                         edgecolor=INK, lw=0.6, alpha=0.8, label=name)  # fmt: skip
+        bodies.append(stage.add_patch(body))
+    pads = [Rectangle((0, 0), 100 * PAD[0], 100 * PAD[1], facecolor=GREY, edgecolor=INK, lw=0.6)
+            for _ in range(2)]  # fmt: skip
+    for pad in pads:
+        stage.add_patch(pad)
+    links = [stage.plot([], [], "o-", color=INK, lw=1.6, ms=3.5, alpha=0.5)[0]
+             for _ in range(2 if scene.rig.jointed else 0)]  # fmt: skip
+    stage.legend(loc="upper right", ncols=len(bodies))
+    return bodies, pads, links
+
+
+def _joints(scene: Scene) -> list[np.ndarray]:
+    """Chains (T, 3, 2) [m] of base, elbow and wrist of both fingers of a jointed hand."""
+    chains = []
+    for i in (1, 2) if scene.rig.jointed else ():
+        finger = scene.rig.finger(i)
+        q = inverse(finger, i, scene.tips[:, i - 1])
+        base = np.broadcast_to(np.asarray(finger.base), (len(q), 2))
+        elbow = base + finger.links[0] * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], -1)
+        chains.append(np.stack([base, elbow, scene.tips[:, i - 1]], 1))
+    return chains
+
+
+def _draw_traces(panels, scene: Scene, traces: Sequence[Trace]) -> list:
+    cursors = []
+    for panel, trace in zip(panels, traces, strict=True):
+        for k, (name, t, values) in enumerate(trace.curves):
+            panel.plot(t, values, color=(INK, BLUE)[k % 2], lw=0.9, label=name or None)
+        panel.set(xlim=(scene.t[0], scene.t[-1]), ylabel=trace.label)
+        cursors.append(panel.axvline(scene.t[0], color=GREY, lw=0.8))
+        if trace is not traces[-1]:
+            panel.tick_params(labelbottom=False)
+    if any(name for name, _, _ in traces[0].curves):
+        panels[0].set_ylim(top=1.45 * panels[0].get_ylim()[1])  # room for the legend
+        panels[0].legend(loc="upper right", ncols=2)
+    panels[-1].set_xlabel("Time [s]")
+    return cursors

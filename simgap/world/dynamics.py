@@ -1,0 +1,268 @@
+"""Planar dynamics of several blocks between two compliant fingertips, on the ground or stacked.
+
+Blocks translate and keep their orientation: flat pads hold a block's faces, flat supports its
+bottom (in recordings of such a hand the shear of a carried block follows the fingers' offset by
+half the shear stiffness, which a block free to tilt would not show). Everything is written
+in scalars, tuples over blocks and fingers: XLA then fuses a whole substep into one kernel, and
+the same code is mapped over trials.
+
+Units: m, s, N, kg, rad. x right, y up; finger 0 is the left one and pushes right.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from simgap.world.contact import friction, normal_force
+
+Scalar = Any  # a float or an Array of shape ()
+Scalars = tuple[Scalar, ...]
+
+EDGE = 1e-3  # m; a contact fades over this length where a face ends
+
+
+class Physics(NamedTuple):
+    """All constants of a scene, a pytree of scalars; effects and gradients act on it.
+
+    Per block: `weight` [N], `width`, `height` [m] and `friction` against a pad. Per finger:
+    `pad_normal`, `pad_shear` [N/m]. `pad_time` [s] is damping over stiffness of the foam.
+    Supports (ground and block on block): `support_stiffness` [N/m] along and across,
+    `support_damping` (ratio to critical) and `support_friction`. `tilt` [rad] inclines the ground.
+    """
+
+    weight: Scalars
+    width: Scalars
+    height: Scalars
+    friction: Scalars
+    pad_normal: Scalars
+    pad_shear: Scalars
+    pad_time: Scalar
+    support_stiffness: Scalar
+    support_damping: Scalar
+    support_friction: Scalar
+    gravity: Scalar
+    tilt: Scalar
+
+
+class State(NamedTuple):
+    """Blocks' centres and velocities (num_blocks each), and where the contacts' anchors lie.
+
+    `pads` (2 x num_blocks), `ground` (num_blocks) and `pairs` (one per pair of blocks) are the
+    relative tangential positions [m] at which a contact carries no shear.
+    """
+
+    x: Scalars
+    y: Scalars
+    vx: Scalars
+    vy: Scalars
+    pads: tuple[Scalars, Scalars]
+    ground: Scalars
+    pairs: Scalars
+
+
+class Tips(NamedTuple):
+    """Undeformed contact faces of the two fingers: positions [m] and velocities [m/s]."""
+
+    x: Scalars
+    y: Scalars
+    vx: Scalars
+    vy: Scalars
+
+
+class Loads(NamedTuple):
+    """Forces [N]: `fx`, `fy` that each finger exerts, `block_x`, `block_y` net on each block,
+    `pads` the normal force of each finger on each block, `support` from beneath each block.
+    """
+
+    fx: Scalars
+    fy: Scalars
+    block_x: Scalars
+    block_y: Scalars
+    pads: tuple[Scalars, Scalars]
+    support: Scalars
+
+
+def pairs(num_blocks: int) -> tuple[tuple[int, int], ...]:
+    """All pairs of blocks, in the order of `State.pairs`."""
+    return tuple(itertools.combinations(range(num_blocks), 2))
+
+
+def resting_state(physics: Physics, x: Sequence[Scalar], y: Sequence[Scalar]) -> State:
+    """Blocks at rest with their centres at x, y [m]; no contact carries shear."""
+    zeros = tuple(0.0 * value for value in x)
+    ground = tuple(_along(physics, a, b) for a, b in zip(x, y, strict=True))
+    offsets = tuple(x[i] - x[j] for i, j in pairs(len(x)))
+    return State(tuple(x), tuple(y), zeros, zeros, (zeros, zeros), ground, offsets)
+
+
+def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
+    """Contact forces in a configuration, and the state with slipping anchors dragged along."""
+    n = len(state.x)
+    force_x: list[Scalar] = [0.0] * n
+    force_y: list[Scalar] = [-w for w in physics.weight]
+    support: list[Scalar] = [0.0] * n
+    tip_x: list[Scalar] = [0.0, 0.0]
+    tip_y: list[Scalar] = [0.0, 0.0]
+    pads, normals = ([], []), ([], [])
+    for finger, sign in ((0, 1.0), (1, -1.0)):
+        for i in range(n):
+            push, shear, anchor = _pad(physics, state, tips, finger, sign, i)
+            force_x[i] += sign * push
+            force_y[i] += shear
+            tip_x[finger] += sign * push
+            tip_y[finger] += shear
+            pads[finger].append(anchor)
+            normals[finger].append(push)
+    ground = []
+    for i in range(n):
+        fx, fy, push, anchor = _ground(physics, state, i)
+        force_x[i] += fx
+        force_y[i] += fy
+        support[i] += push
+        ground.append(anchor)
+    anchors = []
+    for k, (i, j) in enumerate(pairs(n)):
+        fx, fy, anchor = _pair(physics, state, i, j, state.pairs[k])
+        force_x[i] += fx
+        force_x[j] -= fx
+        force_y[i] += fy
+        force_y[j] -= fy
+        support[i] += jnp.maximum(fy, 0.0)
+        support[j] += jnp.maximum(-fy, 0.0)
+        anchors.append(anchor)
+    mapped = state._replace(pads=(tuple(pads[0]), tuple(pads[1])), ground=tuple(ground),
+                            pairs=tuple(anchors))  # fmt: skip
+    return mapped, Loads(tuple(tip_x), tuple(tip_y), tuple(force_x), tuple(force_y),
+                         (tuple(normals[0]), tuple(normals[1])), tuple(support))  # fmt: skip
+
+
+def drift(state: State, h: Scalar) -> State:
+    """Positions moved on by h [s] at constant velocity."""
+    return state._replace(x=tuple(a + h * v for a, v in zip(state.x, state.vx, strict=True)),
+                          y=tuple(a + h * v for a, v in zip(state.y, state.vy, strict=True)))  # fmt: skip
+
+
+def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
+    """Velocities changed by the loads acting for h [s]."""
+    rate = tuple(h * physics.gravity / w for w in physics.weight)
+    return state._replace(
+        vx=tuple(v + r * f for v, r, f in zip(state.vx, rate, loads.block_x, strict=True)),
+        vy=tuple(v + r * f for v, r, f in zip(state.vy, rate, loads.block_y, strict=True)),
+    )
+
+
+def substep(physics: Physics, state: State, tips: Tips, h: Scalar) -> State:
+    """One step of h [s] under tips given at its middle: half drift, kick, half drift.
+
+    The position form of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical
+    Integration, 2006, section I.1): second order and symplectic where nothing dissipates, one
+    evaluation of the forces a step. Stable for h times the fastest frequency below 2.
+    """
+    state, loads = interact(physics, drift(state, h / 2), tips)
+    return drift(kick(physics, state, loads, h), h / 2)
+
+
+def energy(physics: Physics, state: State, tips: Tips) -> Scalar:
+    """Kinetic, gravitational and elastic energy [J] of blocks and contacts."""
+    mapped, _ = interact(physics, state, tips)
+    total = 0.0
+    for i, w in enumerate(physics.weight):
+        total += w / physics.gravity * (state.vx[i] ** 2 + state.vy[i] ** 2) / 2 + w * state.y[i]
+        depth, _ = _ground_depth(physics, state, i)
+        total += physics.support_stiffness * jnp.maximum(depth, 0.0) ** 2 / 2
+        along = _along(physics, state.x[i], state.y[i]) - mapped.ground[i]
+        total += physics.support_stiffness * along**2 / 2
+        for finger, sign in ((0, 1.0), (1, -1.0)):
+            depth, share = _pad_depth(physics, state, tips, finger, sign, i)
+            total += physics.pad_normal[finger] * share * jnp.maximum(depth, 0.0) ** 2 / 2
+            stretch = tips.y[finger] - state.y[i] - mapped.pads[finger][i]
+            total += physics.pad_shear[finger] * stretch**2 / 2
+    for k, (i, j) in enumerate(pairs(len(state.x))):
+        depth, share, beside, overlap = _pair_depths(physics, state, i, j)
+        total += physics.support_stiffness * share * jnp.maximum(depth, 0.0) ** 2 / 2
+        total += physics.support_stiffness * beside * jnp.maximum(overlap, 0.0) ** 2 / 2
+        total += physics.support_stiffness * (state.x[i] - state.x[j] - mapped.pairs[k]) ** 2 / 2
+    return total
+
+
+def _pad_depth(physics: Physics, state: State, tips: Tips, finger: int, sign: float,
+               i: int) -> tuple[Scalar, Scalar]:  # fmt: skip
+    """Compression of a pad by a block, and the share of the pad that meets the block's side."""
+    depth = physics.width[i] / 2 - sign * (state.x[i] - tips.x[finger])
+    reach = physics.height[i] / 2 - jnp.abs(tips.y[finger] - state.y[i])
+    # A finger past the block's middle is behind another block, not inside this one.
+    share = jnp.clip(reach / EDGE + 0.5, 0.0, 1.0) * jnp.where(depth < physics.width[i] / 2, 1.0, 0.0)
+    return depth, share
+
+
+def _pad(physics: Physics, state: State, tips: Tips, finger: int, sign: float,
+         i: int) -> tuple[Scalar, Scalar, Scalar]:  # fmt: skip
+    depth, share = _pad_depth(physics, state, tips, finger, sign, i)
+    stiffness = physics.pad_normal[finger] * share
+    push = normal_force(stiffness, stiffness * physics.pad_time, depth,
+                        sign * (tips.vx[finger] - state.vx[i]))  # fmt: skip
+    offset = tips.y[finger] - state.y[i]
+    shear = physics.pad_shear[finger]
+    force, stretch = friction(shear, shear * physics.pad_time, offset - state.pads[finger][i],
+                              tips.vy[finger] - state.vy[i], physics.friction[i] * push)  # fmt: skip
+    return push, force, offset - stretch
+
+
+def _along(physics: Physics, x: Scalar, y: Scalar) -> Scalar:
+    """Coordinate along the inclined ground [m]."""
+    return x * jnp.cos(physics.tilt) + y * jnp.sin(physics.tilt)
+
+
+def _ground_depth(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar]:
+    """Depth of a block's bottom in the ground, and its rate."""
+    sine, cosine = jnp.sin(physics.tilt), jnp.cos(physics.tilt)
+    depth = sine * state.x[i] - cosine * (state.y[i] - physics.height[i] / 2)
+    return depth, sine * state.vx[i] - cosine * state.vy[i]
+
+
+def _ground(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    depth, rate = _ground_depth(physics, state, i)
+    damping = _damping(physics, physics.weight[i])
+    push = normal_force(physics.support_stiffness, damping, depth, rate)
+    along = _along(physics, state.x[i], state.y[i])
+    sine, cosine = jnp.sin(physics.tilt), jnp.cos(physics.tilt)
+    speed = cosine * state.vx[i] + sine * state.vy[i]
+    force, stretch = friction(physics.support_stiffness, damping, state.ground[i] - along, -speed,
+                              physics.support_friction * push)  # fmt: skip
+    return cosine * force - sine * push, sine * force + cosine * push, push, along + stretch
+
+
+def _pair_depths(physics: Physics, state: State, i: int,
+                 j: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:  # fmt: skip
+    """Vertical depth with its share of contact, then the share of side contact and its depth."""
+    depth = (physics.height[i] + physics.height[j]) / 2 - jnp.abs(state.y[i] - state.y[j])
+    overlap = (physics.width[i] + physics.width[j]) / 2 - jnp.abs(state.x[i] - state.x[j])
+    # Of the two ways out the shorter one is the contact.
+    share = jnp.clip((overlap - jnp.maximum(depth, 0.0)) / EDGE, 0.0, 1.0)
+    beside = jnp.clip((depth - jnp.maximum(overlap, 0.0)) / EDGE, 0.0, 1.0)
+    return depth, share, beside, overlap
+
+
+def _pair(physics: Physics, state: State, i: int, j: int,
+          anchor: Scalar) -> tuple[Scalar, Scalar, Scalar]:  # fmt: skip
+    """Force of block j on block i, and the anchor of their friction (side contact has none)."""
+    depth, share, beside, overlap = _pair_depths(physics, state, i, j)
+    up = jnp.where(state.y[i] > state.y[j], 1.0, -1.0)
+    right = jnp.where(state.x[i] > state.x[j], 1.0, -1.0)
+    weight = physics.weight[i] * physics.weight[j] / (physics.weight[i] + physics.weight[j])
+    k, damping = physics.support_stiffness, _damping(physics, weight)
+    vx, vy = state.vx[i] - state.vx[j], state.vy[i] - state.vy[j]
+    push = normal_force(k * share, damping * share, depth, -up * vy)
+    side = normal_force(k * beside, damping * beside, overlap, -right * vx)
+    offset = state.x[i] - state.x[j]
+    force, stretch = friction(k, damping, anchor - offset, -vx, physics.support_friction * push)
+    return right * side + force, up * push, offset + stretch
+
+
+def _damping(physics: Physics, weight: Scalar) -> Scalar:
+    """Damping [N s/m] of a support under a body of this weight."""
+    return 2 * physics.support_damping * jnp.sqrt(physics.support_stiffness * weight / physics.gravity)

@@ -1,0 +1,266 @@
+"""An operator who performs any block task: motions, grip, dwell, wander and tremor of a person.
+
+Plans in commanded fingertip positions; the compliant hand (`simgap.world.performance`) turns what is
+commanded beyond a contact into grip and pressing. Motions are minimum-jerk (Flash & Hogan,
+J. Neurosci. 5, 1985), superposed where one begins before another ends (Flash & Henis, J. Cogn.
+Neurosci. 3, 1991); physiological tremor lies at 6-12 Hz.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hmmseg.errors import InputError, nearest
+from hmmseg.io.rig import Rig, read_toml
+from hmmseg.io.task import BlockTask, Move
+from simgap.world.layout import Table, lay_out
+from simgap.world.performance import CONTROL_PERIOD
+from simgap.world.properties import Blocks
+from simgap.world.scene import finite_stiffness
+
+Range = tuple[float, float]
+TREMOR_BAND = (6.0, 12.0)  # Hz
+WANDER_BAND = (0.1, 0.6)  # Hz
+HOVER = 0.008  # m; open fingers pass this far above the highest block
+NEAR = 0.0025  # m above touchdown, where a quick descent becomes a slow approach
+PACE = 5.0  # s a move at least, the paper's (two moves in 10 s)
+
+
+@dataclass(frozen=True)
+class OperatorSettings:
+    """How the operator works: every quantity is drawn uniformly from its range for each motion.
+
+    Times [s], lengths [m], forces [N]; `pace` divides all durations of motion and dwell. The
+    hand's `hand_stiffness` [N/m], `hand_mass` [kg] and `hand_damping` (ratio) are drawn once a
+    trial, as are `offset` (of the fingers' heights) and rms `tremor` and `wander` of each tip.
+    """
+
+    grip: Range = (2.0, 3.2)
+    press: Range = (0.9, 1.9)
+    slide_press: Range = (0.0, 0.2)
+    rest: Range = (0.2, 0.5)
+    travel: Range = (0.45, 0.6)
+    descend: Range = (0.38, 0.5)
+    dwell: Range = (0.02, 0.1)
+    close: Range = (0.18, 0.26)
+    hold: Range = (0.3, 0.5)
+    lift: Range = (0.36, 0.48)
+    air: Range = (0.05, 0.25)  # between the parts of a carry; negative: they overlap
+    approach: Range = (0.14, 0.2)
+    place: Range = (0.3, 0.5)
+    slide: Range = (0.6, 0.9)
+    open: Range = (0.14, 0.2)
+    finish: Range = (0.3, 0.4)
+    clearance: Range = (0.010, 0.013)  # opening beyond a block's width
+    rise: Range = (0.012, 0.018)
+    grasp: Range = (-0.001, 0.001)  # height of the grasp over the block's centre
+    misplacement: Range = (-0.0008, 0.0008)
+    offset: Range = (-0.0005, 0.0005)
+    tremor: Range = (2.5e-5, 5.5e-5)
+    wander: Range = (3e-5, 1.8e-4)
+    hand_stiffness: Range = (350.0, 550.0)
+    hand_mass: Range = (0.10, 0.18)
+    hand_damping: Range = (0.7, 1.0)
+    pace: Range = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            low, high = getattr(self, name)
+            if not (np.isfinite([low, high]).all() and low <= high):
+                raise ValueError(f"operator {name} is {(low, high)}; expected (low, high), low <= high")
+        for name in ("grip", "pace", "hand_stiffness", "hand_mass", "hand_damping"):
+            if getattr(self, name)[0] <= 0:
+                raise ValueError(f"operator {name} starts at {getattr(self, name)[0]}; expected above 0")
+
+
+def read_operator(path: str | Path) -> OperatorSettings:
+    """Settings from a TOML or JSON file: [low, high] or one number by name; InputError for others."""
+    path = Path(path)
+    if path.suffix.lower() == ".json":
+        try:
+            table = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(str(path), f"cannot be read ({error})", "operator settings") from None
+    else:
+        table = read_toml(path)
+    settings = {}
+    for name, value in table.items():
+        if name not in OperatorSettings.__dataclass_fields__:
+            raise InputError(f"{path}: key {name}", "unknown key",
+                             nearest(name, OperatorSettings.__dataclass_fields__))  # fmt: skip
+        pair = value if isinstance(value, list) else [value, value]
+        if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
+            raise InputError(f"{path}: key {name}", f"found {value!r}", "a number or [low, high]")
+        settings[name] = (float(pair[0]), float(pair[1]))
+    try:
+        return OperatorSettings(**settings)
+    except ValueError as error:
+        raise InputError(str(path), str(error)) from None
+
+
+@dataclass(frozen=True)
+class Window:
+    """When a move was commanded [s]: closing, lifting (or pushing), midway, opening, let go."""
+
+    object: str
+    slide: bool
+    close: float
+    lift: float
+    middle: float
+    open: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m]; the hand and the start of every block.
+
+    `impedance` is (mass [kg], stiffness [N/m], damping [N s/m]); `start` gives block centres [m].
+    """
+
+    command: np.ndarray
+    impedance: tuple[float, float, float]
+    start: dict[str, tuple[float, float]]
+    windows: tuple[Window, ...]
+    duration: float
+
+
+def minimum_jerk(phase: np.ndarray) -> np.ndarray:
+    """Share of a minimum-jerk motion done at a phase of 0 to 1 (Flash & Hogan 1985)."""
+    s = np.clip(phase, 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+class _Coordinate:
+    """One commanded coordinate: a start and superposed minimum-jerk motions."""
+
+    def __init__(self, start: float) -> None:
+        self.start = self.target = start
+        self.motions: list[tuple[float, float, float]] = []
+
+    def go(self, target: float, at: float, duration: float) -> None:
+        self.motions.append((at, duration, target - self.target))
+        self.target = target
+
+    def sample(self, t: np.ndarray) -> np.ndarray:
+        out = np.full_like(t, self.start)
+        for at, duration, way in self.motions:
+            out += way * minimum_jerk((t - at) / duration)
+        return out
+
+
+class _Performer:
+    """One performance being planned: the commanded coordinates, the table and the clock [s]."""
+
+    def __init__(self, rig: Rig, blocks: Blocks, table: Table, settings: OperatorSettings,
+                 rng: np.random.Generator) -> None:  # fmt: skip
+        self.blocks, self.table, self.settings, self.rng = blocks, table, settings, rng
+        self.pace = self.draw("pace")
+        self.stiffness, self.mass = self.draw("hand_stiffness"), self.draw("hand_mass")
+        self.pad_normal = finite_stiffness(rig.fingertip.normal_stiffness)
+        self.pad_shear = finite_stiffness(rig.fingertip.shear_stiffness)
+        self.clock = self.time("rest")
+
+    def draw(self, name: str) -> float:
+        """A value of a setting."""
+        return float(self.rng.uniform(*getattr(self.settings, name)))
+
+    def time(self, name: str, way: float = 0.0, usual: float = 1.0) -> float:
+        """A duration [s] at the operator's pace, longer where the way [m] is longer than usual."""
+        return self.draw(name) / self.pace * max(1.0, way / usual)
+
+    def begin(self, name: str) -> None:
+        """Wait open, above and beside the first block."""
+        self.x = _Coordinate(self.table.x[name] + self.rng.uniform(-0.02, 0.02))
+        self.y = _Coordinate(self.table.top() + self.rng.uniform(0.012, 0.022))
+        self.gap = _Coordinate(self.blocks[name].width + self.draw("clearance"))
+
+    def perform(self, move: Move) -> Window:
+        """Pregrasp, pickup, carry or slide, place and release of one move."""
+        block, centre = self.blocks[move.object], self.table.centre(move.object)
+        grasp = centre + self.draw("grasp")
+        self._reach(self.table.x[move.object], grasp, block.width + self.draw("clearance"))
+        close, squeeze = self.clock, self.draw("grip") * (1 / self.pad_normal + 1 / self.stiffness)
+        closing = self.time("close")
+        self.gap.go(block.width - 2 * squeeze, close, closing)
+        lift = close + closing + self.time("hold")
+        middle, placed = self._slide(move, lift) if move.slide else self._carry(move, lift, grasp - centre)
+        release, opening = placed + self.time("place"), self.time("open")
+        self.gap.go(block.width + self.draw("clearance"), release, opening)
+        end = release + opening + self.time("dwell")
+        above = max(self.y.target + self.draw("rise"), self.table.top() + HOVER)
+        rising = self.time("lift", above - self.y.target, 0.03)
+        self.y.go(above, end, rising)
+        self.clock = end + rising
+        return Window(move.object, move.slide, close, lift, middle, release, end)
+
+    def _reach(self, x: float, y: float, opening: float) -> None:
+        """Go over a block and come down around it."""
+        travel = self.time("travel", abs(x - self.x.target), 0.05)
+        self.x.go(x + self.draw("misplacement"), self.clock, travel)
+        self.gap.go(max(opening, self.gap.target), self.clock, travel)
+        down = self.clock + travel + self.time("dwell")
+        descend = self.time("descend", self.y.target - y, 0.04)
+        self.y.go(y, down, descend)
+        self.clock = down + descend + self.time("dwell")
+
+    def _slide(self, move: Move, start: float) -> tuple[float, float]:
+        """Push a block along its support; times [s] midway and at the end."""
+        target = self.table.slide(move, self.draw("misplacement"))
+        way = abs(target - self.x.target)
+        duration = self.time("slide", way, 0.05) * min(1.0, max(0.4, way / 0.03))
+        self.y.go(self.y.target - self.draw("slide_press") / (2 * self.stiffness), start - 0.1, 0.1)
+        self.x.go(target, start, duration)
+        return start + duration / 2, start + duration
+
+    def _carry(self, move: Move, start: float, grasp: float) -> tuple[float, float]:
+        """Lift a block, bring it over its destination and press it on; times [s] midway and at the end."""
+        block, before = self.blocks[move.object], self.table.centre(move.object)
+        target = self.table.carry(move, self.draw("misplacement"))
+        rest, rise = self.table.centre(move.object), self.draw("rise")
+        clear = self.table.top(without=move.object) + block.height / 2
+        high = max(before, clear) + grasp + rise
+        up, fall = self.time("lift", high - before, 0.035), self.time("descend", high - rest, 0.04)
+        travel = self.time("travel", abs(target - self.x.target), 0.05)
+        self.y.go(high, start, up)
+        across = start + up + self.time("air")
+        self.x.go(target, across, travel)
+        down = across + travel + self.time("air")
+        # At touchdown the block hangs from the pads' shear; pressing commands the tips beyond it.
+        touch = rest + grasp + block.weight / (2 * self.pad_shear)
+        self.y.go(touch + NEAR, down, fall)
+        press, ramp = self.draw("press") / (2 * self.stiffness), self.time("hold")
+        landing, approach = down + 0.9 * fall, self.time("approach")
+        self.y.go(touch - press / 2, landing, approach)
+        self.y.go(touch - press, landing + approach, ramp)
+        return across + travel / 2, landing + approach
+
+
+def plan(task: BlockTask, rig: Rig, blocks: Blocks, settings: OperatorSettings,
+         rng: np.random.Generator) -> Plan:  # fmt: skip
+    """Commands for one performance of a task, all that varies drawn from `rng`."""
+    table = lay_out(task, blocks, settings.clearance[1], settings.misplacement, rng)
+    start = {name: (table.x[name], table.centre(name)) for name in task.objects}
+    performer = _Performer(rig, blocks, table, settings, rng)
+    performer.begin(task.performed[0].object)
+    windows = tuple(performer.perform(move) for move in task.performed)
+    duration = max(PACE * len(windows) / performer.pace, performer.clock + performer.time("finish"))
+    t = np.arange(round(duration / CONTROL_PERIOD) + 1) * CONTROL_PERIOD
+    x, y, gap = (c.sample(t) for c in (performer.x, performer.y, performer.gap))
+    offset, tremor, wander = (performer.draw(name) for name in ("offset", "tremor", "wander"))
+    tips = np.stack([x - gap / 2, y - offset / 2, x + gap / 2, y + offset / 2], 1)
+    for k in range(4):
+        tips[:, k] += _oscillation(t, TREMOR_BAND, tremor, rng) + _oscillation(t, WANDER_BAND, wander, rng)
+    damping = 2 * performer.draw("hand_damping") * np.sqrt(performer.stiffness * performer.mass)
+    return Plan(tips, (performer.mass, performer.stiffness, damping), start, windows, duration)
+
+
+def _oscillation(t: np.ndarray, band: Range, rms: float, rng: np.random.Generator) -> np.ndarray:
+    """Narrow-band motion [m] of a given rms: sinusoids with random frequencies and phases."""
+    count = 6
+    frequency, phase = rng.uniform(*band, (count, 1)), rng.uniform(0, 2 * np.pi, (count, 1))
+    return rms * np.sqrt(2 / count) * np.sin(2 * np.pi * frequency * t + phase).sum(axis=0)

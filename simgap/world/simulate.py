@@ -1,0 +1,152 @@
+"""Complete synthetic trials: an operator performs a task, sensors record it, contacts tell the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from simgap.world.dynamics import Physics, State, resting_state
+from simgap.world.operator import OperatorSettings, Plan, Window, plan
+from simgap.world.performance import CONTROL_PERIOD, Impedance, Record, perform
+from simgap.world.properties import Blocks
+from simgap.world.scene import Surroundings, physics, substeps_for
+from simgap.world.sensors import DEFAULT_RATE, record
+
+BUCKET = 4000  # control periods; commands are padded to multiples, so that few programs are compiled
+BATCH = 16  # trials integrated side by side
+MOVING = 2e-3  # m/s; a slide begins and ends where the block's speed passes this
+
+
+@dataclass(frozen=True)
+class SimulatedTrial:
+    """A synthetic recording with its truth.
+
+    `trial` is as read from a file. `boundaries` (num_subtasks - 1,) [s] are the times between the
+    subtasks, from the contacts (NaN where one never happened: a dropped block). `motion` is what truly
+    happened, one row per millisecond at times `t` [s], blocks in the order of `blocks`.
+    """
+
+    trial: Trial
+    boundaries: np.ndarray
+    t: np.ndarray
+    motion: Record
+    blocks: Blocks
+    seed: int
+
+
+def simulate_trial(task: BlockTask, rig: Rig, properties: Blocks, seed: int,
+                   operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
+                   ) -> SimulatedTrial:  # fmt: skip
+    """One performance of a task with blocks of known properties, drawn from `seed`.
+
+    InputError where a block is missing or the hand cannot reach that far.
+    """
+    return simulate_trials(task, rig, [properties], [seed], operator, surroundings)[0]
+
+
+def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], seeds: Sequence[int],
+                    operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
+                    ) -> list[SimulatedTrial]:  # fmt: skip
+    """Many performances at once, one for each seed with its blocks; each as `simulate_trial` gives it.
+
+    They are integrated side by side, which costs far less than one after another.
+    """
+    settings = operator or OperatorSettings()
+    if not seeds:
+        return []
+    for blocks in properties:
+        for name in task.objects:
+            if name not in blocks:
+                raise InputError("properties", f"object {name!r} is missing", "a block for every object")
+    plans = [plan(task, rig, blocks, settings, np.random.default_rng([seed, 0]))
+             for blocks, seed in zip(properties, seeds, strict=True)]  # fmt: skip
+    scenes = [physics(rig, [blocks[name] for name in task.objects], surroundings) for blocks in properties]
+    substeps = max(substeps_for(scene, CONTROL_PERIOD) for scene in scenes)
+    length = -(-max(len(p.command) for p in plans) // BUCKET) * BUCKET
+    trials = []
+    for k in range(0, len(plans), BATCH):
+        batch = range(k, min(k + BATCH, len(plans)))
+        records = _perform_all(task, [plans[j] for j in batch], [scenes[j] for j in batch], length, substeps)
+        trials += [_trial(task, rig, plans[j], motion, properties[j], seeds[j])
+                   for j, motion in zip(batch, records, strict=True)]  # fmt: skip
+    return trials
+
+
+def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physics], length: int,
+                 substeps: int) -> list[Record]:  # fmt: skip
+    """Records of one batch; a batch of several is filled up to BATCH, so that one program serves all."""
+    hands = [Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
+    commands = [np.pad(p.command, ((0, length - len(p.command)), (0, 0)), "edge") for p in plans]
+    starts = [_start(scene, task, p) for scene, p in zip(scenes, plans, strict=True)]
+    rows = list(zip(scenes, hands, commands, starts, strict=True))
+    rows += [rows[-1]] * (BATCH - len(rows) if len(rows) > 1 else 0)
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+    batch = jax.tree.map(np.asarray, _perform_batch(*stacked, substeps=substeps))
+    return [jax.tree.map(lambda a, j=j: a[j], batch) for j in range(len(plans))]
+
+
+@partial(jax.jit, static_argnames=("substeps",))
+def _perform_batch(
+    scenes: Physics, hands: Impedance, commands: Array, starts: State, substeps: int
+) -> Record:
+    return jax.vmap(partial(perform, substeps=substeps))(scenes, hands, commands, starts)
+
+
+def _start(scene: Physics, task: BlockTask, performance: Plan) -> State:
+    x, y = zip(*(performance.start[name] for name in task.objects), strict=True)
+    return resting_state(scene, [jnp.asarray(v) for v in x], [jnp.asarray(v) for v in y])
+
+
+def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks: Blocks,
+           seed: int) -> SimulatedTrial:  # fmt: skip
+    n = len(performance.command)
+    motion = jax.tree.map(lambda a: a[:n], motion)
+    fine = np.arange(n) * CONTROL_PERIOD
+    rate = rig.rate or DEFAULT_RATE
+    t = np.arange(int(round(performance.duration * rate, 6))) / rate
+    place, speed, force = (
+        _at(t, fine, values) for values in (motion.position, motion.velocity, motion.force)
+    )
+    trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
+    order = {name: k for k, name in enumerate(task.objects)}
+    truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]
+    return SimulatedTrial(trial, np.array(truth), fine, motion, blocks, seed)
+
+
+def _at(t: np.ndarray, fine: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values at sampling times, linear between milliseconds."""
+    flat = values.reshape(len(fine), -1)
+    return np.stack([np.interp(t, fine, column) for column in flat.T], 1).reshape(t.size, *values.shape[1:])
+
+
+def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> list[float]:
+    """The four times [s] of a move: both touch, leaves (or slides), meets (or stops), one lets go."""
+    gripped = (motion.pads[:, :, block] > 0).all(axis=1)
+    early, late = (t >= window.lift) & (t < window.middle), (t >= window.middle) & (t < window.end)
+    if window.slide:
+        still = np.hypot(motion.block_velocity[:, block, 0], motion.block_velocity[:, block, 1]) < MOVING
+        start = t[early & still].max(initial=window.lift)
+        stop = _first(t, late & still)
+    else:
+        standing = motion.support[:, block] > 0
+        start = t[early & standing].max(initial=window.lift)
+        stop = _first(t, late & standing)
+        if standing[np.searchsorted(t, window.middle)]:  # never lifted
+            start = stop = np.nan
+    closing = (t >= window.close) & (t < window.lift)
+    return [_first(t, closing & gripped), start, stop, _first(t, (t >= window.open) & ~gripped)]
+
+
+def _first(t: np.ndarray, there: np.ndarray) -> float:
+    """Time of the first true entry; NaN where there is none."""
+    return float(t[np.argmax(there)]) if there.any() else np.nan

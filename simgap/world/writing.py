@@ -1,0 +1,99 @@
+"""Synthetic trials as a folder of recordings: rig, task, actual properties, trials and their truth."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from simgap.world.properties import UNITS, Blocks
+from simgap.world.simulate import SimulatedTrial
+
+DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # decimals by a channel's first letter
+
+
+def write_trials(folder: str | Path, task: BlockTask, rig: Rig, blocks: Blocks,
+                 trials: Sequence[SimulatedTrial]) -> list[Path]:  # fmt: skip
+    """Write trials of the same blocks in the input format; the files written.
+
+    rig.toml, task.toml, actual.toml (the true properties), trial_NN.csv and truth/trial_NN.json.
+    """
+    folder = Path(folder)
+    (folder / "truth").mkdir(parents=True, exist_ok=True)
+    texts = scene_files(task, rig, blocks)
+    for k, simulated in enumerate(trials, 1):
+        texts |= trial_files(k, simulated.trial, simulated.boundaries, simulated.seed)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return [folder / name for name in texts]
+
+
+def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
+    """Texts of rig.toml, task.toml and actual.toml by file name."""
+    actual = {
+        name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
+        for name in task.objects
+    }
+    return {"rig.toml": toml(rig.model_dump(exclude_none=True, exclude_defaults=True)),
+            "task.toml": toml(task_table(task)), "actual.toml": toml(actual)}  # fmt: skip
+
+
+def trial_files(number: int, trial: Trial, boundaries: np.ndarray, seed: int) -> dict[str, str]:
+    """Texts of one trial and its truth (boundaries [s], null where one never happened) by file name."""
+    times = [round(float(b), 6) if np.isfinite(b) else None for b in boundaries]
+    truth = json.dumps({"boundaries": times, "seed": int(seed)})
+    return {f"trial_{number:02d}.csv": trial_csv(trial), f"truth/trial_{number:02d}.json": truth + "\n"}
+
+
+def trial_csv(trial: Trial) -> str:
+    """A trial as CSV text: t and the hand's channels, rounded below the sensors' noise; empty if missing."""
+    rows = [f"{t:.6f}" for t in trial.t]
+    for name, values in trial.channels.items():
+        digits = DIGITS[name[0]]
+        cells = (f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values)
+        rows = [f"{row},{cell}" for row, cell in zip(rows, cells, strict=True)]
+    return "\n".join([",".join(["t", *trial.channels]), *rows]) + "\n"
+
+
+def task_table(task: BlockTask) -> dict[str, Any]:
+    """The table of `task.toml` that describes a task."""
+    moves = [{"object": m.object, "to": m.to} | ({"slide": True} if m.slide else {}) for m in task.moves]
+    table: dict[str, Any] = {} if task.repeat == 1 else {"repeat": task.repeat}
+    return table | {"objects": {name: {"on": on} for name, on in task.initial.items()}, "moves": moves}
+
+
+def toml(table: Mapping[str, Any], prefix: str = "") -> str:
+    """TOML text of nested tables, lists of tables, numbers, strings and lists of those."""
+    plain, tables = [], []
+    for key, value in table.items():
+        name = prefix + _key(key)
+        if isinstance(value, Mapping):
+            only_tables = value and all(isinstance(entry, Mapping) for entry in value.values())
+            tables.append(("" if only_tables else f"[{name}]\n") + toml(value, name + "."))
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            tables += [f"[[{name}]]\n{toml(entry, name + '.')}" for entry in value]
+        else:
+            plain.append(f"{_key(key)} = {_value(value)}\n")
+    return "".join(plain + tables)
+
+
+def _key(key: str) -> str:
+    bare = key.isascii() and key.replace("_", "").replace("-", "").isalnum()
+    return key if bare else json.dumps(key, ensure_ascii=False)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return repr(value) if math.isfinite(value) else str(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)

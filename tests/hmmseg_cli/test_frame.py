@@ -1,0 +1,242 @@
+"""The frame of the commands: exit codes, one line of error, strict JSON, all files or none."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hmmseg
+from hmmseg.errors import InputError
+from hmmseg_cli import main as frame
+from hmmseg_cli.console import Output, distinct_trials, strict_json
+
+HMMSEG = Path(sys.executable).with_name("hmmseg")
+TASK = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
+
+
+def run(*args: str, **more) -> subprocess.CompletedProcess:
+    return subprocess.run([HMMSEG, *args], capture_output=True, text=True, check=False, **more)
+
+
+@pytest.fixture
+def task(tmp_path) -> Path:
+    path = tmp_path / "task.toml"
+    path.write_text(TASK)
+    return path
+
+
+def test_process_prints_only_json_on_standard_output(task):
+    done = run("decompose", str(task), "--json", "-", "--seed", "7")
+    assert done.returncode == 0
+    document = json.loads(done.stdout)
+    assert list(document)[:5] == ["format", "version", "seed", "warnings", "figures"]
+    assert document["format"] == "hmmseg.contact.decompose/1"
+    assert (document["version"], document["seed"]) == (hmmseg.__version__, 7)
+    assert "Subtask" in done.stderr
+
+
+def test_process_at_fault_says_one_line_and_exits_with_2(tmp_path):
+    (tmp_path / "bad.toml").write_text(TASK.replace('to = "ground"', 'to = "table"'))
+    done = run("decompose", "bad.toml", "--json", "out.json", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("bad.toml: move 1: unknown destination 'table'; expected one of block1, ")
+    assert done.stderr.count("\n") == 1
+    assert os.listdir(tmp_path) == ["bad.toml"]
+
+
+def test_light_commands_do_not_import_heavy_modules():
+    heavy = ("jax", "pandas", "matplotlib", "scipy", "arviz")
+    code = f"import sys, hmmseg_cli.main; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_version_and_help(capsys):
+    assert frame.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{hmmseg.__version__}\n"
+    for args in ([], ["--help"], ["-h"]):
+        assert frame.main(args) == 0
+        assert "decompose" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["decompse"], "hmmseg: No such command 'decompse'"),
+        (["decompose"], "hmmseg decompose: Missing argument 'TASK'"),
+        (["decompose", "a", "--jsn", "b"], "hmmseg decompose: No such option: --jsn"),
+        (["decompose", "a", "b"], "hmmseg decompose: Got unexpected extra argument"),
+        (["decompose", "a", "--seed", "x"], "hmmseg decompose: Invalid value for '--seed'"),
+        (["decompose", "a", "--seed", "-1"], "hmmseg decompose: Invalid value for '--seed'"),
+        (["decompose", "a", "--json"], "hmmseg: Option '--json' requires an argument"),
+        (["--nonsense"], "hmmseg: No such option: --nonsense"),
+        (["decompose", "absent.toml"], "absent.toml: no such file; expected a TOML file"),
+    ],
+)
+def test_usage_at_fault(capsys, args, line):
+    assert frame.main(args) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(line)
+
+
+def test_any_other_exception_is_a_bug(monkeypatch, task):
+    def broken(found):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("hmmseg_cli.decompose._table", broken)
+    with pytest.raises(ZeroDivisionError):
+        frame.main(["decompose", str(task)])
+
+
+def test_a_process_with_a_bug_shows_its_traceback(task):
+    code = """if True:
+        import sys
+        from hmmseg_cli import decompose, main
+        decompose.decompose_task = lambda task: 1 / 0
+        sys.exit(main.main(["decompose", sys.argv[1]]))
+    """
+    done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Traceback")
+    assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"json": "{}/trial.csv"}, "--json .*trial.csv: would be written over, .*; expected a .json file"),
+        ({"json": "{}"}, "--json .*: is a folder; expected a file"),
+        (
+            {"json": "{}/absent/a.json"},
+            "--json .*a.json: no folder .*absent; expected a file in a folder that",
+        ),
+        ({"report": "{}/a.json"}, "--report .*a.json: unknown kind of file; expected .html or .htm"),
+        ({"figures": "{}/file"}, "--figures .*file is not a folder; expected a folder"),
+        ({"figures": "{}/file/below"}, "--figures .*file is not a folder"),
+    ],
+)
+def test_destinations_are_checked_beforehand(tmp_path, arguments, message):
+    (tmp_path / "file").write_text("")
+    given = {name: value.format(tmp_path) for name, value in arguments.items()}
+    with pytest.raises(InputError, match=f"^{message}"):
+        Output("test", json=given.get("json"),
+               figures=Path(given["figures"]) if "figures" in given else None,
+               report=Path(given["report"]) if "report" in given else None)  # fmt: skip
+
+
+def test_destinations_without_permission(tmp_path, monkeypatch):
+    (tmp_path / "a.json").write_text("old")
+    monkeypatch.setattr("hmmseg_cli.console.os.access", lambda path, mode: False)  # root may write anywhere
+    for arguments in ({"json": str(tmp_path / "a.json")}, {"json": str(tmp_path / "b.json")},
+                      {"report": tmp_path / "c.html"}, {"figures": tmp_path / "d"}):  # fmt: skip
+        with pytest.raises(InputError, match="cannot be written"):
+            Output("test", **arguments)
+
+
+def test_files_appear_together_at_the_end(tmp_path):
+    with Output("test", json=str(tmp_path / "a.json"), figures=tmp_path / "new/figures",
+                report=tmp_path / "r.html", quiet=True) as out:  # fmt: skip
+        out.warn("beware")
+        out.figure("one.png").write_bytes(b"1")
+        out.figure("one.png").write_bytes(b"2")
+        out.stage(tmp_path / "r.html").write_text("<p>")
+        assert os.listdir(tmp_path) == []
+        out.finish({"value": 1})
+    figure = tmp_path / "new/figures/one.png"
+    assert figure.read_bytes() == b"2"
+    assert (tmp_path / "r.html").read_text() == "<p>"
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document == {"format": "hmmseg.test/1", "version": hmmseg.__version__, "seed": 0,
+                        "warnings": ["beware"], "figures": [str(figure)], "value": 1}  # fmt: skip
+    assert sorted(os.listdir(tmp_path)) == ["a.json", "new", "r.html"]
+
+
+def test_a_failure_leaves_everything_as_it_was(tmp_path):
+    (tmp_path / "a.json").write_text("old")
+    with (pytest.raises(InputError),
+          Output("test", json=str(tmp_path / "a.json"), figures=tmp_path / "figures") as out):  # fmt: skip
+        out.figure("one.png").write_bytes(b"1")
+        raise InputError("here", "wrong")
+    assert (tmp_path / "a.json").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_full_disk_leaves_no_half_written_file(tmp_path, monkeypatch):
+    def full(source, target):
+        Path(target).write_text("ha")
+        raise OSError(28, "No space left on device", str(target))
+
+    monkeypatch.setattr("hmmseg_cli.console.shutil.copyfile", full)
+    with (pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"),
+          Output("test", json=str(tmp_path / "a.json"), quiet=True) as out):  # fmt: skip
+        out.finish({})
+    assert os.listdir(tmp_path) == []
+
+
+def test_links_and_devices_are_written_through(tmp_path):
+    (tmp_path / "real.json").write_text("old")
+    (tmp_path / "link.json").symlink_to("real.json")
+    for name in (str(tmp_path / "link.json"), os.devnull):
+        with Output("test", json=name, quiet=True) as out:
+            out.finish({})
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "real.json").read_text())["format"] == "hmmseg.test/1"
+    assert Path(os.devnull).is_char_device()
+
+
+def test_standard_output_is_kept_clean(capsys):
+    with Output("test", json="-") as out:
+        out.print("to people")
+        print("a stray print")
+        out.warn("beware")
+        with out.progress("sampling", 3) as advance:
+            advance(3)
+        out.finish({"value": np.nan})
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["value"] is None
+    assert "to people\n" in printed.err
+    assert "a stray print\n" in printed.err
+    assert "warning: beware\n" in printed.err
+
+
+def test_quiet(capsys):
+    with Output("test", quiet=True) as out:
+        out.print("to people")
+        out.warn("beware")
+        out.finish({})
+    assert tuple(capsys.readouterr()) == ("", "")
+
+
+def test_a_figure_needs_a_folder():
+    with Output("test") as out, pytest.raises(ValueError, match="no folder for figures"):
+        out.figure("one.png")
+
+
+def test_strict_json():
+    document = {"a": np.array([1.0, np.nan]), "b": (np.float32(0.5), np.int64(3), np.bool_(True)),
+                "c": float("inf"), "d": [float("-inf"), None, "x"], "e": Path("p"), 3: "µ"}  # fmt: skip
+    plain = {"a": [1.0, None], "b": [0.5, 3, True], "c": None, "d": [None, None, "x"], "e": "p", "3": "µ"}
+    assert json.loads(strict_json(document), parse_constant=pytest.fail) == plain
+    with pytest.raises(TypeError):
+        strict_json({"a": object()})
+
+
+def test_distinct_trials(tmp_path):
+    paths = [tmp_path / "a.csv", tmp_path / "b.csv", tmp_path / "copy.csv"]
+    for path, text in zip(paths, "aba", strict=True):
+        path.write_text(text)
+    assert distinct_trials(paths[:2]) == paths[:2]
+    for twice in ([paths[0], paths[0]], [paths[0], tmp_path / "." / "a.csv"], [paths[0], paths[2]]):
+        with pytest.raises(InputError, match=r"csv: the same trial as .*a\.csv; expected every trial once"):
+            distinct_trials(twice)
+    with pytest.raises(InputError, match=r"absent\.csv: no such file; expected a trial"):
+        distinct_trials([tmp_path / "absent.csv"])
+    with pytest.raises(InputError, match="is a folder; expected a trial"):
+        distinct_trials([tmp_path])

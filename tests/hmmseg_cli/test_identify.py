@@ -1,0 +1,208 @@
+"""segment, identify and demo on recordings of the stand-in rig: the outward contract, end to end."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hmmseg_cli.main import main
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+NONE = RECORDINGS / "none_1"
+RIG_AND_TASK = ("--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"))
+
+
+def document(*args: str, out: Path) -> dict:
+    assert main([*args, "--json", str(out), "--quiet"]) == 0
+
+    def refuse(name: str) -> float:
+        raise AssertionError(f"{name} in JSON")
+
+    return json.loads(out.read_text(), parse_constant=refuse)
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory) -> tuple[dict, Path]:
+    folder = tmp_path_factory.mktemp("identified")
+    trials = [str(NONE / f"trial_0{i}.csv") for i in (1, 2)]
+    found = document(
+        "identify", *trials, *RIG_AND_TASK, "--actual", str(NONE / "actual.toml"), "--figures",
+        str(folder / "figures"), "--report", str(folder / "page.html"), out=folder / "out.json",
+    )  # fmt: skip
+    return found, folder
+
+
+def test_segment_finds_every_boundary(tmp_path):
+    trial = NONE / "trial_01.csv"
+    found = document("segment", str(trial), *RIG_AND_TASK, out=tmp_path / "out.json")
+    assert found["format"] == "hmmseg.segment/1"
+    (only,) = found["trials"]
+    assert only["complete"] and "failed" not in only and only["rate"] == pytest.approx(20)
+    segments = only["segments"]
+    truth = json.loads((NONE / "truth" / "trial_01.json").read_text())["boundaries"]
+    assert [s["end"] for s in segments[:-1]] == pytest.approx(truth, abs=0.03)
+    assert [a["end"] for a in segments[:-1]] == [b["start"] for b in segments[1:]]
+    assert segments[0]["start"] == 0.0 and segments[-1]["end"] == pytest.approx(9.95)
+    assert [s["subtask"] for s in segments] == [
+        "pregrasp", "pickup", "carry", "place", "release", "pickup", "carry", "place", "release",
+    ]  # fmt: skip
+    for segment in segments[1:]:
+        low, high = segment["start_90"]
+        assert low < segment["start"] < high and segment["start_sd"] > 0
+
+
+def test_identify_recovers_the_blocks(identified):
+    found, _ = identified
+    actual = {  # labels.json of the recordings
+        "block1": {"weight": 0.57789, "width": 0.018794, "height": 0.017266},
+        "block2": {"weight": 0.52560, "width": 0.027978, "height": 0.012562},
+    }
+    for name, entries in actual.items():
+        for prop, value in entries.items():
+            entry = found["properties"][name][prop]
+            assert entry["mean"] == pytest.approx(value, rel=0.02 if prop == "weight" else 0.003)
+            assert abs(entry["mean"] - value) < 4 * entry["sd"]
+            low, high = entry["interval_95"]
+            assert low < entry["interval_68"][0] < entry["median"] < entry["interval_68"][1] < high
+            assert entry["subtasks"]
+        assert 0 < found["properties"][name]["friction"]["lower_bound"] < 1.2
+    assert found["properties"]["block1"]["weight"]["subtasks"] == ["carry block1"]
+    assert found["properties"]["block1"]["height"]["subtasks"] == ["pickup block2", "place block2"]
+    assert found["sampler"]["ess"] > 500 and found["sampler"]["rhat"] < 1.02
+    assert found["reasons"] == {} and found["warnings"] == []
+    assert found["actual"]["block1"]["width"]["inside_95"]
+
+
+def test_identify_draws_figures_and_one_self_contained_page(identified):
+    found, folder = identified
+    drawn = sorted(Path(name).name for name in found["figures"])
+    assert drawn == sorted(p.name for p in (folder / "figures").iterdir())
+    assert {"corner.png", "estimates.png", "trial_01_segments.png", "trial_02_predictive.png"} <= set(drawn)
+    page = (folder / "page.html").read_text()
+    assert "block1 weighs" in page and "data:image/png;base64," in page
+    assert 'src="http' not in page and "href=" not in page
+
+
+def test_same_seed_same_answer_and_another_seed_another(tmp_path):
+    trial = str(NONE / "trial_03.csv")
+    runs = [
+        document("identify", trial, *RIG_AND_TASK, "--seed", seed, out=tmp_path / f"{i}.json")["properties"]
+        for i, seed in enumerate(("4", "4", "5"))
+    ]
+    assert runs[0] == runs[1]
+    assert runs[0]["block1"]["weight"]["mean"] != runs[2]["block1"]["weight"]["mean"]
+
+
+SINGLE = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
+
+
+def test_what_the_task_cannot_tell_is_null_with_the_reason(tmp_path):
+    task, folder = tmp_path / "task.toml", tmp_path / "made"
+    task.write_text(SINGLE)
+    rig = str(NONE / "rig.toml")
+    document("simulate", "--task", str(task), "--rig", rig, "--output", str(folder), out=tmp_path / "s.json")
+    trial = str(folder / "trial_01.csv")
+    found = document("identify", trial, "--task", str(task), "--rig", rig, out=tmp_path / "o.json")
+    assert found["trials"][0]["complete"] and found["warnings"] == []
+    assert found["properties"]["block1"]["height"] is None
+    assert found["reasons"]["block1.height"]
+    assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.343, rel=0.03)
+
+
+def test_an_object_that_the_task_does_not_name_is_said(tmp_path):
+    task, trial = tmp_path / "task.toml", tmp_path / "trial.csv"
+    task.write_text(SINGLE)  # but the recorded block comes down from another, 12.5 mm
+    cut = pd.read_csv(NONE / "trial_01.csv")
+    cut[cut.t < 5.5].to_csv(trial, index=False)
+    found = document(
+        "identify", str(trial), "--task", str(task), "--rig", str(NONE / "rig.toml"), out=tmp_path / "o.json"
+    )
+    assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.57789, rel=0.03)
+    (warning,) = found["warnings"]
+    assert warning.startswith("block1 was lowered by 12.5 mm")
+
+
+def test_the_papers_method_has_no_evidence_and_its_own_formulas(tmp_path):
+    trial = str(NONE / "trial_02.csv")
+    found = document("identify", trial, *RIG_AND_TASK, "--method", "paper", out=tmp_path / "out.json")
+    assert found["method"] == "paper" and found["trials"][0]["log_evidence"] is None
+    assert found["properties"]["block1"]["width"]["mean"] < 0.0185  # short by what the pads give
+
+
+def test_demo_runs_on_the_packages_own_recordings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = document("demo", out=tmp_path / "out.json")
+    assert found["format"] == "hmmseg.demo/1"
+    assert {"corner.png", "report.html"} <= {p.name for p in (tmp_path / "demo").iterdir()}
+    for block in found["actual"].values():
+        assert all(abs(entry["relative_deviation"]) < 0.02 for entry in block.values())
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (lambda f: f.drop(columns="fx1"), "column fx1: missing"),
+        (lambda f: f.assign(t=f.t[::-1].to_numpy()), "row 3, column t"),
+        (lambda f: f.assign(q11=["bad", *f.q11[1:]]), "row 2, column q11"),
+        (lambda f: f.head(3), "has 3 samples"),
+        (lambda f: f.assign(fy2=np.nan), "column fy2: has no values"),
+    ],
+)
+def test_a_bad_trial_is_one_line_and_exit_2(tmp_path, capsys, edit, said):
+    path = tmp_path / "trial.csv"
+    edit(pd.read_csv(NONE / "trial_01.csv").astype({"q11": object})).to_csv(path, index=False)
+    assert main(["identify", str(path), *RIG_AND_TASK, "--json", str(tmp_path / "out.json")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and said in error and "trial.csv" in error
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_plain_tasks_and_block_tasks_are_kept_apart(tmp_path, capsys):
+    task = tmp_path / "task.toml"
+    task.write_text('sequence = ["approach", "insertion"]\n')
+    trial = str(NONE / "trial_01.csv")
+    assert main(["identify", trial, "--task", str(task), "--rig", str(NONE / "rig.toml")]) == 2
+    assert "no blocks to identify" in capsys.readouterr().err
+    assert main(["fit", trial, "--task", str(NONE / "task.toml"), "--model", str(tmp_path / "m.npz")]) == 2
+    assert "needs no fitting" in capsys.readouterr().err
+    assert main(["segment", trial, "--task", str(NONE / "task.toml")]) == 2
+    assert "--rig" in capsys.readouterr().err
+
+
+def test_plain_ordered_task_fits_saves_and_segments(tmp_path):
+    rng = np.random.default_rng(0)
+    task, labels, model = tmp_path / "task.toml", tmp_path / "labels", tmp_path / "model.npz"
+    task.write_text('sequence = ["rest", "push", "rest again"]\nchannels = ["f"]\n')
+    labels.mkdir()
+    edges = []
+    for i in range(4):
+        a, b = 2 + rng.uniform(), 5 + rng.uniform()
+        t = np.arange(0, 8, 0.02)
+        force = np.where((t > a) & (t < b), 3.0, 0.0) + 0.1 * rng.normal(size=t.size)
+        pd.DataFrame({"t": t, "f": force}).to_csv(tmp_path / f"push_{i}.csv", index=False)
+        edges.append((a, b))
+        if i < 2:
+            (labels / f"push_{i}.json").write_text(json.dumps({"boundaries": [a, b]}))
+    trials = [str(tmp_path / f"push_{i}.csv") for i in range(4)]
+    fitted = document("fit", *trials[:2], "--task", str(task), "--labels", str(labels), "--model", str(model),
+                      out=tmp_path / "fit.json")  # fmt: skip
+    assert fitted["labelled"] == ["push_0.csv", "push_1.csv"] and model.exists()
+    found = document("segment", *trials[2:], "--task", str(task), "--model", str(model),
+                     "--figures", str(tmp_path / "figures"), out=tmp_path / "segment.json")  # fmt: skip
+    for trial, (a, b) in zip(found["trials"], edges[2:], strict=True):
+        assert [s["end"] for s in trial["segments"][:-1]] == pytest.approx([a, b], abs=0.06)
+        assert trial["segments"][0]["object"] is None and trial["segments"][1]["state"] == "push"
+        assert math.isfinite(trial["log_evidence"])
+
+
+def test_a_trial_twice_is_refused(tmp_path, capsys):
+    copy = tmp_path / "copy.csv"
+    shutil.copyfile(NONE / "trial_01.csv", copy)
+    assert main(["segment", str(NONE / "trial_01.csv"), str(copy), *RIG_AND_TASK]) == 2
+    assert "the same trial as" in capsys.readouterr().err
