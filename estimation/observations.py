@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
+from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segment.align import AlignedTrials, TrialAlignment
@@ -65,17 +66,15 @@ def draw_boundaries(trial: TrialAlignment, rng: np.random.Generator, num: int) -
 
 def channel_values(signals: Signals, rig: Rig) -> dict[str, np.ndarray]:
     """The sample values behind each mean, arrays (num_timesteps,)."""
-    squeeze = (signals.fx1 - signals.fx2) / rig.fingertip.normal_stiffness
-    deflection = signals.fy / (2 * rig.fingertip.shear_stiffness)
-    height = signals.y - deflection
-    return {
-        "force": signals.fy, "distance": signals.distance + squeeze, "pickup": height, "place": height,
-    }  # fmt: skip
+    s, pads = signals, pads_of(rig)
+    width = block_width(s.distance, s.fx1, s.fx2, pads)
+    height = block_y(s.y, s.fy1, s.fy2, pads)
+    return {"force": s.fy, "distance": width, "pickup": height, "place": height}
 
 
 def gravity_factor(signals: Signals, rig: Rig) -> np.ndarray:
     """1 + a / g (num_timesteps,): the net force of a carried block in units of its weight."""
-    return 1 + np.nan_to_num(acceleration(signals.t, signals.vy)) / rig.gravity
+    return inertia_factor(np.nan_to_num(acceleration(signals.t, signals.vy)), rig.gravity)
 
 
 def subtask_masks(times: np.ndarray, boundaries: np.ndarray, num_subtasks: int) -> np.ndarray:

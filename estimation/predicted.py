@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from estimation.identify import Identification
-from estimation.observations import gravity_factor
+from estimation.observations import channel_values, gravity_factor
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE
 
 
@@ -31,7 +31,7 @@ def predicted_signals(found: Identification, trial: int) -> tuple[np.ndarray, li
     weighed = found.weighed[trial]
     signals, masks = weighed.signals, weighed.masks.mean(axis=0) > 0.5
     factor = gravity_factor(signals, found.rig)
-    squeeze = (signals.fx1 - signals.fx2) / found.rig.fingertip.normal_stiffness
+    given = signals.distance - channel_values(signals, found.rig)["distance"]
     force, distance = (np.full((2, signals.t.size), np.nan) for _ in range(2))
     for step in found.aligned.subtasks:
         inside = masks[step.index]
@@ -42,7 +42,7 @@ def predicted_signals(found: Identification, trial: int) -> tuple[np.ndarray, li
             force[1, inside] = np.hypot(np.sqrt(found.noise.variance["force"]), weight.std())
         if step.state != FREE and (obj, "width") in found.names:
             width = found.of(obj, "width")
-            distance[0, inside] = width.mean() - squeeze[inside]
+            distance[0, inside] = width.mean() + given[inside]
             distance[1, inside] = np.hypot(np.sqrt(found.noise.variance["distance"]), width.std())
     half = norm.ppf(0.95)
     return signals.t, [

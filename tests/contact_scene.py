@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
+from hmmseg.contact.equations import Pads
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.segment.emissions import Features
 
@@ -13,6 +14,7 @@ STACK = BlockTask(
 )
 STEPS = subtasks(STACK)
 GRAVITY, COMPLIANCE, SQUEEZE = 9.81, 2e-4, 2.5e-4
+PADS = Pads(SQUEEZE, SQUEEZE, 2 * COMPLIANCE, 2 * COMPLIANCE)
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
     noises = {"sd_y": 5e-5, "sd_d": 6e-5, "sd_vx": 2e-3, "sd_vy": 2e-3}
     f = Features(
         t=np.arange(num) * dt, force=force, vx=vx, vy=vy, ay=ay, y=y, d=d,
-        **{k: np.full(num, v) for k, v in noises.items()}, compliance=COMPLIANCE, squeeze=SQUEEZE,
+        **{k: np.full(num, v) for k, v in noises.items()}, pads=PADS,
         gravity=GRAVITY, span={k: float(v) for k, v in spans.items()},
     )  # fmt: skip
     return f, labels

@@ -140,8 +140,7 @@ def _check_rises(f: Features, c: Conformity, steps: tuple[Subtask, ...], task: B
         spans = {r.subtask: slice(r.start, r.stop) for r in c.runs if r.subtask in (held[0], held[-1])}
         if len(spans) < 2 or not rise or len({np.sign(v) for v in rise.values()}) > 1:
             continue
-        fy = f.force[:, 1] + f.force[:, 3] - c.free.parameters.bias[[1, 3]].sum()
-        height = f.y - np.nan_to_num(fy) * f.compliance
+        height = f.block_y(c.free.parameters.bias)
         if not all(np.isfinite(height[span]).any() for span in spans.values()):
             continue
         risen = float(np.nanmedian(height[spans[held[-1]]]) - np.nanmedian(height[spans[held[0]]]))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
+from hmmseg.contact.equations import Pads, block_y, hanging, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segment.boundaries import POINTS, Crossing, crossing_density, first_of
@@ -26,7 +27,7 @@ class Contacts:
     """
 
     signals: Signals
-    rig: Rig
+    pads: Pads
     compression: np.ndarray
     inward: np.ndarray
     inward_velocity: np.ndarray
@@ -65,7 +66,7 @@ class Contacts:
         free, touching = (n, n + 1) if sign > 0 else (n + 1, n)
         gap = self.inward[i, free] - face
         squeeze, sd_squeeze = self.compression[i, touching], self.sd["compression"]
-        if not self.rig.fingertip.normal_stiffness < np.inf:  # a rigid pad hides its compression
+        if self.pads.normal1 == 0.0:  # a rigid pad hides its compression
             squeeze = max(self.inward[i, touching] - face, 0.0)
             sd_squeeze = self.sd["inward"] + 0.5 * abs(gap)
         v, sd_v = self.inward_velocity[i], self.sd["inward_velocity"]
@@ -77,21 +78,17 @@ class Contacts:
         """Height of the fingers above where the pads' shear just carries the weight."""
         y = self.signals.y
         level = _median(y[held] - self.deflection[held])
-        carrying = self.weight[str(before.object)] * self._compliance
+        carrying = hanging(self.weight[str(before.object)], self.pads)
         resting, lifted = (n, n + 1) if lifting else (n + 1, n)
         on_ground = self.deflection[resting] - carrying
         sd_ground = self.sd["deflection"]
-        if self._compliance == 0.0:  # rigid pads: only the position tells
+        if hanging(1.0, self.pads) == 0.0:  # rigid pads: only the position tells
             on_ground, sd_ground = y[resting] - level, self.sd["y"]
         in_air = y[lifted] - level - carrying
         v, sd_y, sd_v = self.signals.vy, self.sd["y"], self.sd["vy"]
         if lifting:
             return Crossing(on_ground, in_air, v[n], v[n + 1], sd_ground, sd_y, sd_v, "launch")
         return Crossing(-in_air, -on_ground, -v[n], -v[n + 1], sd_y, sd_ground, sd_v, "impact")
-
-    @property
-    def _compliance(self) -> float:
-        return 0.5 / self.rig.fingertip.shear_stiffness
 
 
 def _median(values: np.ndarray) -> float:
@@ -104,7 +101,6 @@ def contacts(signals: Signals, rig: Rig, parameters: Parameters) -> Contacts:
     """Contacts of one trial; noise the rig does not state is learned from the recording."""
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
-    net = s.fy1 + s.fy2 - bias[1] - bias[3]
     inward = np.stack([s.x1, -s.x2])
     velocity = np.stack([s.vx1, -s.vx2])
     force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
@@ -112,17 +108,18 @@ def contacts(signals: Signals, rig: Rig, parameters: Parameters) -> Contacts:
     def sd(stated: np.ndarray, values: np.ndarray) -> float:
         return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
 
-    compliance = 0.5 / rig.fingertip.shear_stiffness
+    pads = pads_of(rig)
+    fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
     return Contacts(
-        signals=s, rig=rig, compression=normal / rig.fingertip.normal_stiffness, inward=inward,
-        inward_velocity=velocity, deflection=net * compliance, weight=parameters.weight,
+        signals=s, pads=pads, compression=normal * pads.normal1, inward=inward,
+        inward_velocity=velocity, deflection=-block_y(0.0, fy1, fy2, pads), weight=parameters.weight,
         sd={
-            "compression": force / rig.fingertip.normal_stiffness + 1e-9,
+            "compression": force * pads.normal1 + 1e-9,
             "inward": sd(s.sd_x, s.x1),
             "inward_velocity": sd(s.sd_vx, s.vx1),
             "y": float(np.hypot(sd(s.sd_y, s.y1) / root2, level)),
             "vy": sd(s.sd_vy, s.vy1) / root2,
-            "deflection": root2 * force * compliance + 1e-9,
+            "deflection": root2 * hanging(force, pads) + 1e-9,
         },
     )  # fmt: skip

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.special import gammaln, log_ndtr
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
 
 TAIL = 4.0  # degrees of freedom of the Student-t residuals
 STRAY = 0.02  # share of resting samples that move for a moment (a grip settling, a bounce)
@@ -38,7 +39,7 @@ class Features:
 
     `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N]; vx, vy, ay: mean velocity and vertical
     acceleration of the fingers; y: mean height [m]; d: distance of the fingers [m];
-    `compliance`: 1 / (2 k_s), `squeeze`: 1 / k_n [m/N].
+    `pads`: their nominal compliances [m/N].
     `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force [N]).
     """
 
@@ -53,8 +54,7 @@ class Features:
     sd_d: np.ndarray
     sd_vx: np.ndarray
     sd_vy: np.ndarray
-    compliance: float
-    squeeze: float
+    pads: Pads
     gravity: float
     span: dict[str, float]
 
@@ -62,6 +62,25 @@ class Features:
     def grip(self) -> np.ndarray:
         """Mean grip force (fx1 - fx2) / 2 [N]."""
         return (self.force[:, 0] - self.force[:, 2]) / 2
+
+    def block_width(self, bias: np.ndarray) -> np.ndarray:
+        """Width of what is held (num_timesteps,) [m]; as if rigid where a force is missing."""
+        return block_width(self.d, *_pair(self.force - bias, 0, 2), self.pads)
+
+    def block_y(self, bias: np.ndarray) -> np.ndarray:
+        """Height of what is held (num_timesteps,) [m]; as if rigid where a force is missing."""
+        return block_y(self.y, *_pair(self.force - bias, 1, 3), self.pads)
+
+    @property
+    def carrying(self) -> np.ndarray:
+        """Net vertical force on a lifted block in units of its weight (num_timesteps,)."""
+        return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)
+
+
+def _pair(force: np.ndarray, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both fingers' forces (num_timesteps,), 0 where either is missing."""
+    there = np.isfinite(force[:, first] + force[:, second])
+    return np.where(there, force[:, first], 0.0), np.where(there, force[:, second], 0.0)
 
 
 @dataclass(frozen=True)
@@ -146,13 +165,11 @@ def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, st
     if width is None:  # the first pass knows neither widths nor where a block rests
         out += broad_d
     else:
-        unsqueezed = f.d + 2 * np.where(np.isfinite(grip), grip, 0.0) * f.squeeze
         spread = np.hypot(f.sd_d, scale["width"])
-        out += _log_mostly(unsqueezed - width, spread, span["d"], TOUCHING)
+        out += _log_mostly(f.block_width(p.bias) - width, spread, span["d"], TOUCHING)
     weight = p.weight[str(subtask.object)]
     if subtask.state == ABOVE_GROUND:
-        inertial = np.where(np.isfinite(f.ay), f.ay, 0.0) / f.gravity
-        return out + log_student(fy - weight * (1 + inertial), scale["carry"]) + broad_v + broad_y
+        return out + log_student(fy - weight * f.carrying, scale["carry"]) + broad_v + broad_y
     if subtask.state not in (ON_GROUND, SLIDING):
         raise ValueError(f"no emission for the contact state {subtask.state!r}")
     out += _log_between(fy, -span["force"], weight, scale["carry"])
@@ -164,5 +181,4 @@ def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, st
     level = p.levels[trial].get(subtask.index) if p.levels else None
     if level is None:
         return out + broad_y
-    resting = f.y - np.where(np.isfinite(fy), fy, 0.0) * f.compliance
-    return out + _log_mostly(resting - level, np.hypot(f.sd_y, scale["level"]), span["y"], stray)
+    return out + _log_mostly(f.block_y(p.bias) - level, np.hypot(f.sd_y, scale["level"]), span["y"], stray)

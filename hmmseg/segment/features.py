@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hmmseg.contact.equations import pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segment.emissions import Features
@@ -79,8 +80,7 @@ def features(signals: Signals, rig: Rig) -> Features:
         t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y,
         d=s.distance, sd_y=stated(s.sd_y, s.y), sd_d=2 * stated(s.sd_x, s.distance / 2),
         sd_vx=stated(s.sd_vx, s.vx), sd_vy=stated(s.sd_vy, s.vy),
-        compliance=0.5 / rig.fingertip.shear_stiffness, squeeze=1 / rig.fingertip.normal_stiffness,
-        gravity=rig.gravity, span=span,
+        pads=pads_of(rig), gravity=rig.gravity, span=span,
     )  # fmt: skip
 
 

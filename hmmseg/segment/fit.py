@@ -122,7 +122,7 @@ def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
     unbiased = force - bias
     fy, net_x = unbiased[:, 1] + unbiased[:, 3], unbiased[:, 0] + unbiased[:, 2]
     shear = (unbiased[:, 1] - unbiased[:, 3]) / 2
-    factor = 1 + np.nan_to_num(np.concatenate([f.ay for f in features])) / features[0].gravity
+    factor = np.concatenate([f.carrying for f in features])
     weight, residual = dict(old.weight), np.full(fy.size, np.nan)
     for name in weight:
         columns = [i for i, s in enumerate(subtasks) if s.object == name and s.state == ABOVE_GROUND]
@@ -139,16 +139,15 @@ def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
         "shear": _scale(shear, above + ground, old.scale["shear"], noise),
     }
     rest = _rest(features, subtasks, old, bias, gammas)
-    width, width_scale = _widths(features, subtasks, old, unbiased, every)
+    width, width_scale = _widths(features, subtasks, old, bias, every)
     scale |= {"velocity": rest[0], "level": rest[1], "width": width_scale}
     return Parameters(bias, weight, scale, width, rest[2])
 
 
 def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Parameters,
-            unbiased: np.ndarray, every: np.ndarray) -> tuple[dict[str, float], float]:  # fmt: skip
+            bias: np.ndarray, every: np.ndarray) -> tuple[dict[str, float], float]:  # fmt: skip
     """Distance of the fingers per held object, pads' squeeze taken out, and its scale."""
-    squeeze = np.nan_to_num(unbiased[:, 0] - unbiased[:, 2]) * features[0].squeeze
-    unsqueezed = np.concatenate([f.d for f in features]) + squeeze
+    unsqueezed = np.concatenate([f.block_width(bias) for f in features])
     spread = float(np.hypot(np.median(features[0].sd_d), old.scale["width"]))
     width, residuals, weights = {}, [], []
     for name in old.weight:
@@ -175,8 +174,7 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
     velocity, level, weights, levels = [], [], [], []
     columns = [s.index for s in subtasks if s.state in (ON_GROUND, SLIDING)]
     for i, (f, gamma) in enumerate(zip(features, gammas, strict=True)):
-        fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
-        resting = f.y - np.nan_to_num(fy) * f.compliance
+        resting = f.block_y(bias)
         found = {}
         for k in columns:
             spread = np.hypot(np.median(f.sd_y), old.scale["level"])

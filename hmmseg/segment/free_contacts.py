@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
 from hmmseg.hmm.padding import bucket
 from hmmseg.segment.emissions import Features, Parameters, log_likelihoods, log_student
@@ -222,16 +223,16 @@ def _blocks(f: Features, bias: np.ndarray, held: np.ndarray) -> tuple[Block, ...
     """Distinct blocks among the grips, each grip's width and weight by robust means."""
     edges = np.flatnonzero(np.diff(np.r_[False, held, False].astype(int)))
     fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
-    squeeze = _filled((f.force[:, 0] - f.force[:, 2] - bias[0] + bias[2]) * f.squeeze)
-    factor = 1 + np.nan_to_num(f.ay) / f.gravity
+    fx1, fx2 = (_filled(f.force[:, c] - bias[c]) for c in (0, 2))
+    widths = block_width(f.d, fx1, fx2, f.pads)
     noise = noise_sd(f.force[:, 1])
     found: list[Block] = []
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         span = slice(start, stop)
-        width = _median((f.d + squeeze)[span], np.nan)
+        width = _median(widths[span], np.nan)
         if stop - start < 2 or not np.isfinite(width):
             continue
-        lifted = (fy / factor)[span][_lifted(f, span)]
+        lifted = (fy / f.carrying)[span][_lifted(f, span)]
         lifted = lifted[np.isfinite(lifted)]
         weight = float(np.median(lifted)) if lifted.size > 2 else np.nan
         # Of the median of n sums of two forces, whose standard error is sqrt(pi / 2) sqrt(2 / n) sds of one.

@@ -13,6 +13,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from hmmseg.contact.equations import Pads, block_offset, block_width, block_x, block_y, support_load
 from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, YIELDING, World, gradient, tips
 from simgap.effects.filters import faded, lowpass
 from simgap.gap.frame import CHANNELS, Arrays
@@ -50,7 +51,9 @@ def residuals(
     fy1, fy2 = fy1 + couple, fy2 - couple
     (n1, n2), (s1, s2) = world.give_normal, world.give_shear
 
-    gap, squeeze = x2 - x1 - width, fx1 * n1 - fx2 * n2
+    pads_give = Pads(n1, n2, s1, s2)
+    gap = x2 - x1 - width
+    squeeze = block_width(0.0, fx1, fx2, pads_give)
     # Pads that have crept come back late: fingers may be nearer for a while without pressing.
     late = (pads - force)[..., 0] * n1 - (pads - force)[..., 2] * n2
     # A distance known to so much says nothing of a lighter touch: its noise would come out as force.
@@ -61,10 +64,10 @@ def residuals(
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = jnp.asarray(arrays.phase[..., 3])
-    offset = y2 - y1 - (fy2 * s2 - fy1 * s1)
-    x = (x1 + x2) / 2 - (fx1 * n1 + fx2 * n2) / 2
-    load = weight - force[..., 1] - force[..., 3]
-    y = (y1 + y2) / 2 - (fy1 * s1 + fy2 * s2) / 2 + _sunk(world, load)
+    offset = block_offset(y2 - y1, fy1, fy2, pads_give)
+    x = block_x((x1 + x2) / 2, fx1, fx2, pads_give)
+    load = support_load(weight, force[..., 1] + force[..., 3])
+    y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + _sunk(world, load)
     y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
     still = firm * (arrays.phase[..., 1] + place)
     onground = firm * world.ground

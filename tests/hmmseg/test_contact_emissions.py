@@ -8,6 +8,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
+from hmmseg.contact.equations import Pads
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.segment.emissions import (
     STRAY,
@@ -39,8 +40,8 @@ def features(num, **columns):
     force = np.broadcast_to(np.asarray(columns.get("force", np.zeros(4)), float), (num, 4))
     noise = {name: np.full(num, sd) for name, sd in
              (("sd_y", 3e-5), ("sd_d", 6e-5), ("sd_vx", 2e-3), ("sd_vy", 2e-3))}  # fmt: skip
-    return Features(np.arange(num) * 0.05, force, **(blank | values), **noise, compliance=2e-4,
-                    squeeze=2.5e-4, gravity=9.81, span=SPAN)  # fmt: skip
+    return Features(np.arange(num) * 0.05, force, **(blank | values), **noise,
+                    pads=Pads(2.5e-4, 2.5e-4, 4e-4, 4e-4), gravity=9.81, span=SPAN)  # fmt: skip
 
 
 def step(state: str) -> tuple[Subtask, ...]:

@@ -1,0 +1,81 @@
+"""The contact equations of a two-finger grip: the only place where its physics is written down.
+
+Quasistatic balance of the block and linear pads, per sample (x right, y up, finger 1 left; F what a
+fingertip exerts; paper, Sections 2 and 3.3, with the block's inertia and the pads' compliance, which it
+leaves out):
+
+| contact state | equations |
+|---|---|
+| free motion | F1 = F2 = 0 |
+| every grip | `block_width` = w, `block_offset` constant; `block_x`, `block_y`: where the block is |
+| hold on ground | `block_x`, `block_y` constant; 0 <= `support_load` |
+| sliding on ground | `block_y` constant; |net fx - m ax| <= mu `support_load` |
+| hold above ground | net fx = m ax; net fy = `carried_force` |
+
+Emissions (hmmseg.segment), observations of properties (estimation) and residuals of the gap (simgap) are
+built from these functions; the dynamics of the virtual model (simgap.world) is tested against them. All
+work on NumPy and JAX arrays alike, of any shape that broadcasts, in SI units, and raise nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from hmmseg.io.rig import Rig
+
+Values = Any  # a NumPy or JAX array, or a number
+
+
+class Pads(NamedTuple):
+    """Compliances of both fingers' pads [m/N], along the grip and in shear; 0 for a rigid pad."""
+
+    normal1: Values
+    normal2: Values
+    shear1: Values
+    shear2: Values
+
+
+def pads_of(rig: Rig) -> Pads:
+    """The nominal pads of a rig, alike on both fingers."""
+    normal, shear = 1 / rig.fingertip.normal_stiffness, 1 / rig.fingertip.shear_stiffness
+    return Pads(normal, normal, shear, shear)
+
+
+def block_width(distance: Values, fx1: Values, fx2: Values, pads: Pads) -> Values:
+    """Width of the held block [m]: the fingers' distance and what both pads give under the grip."""
+    return distance + fx1 * pads.normal1 - fx2 * pads.normal2
+
+
+def block_x(x: Values, fx1: Values, fx2: Values, pads: Pads) -> Values:
+    """Horizontal position of the held block [m] from the fingers' mean position."""
+    return x - (fx1 * pads.normal1 + fx2 * pads.normal2) / 2
+
+
+def block_y(y: Values, fy1: Values, fy2: Values, pads: Pads) -> Values:
+    """Height of the held block [m], up to where it was gripped, from the fingers' mean height."""
+    return y - (fy1 * pads.shear1 + fy2 * pads.shear2) / 2
+
+
+def block_offset(offset: Values, fy1: Values, fy2: Values, pads: Pads) -> Values:
+    """Height difference [m] of the places at which the pads hold the block: constant in one grip."""
+    return offset - (fy2 * pads.shear2 - fy1 * pads.shear1)
+
+
+def hanging(weight: Values, pads: Pads) -> Values:
+    """How far the pads' shear lets a block of this weight hang below the fingers [m]."""
+    return weight * (pads.shear1 + pads.shear2) / 4
+
+
+def inertia_factor(acceleration: Values, gravity: float) -> Values:
+    """1 + a / g: the vertical force on a lifted block in units of its weight."""
+    return 1 + acceleration / gravity
+
+
+def carried_force(weight: Values, ay: Values, gravity: float) -> Values:
+    """Net vertical force that carries a block above the ground [N]."""
+    return weight * inertia_factor(ay, gravity)
+
+
+def support_load(weight: Values, fy: Values) -> Values:
+    """What the support carries of a block at rest on it [N]; a support only pushes."""
+    return weight - fy
