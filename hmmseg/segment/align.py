@@ -96,7 +96,7 @@ def _fit_shown(f: Features, shown: Plan, verdict: Conformity) -> tuple[Fit | Non
 
 def _unfitted(verdicts: Sequence[Conformity]) -> Fit:
     """Where no trial fits the task: what the first shows of the sensors, and no alignment."""
-    return Fit(verdicts[0].free.parameters, (), (), np.zeros(0), np.zeros(0))
+    return Fit(verdicts[0].free.parameters, ())
 
 
 def boundary_posteriors(

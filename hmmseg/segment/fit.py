@@ -8,27 +8,22 @@ of one task are pooled: they share weights, biases and scales, not the resting l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
-from hmmseg.hmm.padding import Alignment, align
+from hmmseg.hmm.em import em
+from hmmseg.hmm.padding import Alignment, Bands
 from hmmseg.segment.emissions import TAIL, Features, Parameters, log_likelihoods
-
-MAX_ITERATIONS = 40
-TOLERANCE = 1e-3  # nats of log evidence between iterations
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted emissions with the alignment posterior and log-likelihoods of every trial."""
+    """Fitted emissions with the alignment posterior of every trial."""
 
     parameters: Parameters
     posteriors: tuple[Alignment, ...]
-    log_likelihoods: tuple[np.ndarray, ...]
-    log_stay: np.ndarray
-    log_advance: np.ndarray
 
 
 def otsu(values: np.ndarray) -> float:
@@ -64,10 +59,46 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     return Parameters(bias, dict.fromkeys(names, weight), scale)
 
 
-def transitions(num_timesteps: int, mean_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log probabilities to stay (K,) and to advance (K-1,) for given mean shares of the trial."""
-    advance = np.clip(1.0 / np.maximum(mean_share * num_timesteps, 1.5), 1e-6, 0.6)
-    return np.log1p(-advance), np.log(advance[:-1])
+@dataclass(frozen=True)
+class ContactEmission:
+    """The contact states of one task, learned from several trials together (an `em.Emission`)."""
+
+    features: tuple[Features, ...]
+    subtasks: tuple[Subtask, ...]
+    parameters: Parameters
+
+    def log_likelihoods(self, trial: int) -> np.ndarray:
+        """Log-likelihoods (num_timesteps, num_subtasks) of one trial."""
+        return log_likelihoods(self.features[trial], self.subtasks, self.parameters, trial)
+
+    def updated(self, responsibilities: Sequence[np.ndarray]) -> ContactEmission:
+        """The M-step of every parameter."""
+        found = maximisation(self.features, self.subtasks, self.parameters, responsibilities)
+        return replace(self, parameters=found)
+
+
+@dataclass(frozen=True)
+class MeanShares:
+    """Geometric durations whose means are the same share of every trial (an `em.Durations`).
+
+    `lengths` of the trials [samples], `shares` (num_subtasks,), under a Dirichlet prior of equal shares
+    that is worth one trial.
+    """
+
+    lengths: tuple[int, ...]
+    shares: np.ndarray
+    ends = (None, None)
+
+    def bands(self, trial: int) -> Bands:
+        """Log probabilities to stay (num_subtasks,) and to advance (num_subtasks - 1,)."""
+        mean = np.maximum(self.shares * self.lengths[trial], 1.5)
+        advance = np.clip(1.0 / mean, 1e-6, 0.6)
+        return np.log1p(-advance), np.log(advance[:-1])
+
+    def updated(self, responsibilities: Sequence[np.ndarray]) -> MeanShares:
+        """Posterior mean shares."""
+        counts = np.sum([g.sum(axis=0) / g.shape[0] for g in responsibilities], axis=0)
+        return replace(self, shares=(counts + 1.0 / counts.size) / (counts.sum() + 1.0))
 
 
 def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Parameters | None = None) -> Fit:
@@ -77,36 +108,10 @@ def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Para
     Raises `hmmseg.hmm.banded.InfeasibleAlignment` where a trial is too short for its subtasks.
     """
     parameters = start or initial_parameters(features, subtasks)
-    share = np.full(len(subtasks), 1.0 / len(subtasks))
-    before = -np.inf
-    for iteration in range(MAX_ITERATIONS):
-        current = _expectation(features, subtasks, parameters, share)
-        evidence = sum(p.log_evidence for p in current.posteriors)
-        gammas = [np.exp(p.log_smoothed) for p in current.posteriors]
-        if iteration > 5 and abs(evidence - before) < TOLERANCE:
-            break
-        before = evidence
-        parameters = maximisation(features, subtasks, parameters, gammas)
-        share = _mean_share(gammas)
-    return current
-
-
-def _expectation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
-                 parameters: Parameters, share: np.ndarray) -> Fit:  # fmt: skip
-    tables, posteriors = [], []
-    for i, f in enumerate(features):
-        table = log_likelihoods(f, subtasks, parameters, i)
-        stay, advance = transitions(f.t.size, share)
-        tables.append(table)
-        posteriors.append(align(table, stay, advance))
-    return Fit(parameters, tuple(posteriors), tuple(tables), stay, advance)
-
-
-def _mean_share(gammas: Sequence[np.ndarray]) -> np.ndarray:
-    """Posterior mean share of each subtask under a weak Dirichlet prior of equal shares."""
-    counts = np.sum([g.sum(axis=0) / g.shape[0] for g in gammas], axis=0)
-    prior = 1.0 / counts.size
-    return (counts + prior) / (counts.sum() + 1.0)
+    emission = ContactEmission(tuple(features), subtasks, parameters)
+    equal = np.full(len(subtasks), 1.0 / len(subtasks))
+    found = em(emission, MeanShares(tuple(f.t.size for f in features), equal), len(features))
+    return Fit(found.emission.parameters, found.alignments)
 
 
 def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],

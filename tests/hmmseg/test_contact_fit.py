@@ -7,10 +7,11 @@ import pytest
 from contact_scene import LEVELS, PLANTED, STEPS, planted
 from scipy import optimize, stats
 
+from hmmseg.hmm import em
 from hmmseg.hmm.banded import InfeasibleAlignment
 from hmmseg.segment import fit as contact_fit
 from hmmseg.segment.emissions import TAIL
-from hmmseg.segment.fit import _location, _scale, _weighted_median, fit, initial_parameters, otsu, transitions
+from hmmseg.segment.fit import MeanShares, _location, _scale, _weighted_median, fit, initial_parameters, otsu
 
 
 def test_otsu_against_trying_every_split():
@@ -61,10 +62,10 @@ def test_weighted_median():
 
 
 def test_transitions_are_probabilities_with_the_mean_duration():
-    stay, advance = transitions(200, np.array([0.25, 0.5, 0.25]))
+    stay, advance = MeanShares((200,), np.array([0.25, 0.5, 0.25])).bands(0)
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
     np.testing.assert_allclose(np.exp(-advance), [50, 100])
-    stay, advance = transitions(5, np.array([1e-9, 1.0]))
+    stay, advance = MeanShares((5,), np.array([1e-9, 1.0])).bands(0)
     assert np.isfinite(stay).all() and np.isfinite(advance).all()
 
 
@@ -105,14 +106,14 @@ def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
 def test_evidence_does_not_decrease(monkeypatch):
     """ECM with 5 inner steps a parameter, floors and weak pulls: small steps back are allowed."""
     seen = []
-    expectation = contact_fit._expectation
+    expectation = em.expectation
 
-    def recorded(features, steps, parameters, share):
-        current = expectation(features, steps, parameters, share)
-        seen.append(sum(float(p.log_evidence) for p in current.posteriors))
-        return current
+    def recorded(*arguments):
+        alignments = expectation(*arguments)
+        seen.append(sum(a.log_evidence for a in alignments))
+        return alignments
 
-    monkeypatch.setattr(contact_fit, "_expectation", recorded)
+    monkeypatch.setattr(em, "expectation", recorded)
     fit([planted(seed)[0] for seed in range(2)], STEPS)
     # The second pass scores widths and levels for the first time, against narrower densities.
     gains = np.diff(seen[1:])

@@ -1,0 +1,121 @@
+"""Expectation maximisation of a task's hidden Markov model, trials of any lengths pooled.
+
+One driver for every kind of recording. What the states look like is an `Emission`, how long they
+last a `Durations`; both hold the trials' data, so that the driver sees nothing but log-likelihoods
+(num_timesteps, num_states) and posterior state probabilities of the same shape.
+
+Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2), 1989.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from hmmseg.hmm.padding import Alignment, Bands, align_many
+
+S = TypeVar("S")
+
+
+@runtime_checkable
+class Emission(Protocol):
+    """What each state looks like; frozen, an update is a new object."""
+
+    def log_likelihoods(self, trial: int) -> np.ndarray:
+        """Log-likelihoods (num_timesteps, num_states) of one trial, -inf where a state cannot be."""
+        ...
+
+    def updated(self: S, responsibilities: Sequence[np.ndarray]) -> S:
+        """The M-step, given posterior state probabilities (num_timesteps, num_states) a trial."""
+        ...
+
+
+@runtime_checkable
+class Durations(Protocol):
+    """How states follow each other; frozen, an update is a new object."""
+
+    @property
+    def ends(self) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Log weights (num_states,) to begin and to end in each state; None: in the first, the last."""
+        ...
+
+    def bands(self, trial: int) -> Bands:
+        """Log weights to stay, advance by one, two ... states in one trial (see hmmseg.hmm.banded)."""
+        ...
+
+    def updated(self: S, responsibilities: Sequence[np.ndarray]) -> S:
+        """The M-step, as of an emission."""
+        ...
+
+
+E = TypeVar("E", bound=Emission)
+D = TypeVar("D", bound=Durations)
+
+
+@dataclass(frozen=True)
+class Fit(Generic[E, D]):
+    """A fitted model: the alignments are those under this emission and these durations."""
+
+    emission: E
+    durations: D
+    alignments: tuple[Alignment, ...]
+    num_iterations: int
+    converged: bool
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence of all trials [nats]."""
+        return sum(a.log_evidence for a in self.alignments)
+
+    @property
+    def responsibilities(self) -> list[np.ndarray]:
+        """Posterior state probabilities (num_timesteps, num_states) of every trial."""
+        return [np.exp(a.log_smoothed) for a in self.alignments]
+
+
+def expectation(emission: Emission, durations: Durations, num_trials: int) -> tuple[Alignment, ...]:
+    """Alignment posteriors of all trials; raises InfeasibleAlignment where a trial has no path."""
+    initial, final = durations.ends
+    tables = [emission.log_likelihoods(i) for i in range(num_trials)]
+    bands = [durations.bands(i) for i in range(num_trials)]
+    return tuple(align_many(tables, bands, log_initial=initial, log_final=final))
+
+
+def em(
+    emission: E,
+    durations: D,
+    num_trials: int,
+    max_iterations: int = 40,
+    min_iterations: int = 6,
+    tolerance: float = 1e-3,
+) -> Fit[E, D]:
+    """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
+
+    The last step is an expectation. Raises `hmmseg.hmm.banded.InfeasibleAlignment` where a trial is too
+    short for its states, ValueError on NaN.
+    """
+    before = -np.inf
+    for iteration in range(1, max_iterations + 1):
+        fit = Fit(emission, durations, expectation(emission, durations, num_trials), iteration, False)
+        if iteration > min_iterations and abs(fit.log_evidence - before) < tolerance:
+            return Fit(emission, durations, fit.alignments, iteration, True)
+        if iteration < max_iterations:
+            before, responsibilities = fit.log_evidence, fit.responsibilities
+            emission, durations = emission.updated(responsibilities), durations.updated(responsibilities)
+    return fit
+
+
+def from_starts(
+    starts: Iterable[tuple[E, D]],
+    num_trials: int,
+    max_iterations: int = 40,
+    min_iterations: int = 6,
+    tolerance: float = 1e-3,
+) -> list[Fit[E, D]]:
+    """`em` from several starts, the fit of the highest log evidence first."""
+    limits = max_iterations, min_iterations, tolerance
+    fits = [em(emission, durations, num_trials, *limits) for emission, durations in starts]
+    return sorted(fits, key=lambda fit: -fit.log_evidence)
