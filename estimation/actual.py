@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.rig import read_toml
+from hmmseg.io.schema import read_toml
 
 UNITS = {"weight": "N", "width": "m", "height": "m", "friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]

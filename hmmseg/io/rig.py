@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from hmmseg.errors import InputError, nearest
+from hmmseg.errors import nearest
+from hmmseg.io.columns import Columns
+from hmmseg.io.gripper import Gripper
+from hmmseg.io.schema import (
+    Deviation,
+    Finite,
+    FinitePositive,
+    Positive,
+    StrictTable,
+    read_toml,
+    validated,
+)
 
-Positive = Annotated[float, Field(gt=0, strict=True)]  # inf allowed: a rigid pad
-FinitePositive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Deviation = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 
-
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Finger(_Table):
+class Finger(StrictTable):
     """One planar two-link finger with absolute link angles (parallelogram linkage).
 
     tip = base + L1 (cos q1, sin q1) + L2 (cos q2, sin q2), all in m.
@@ -30,14 +31,14 @@ class Finger(_Table):
     links: tuple[FinitePositive, FinitePositive]
 
 
-class Fingertip(_Table):
+class Fingertip(StrictTable):
     """Stiffness of one finger's pad [N/m]; `inf` is the paper's rigid fingertip."""
 
     normal_stiffness: Positive = float("inf")
     shear_stiffness: Positive = float("inf")
 
 
-class Noise(_Table):
+class Noise(StrictTable):
     """Standard deviation of one sample; None is learned from the recording.
 
     A jointed hand gives `angle` [rad] and `velocity` [rad/s]; a Cartesian hand gives
@@ -73,7 +74,7 @@ JOINTS = ("q11", "q12", "q21", "q22")
 _Four = tuple[Deviation, Deviation, Deviation, Deviation]
 
 
-class Systematic(_Table):
+class Systematic(StrictTable):
     """Standard deviations of what all trials share; 0 where absent.
 
     `force_bias` [N] and `force_gain` (relative) per finger and axis (fx1, fy1, fx2, fy2),
@@ -88,7 +89,15 @@ class Systematic(_Table):
     pad_stiffness: Annotated[tuple[Deviation, Deviation], _per_entry(("1", "2"))] = (0.0, 0.0)
 
 
-class Rig(_Table):
+class Tolerance(StrictTable):
+    """The smallest gap that matters: `position` [m], `force` [N], `property` (share); None where not said."""
+
+    position: FinitePositive | None = None
+    force: FinitePositive | None = None
+    property: FinitePositive | None = None
+
+
+class Rig(StrictTable):
     """The nominal hand as `rig.toml` describes it, SI units."""
 
     rate: FinitePositive | None = None
@@ -97,11 +106,17 @@ class Rig(_Table):
     fingertip: Fingertip = Fingertip()
     noise: Noise = Noise()
     systematic: Systematic = Systematic()
+    tolerance: Tolerance = Tolerance()
+    gripper: Gripper | None = None
+    columns: Columns = Field(default={})
+    topics: Columns = Field(default={})
 
     @model_validator(mode="after")
     def _two_fingers(self) -> Rig:
         if self.fingers is not None and sorted(self.fingers) != ["1", "2"]:
             raise ValueError("fingers must be the two tables [fingers.1] and [fingers.2]")
+        if self.fingers is not None and self.gripper is not None:
+            raise ValueError("a hand has [fingers] or is a [gripper], not both")
         return self
 
     @property
@@ -116,45 +131,9 @@ class Rig(_Table):
         return self.fingers[str(i)]
 
 
-def _known_keys(location: tuple[Any, ...]) -> list[str]:
-    tables: dict[str, type[_Table]] = {
-        "fingertip": Fingertip, "noise": Noise, "systematic": Systematic,
-    }  # fmt: skip
-    if len(location) <= 1:
-        return list(Rig.model_fields)
-    head = str(location[0])
-    return list((Finger if head == "fingers" else tables[head]).model_fields)
-
-
 def parse_rig(table: dict[str, Any], where: str = "rig") -> Rig:
     """Rig from the table of a `rig.toml`; InputError names the key at fault."""
-    try:
-        return Rig.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            expected = nearest(str(first["loc"][-1]), _known_keys(first["loc"]))
-            raise InputError(f"{where}: key {key}", "unknown key", expected) from None
-        if first["type"] == "missing":
-            raise InputError(f"{where}: key {key}", "missing", "a value") from None
-        problem = f"{first['msg'].removeprefix('Value error, ')} (found {first.get('input')!r})"
-        if first["type"] == "value_error":
-            problem = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"{where}: key {key}" if key else where, problem) from None
-
-
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """Table of a TOML file; InputError for an absent or malformed file."""
-    path = Path(path)
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", "a TOML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(str(path), f"not valid TOML: {error}") from None
+    return validated(Rig, table, where)
 
 
 def read_rig(path: str | Path) -> Rig:

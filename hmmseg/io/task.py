@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.rig import read_toml
+from hmmseg.io.schema import read_toml
 
 GROUND = "ground"
 RESERVED = (GROUND, "finger1", "finger2")

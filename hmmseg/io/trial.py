@@ -1,32 +1,43 @@
-"""Trials: one recording each, read from CSV, Parquet, NPZ or a pandas DataFrame."""
+"""Trials: one recording each, from a file of any kind, a data frame or arrays, mapped to our channels."""
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hmmseg.errors import InputError, nearest
+from hmmseg.io.columns import Column, source_of
+from hmmseg.io.formats import read_table
+from hmmseg.io.frames import frame_table
 from hmmseg.io.rig import Rig
+from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.task import SequenceTask
+from hmmseg.io.units import si_factor
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
 CARTESIAN_OPTIONAL = ("vx1", "vy1", "vx2", "vy2")
 MIN_SAMPLES = 8
-UNNAMED = "\0"
+MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing."""
+    """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
+
+    `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
+    channels of a log, the samples that lie between two messages.
+    """
 
     file: str
     t: np.ndarray
     channels: dict[str, np.ndarray]
+    origin: int | None = None
+    interpolated: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def rate(self) -> float:
@@ -39,121 +50,97 @@ class Trial:
         return Path(self.file).name
 
 
-def read_trial(source: str | Path | pd.DataFrame, rig: Rig | None = None,
-               task: SequenceTask | None = None) -> Trial:  # fmt: skip
-    """Trial from a file or DataFrame, checked; InputError names file, row or column.
+def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceTask | None = None) -> Trial:
+    """Trial from a file, a pandas or polars DataFrame or a dict of arrays; InputError says where it fails.
 
-    The channels kept are the rig's (joint space or Cartesian), or for a plain ordered task the
-    ones it names (every column but `t` otherwise).
+    The channels kept are the rig's (joint space, Cartesian or a gripper's), or for a plain ordered
+    task the ones it names (every column but `t` otherwise), taken from the columns or messages
+    that the rig's `[columns]` or `[topics]` map to them.
     """
-    if isinstance(source, pd.DataFrame):
-        where, frame = "DataFrame", source.set_axis(range(1, len(source) + 1))
-    else:
-        where, frame = str(source), _read_frame(Path(source))
-    frame = frame.rename(columns=lambda name: str(name).strip())
-    _check_header(list(frame.columns), where)
-    wanted, optional = _wanted(frame, rig, task, where)
-    for name in wanted:
-        if name not in frame.columns and name not in optional:
-            raise InputError(f"{where}: column {name}", "missing", ", ".join(("t", *wanted)))
-    t = _column(frame, "t", where)
-    _check_times(t, frame.index, where)
-    channels = {name: _column(frame, name, where) for name in wanted if name in frame.columns}
-    empty = [name for name, values in channels.items() if not np.isfinite(values).any()]
-    for name in empty:
-        if name not in optional:
-            raise InputError(f"{where}: column {name}", "has no values", "at least one number")
-        del channels[name]  # as good as absent
-    return Trial(where, t, channels)
-
-
-def _wanted(frame: pd.DataFrame, rig: Rig | None, task: SequenceTask | None,
-            where: str) -> tuple[tuple[str, ...], tuple[str, ...]]:  # fmt: skip
-    if task is not None:
-        names = task.channels or tuple(str(c) for c in frame.columns if c != "t")
-        if not names:
-            raise InputError(where, "has no columns but t", "at least one channel")
-        for name in names:
-            if name not in frame.columns:
-                raise InputError(f"{where}: column {name}", "missing",
-                                 nearest(name, [str(c) for c in frame.columns]))  # fmt: skip
-        return names, ()
-    if rig is None:
+    if task is None and rig is None:
         raise ValueError("a block task's trial needs its rig")
+    names, optional = _channels(rig, task)
+    log = isinstance(source, str | Path) and Path(source).suffix.lower() in (".mcap", ".bag", ".db3")
+    columns: Mapping[str, Column] = {} if rig is None else (rig.topics if log else rig.columns)
+    theirs = None if names is None else [source_of(name, columns) for name in ("t", *names)]
+    read = read_table if isinstance(source, str | Path) else frame_table
+    table = read(source, theirs)
+    if table.messages and rig is not None:  # a folder of messages
+        columns = rig.topics
+    _check_names(table, columns, names, optional, task is not None)
+    stamps, origin = times(table, source_of("t", columns))
+    t = _mapped(stamps, "t", columns, table)
+    _check_times(t, table)
+    channels: dict[str, np.ndarray] = {}
+    for name in names if names is not None else _every(table, columns):
+        theirs_name = source_of(name, columns)
+        if theirs_name not in table.columns:
+            continue
+        values = _mapped(numbers(table, theirs_name), name, columns, table)
+        if np.isfinite(values).any():
+            channels[name] = values
+        elif name not in optional:  # an optional one without values is as good as absent
+            raise InputError(f"{table.file}: column {theirs_name}", "has no values", "at least one number")
+    between = {
+        name: table.interpolated[source_of(name, columns)]
+        for name in channels if source_of(name, columns) in table.interpolated
+    }  # fmt: skip
+    return Trial(table.file, t, channels, origin, between)
+
+
+def _channels(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
+    """Channels of the hand or the task (None: all there are), and which of them may be absent."""
+    if task is not None:
+        return task.channels, ()
+    assert rig is not None
+    if rig.gripper is not None:
+        return rig.gripper.channels, ()
     return (JOINT_CHANNELS, ()) if rig.jointed else (CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL)
 
 
-def _read_frame(path: Path) -> pd.DataFrame:
-    """Table of a file; its index is the row as an editor numbers it (CSV) or counts from 1."""
-    readers = {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}
-    if not path.exists():
-        raise InputError(str(path), "no such file", "a trial (.csv, .parquet or .npz)")
-    if path.suffix.lower() not in readers:
-        raise InputError(str(path), f"unknown kind of file {path.suffix!r}", ", ".join(readers))
-    try:
-        return readers[path.suffix.lower()](path)
-    except InputError:
-        raise
-    except ImportError:
-        raise InputError(str(path), "Parquet support is not installed",
-                         "pip install 'hmmseg[parquet]'") from None  # fmt: skip
-    except Exception as error:  # whatever a parser makes of a file it cannot parse
-        raise InputError(str(path), f"cannot be read ({error})", "a table with a header row") from error
+def _every(table: Table, columns: Mapping[str, Column]) -> list[str]:
+    """All channels of a plain task: what is mapped by our name, the rest by its own."""
+    mapped = {source_of(name, columns): name for name in columns}
+    return [mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t"]
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = csv.reader(file)
-        header = [name.strip() or f"{UNNAMED}{i}" for i, name in enumerate(next(lines, []))]
-        _check_header(header, str(path))
-        for cells in lines:
-            if any(cells) and len(cells) != len(header):  # pandas would shift or drop columns silently
-                raise InputError(f"{path}: row {lines.line_num}", f"has {len(cells)} cells",
-                                 f"{len(header)} as in the header")  # fmt: skip
-        file.seek(0)
-        frame = pd.read_csv(file, header=0, names=header, index_col=False, skipinitialspace=True,
-                            skip_blank_lines=False, low_memory=False)  # fmt: skip
-    unnamed = [name for name in header if name.startswith(UNNAMED)]  # a row index, trailing commas
-    return frame.set_axis(range(2, len(frame) + 2)).drop(columns=unnamed).dropna(how="all")
-
-
-def _read_parquet(path: Path) -> pd.DataFrame:
-    frame = pd.read_parquet(path)
-    return frame.set_axis(range(1, len(frame) + 1))
-
-
-def _read_npz(path: Path) -> pd.DataFrame:
-    with path.open("rb") as file:
-        arrays = np.load(file)
-        if isinstance(arrays, np.ndarray):
-            raise InputError(str(path), "holds one array without a name", "one array a column")
-        frame = pd.DataFrame({name: np.atleast_1d(arrays[name]) for name in arrays.files})
-    return frame.set_axis(range(1, len(frame) + 1))
-
-
-def _check_header(names: list[str], where: str) -> None:
-    for name in names:
-        if names.count(name) > 1:
+def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
+                 optional: tuple[str, ...], plain: bool) -> None:  # fmt: skip
+    where = table.file
+    for name in table.names:
+        if table.names.count(name) > 1:
             raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
-    if "t" not in names:
-        raise InputError(f"{where}: column t", "missing", "a header row with a column t of times in s")
+    for ours in columns:
+        if names is not None and ours not in ("t", *names):
+            raise InputError(f"{where}: [columns] {ours}", "is no channel of this hand or task",
+                             nearest(ours, ("t", *names)))  # fmt: skip
+    for ours in ("t", *(names or ())):
+        theirs = source_of(ours, columns)
+        if theirs in table.names or (ours in optional and ours not in columns):
+            continue
+        if theirs != ours:
+            raise InputError(f"{where}: column {theirs}", f"missing, but the rig maps {ours} to it",
+                             nearest(theirs, table.names))  # fmt: skip
+        if ours == "t":
+            raise InputError(f"{where}: column t", "missing",
+                             f"a header row with a column t of times in s, {MAPPED}")  # fmt: skip
+        expected = nearest(theirs, table.names) if plain else f"{', '.join(('t', *(names or ())))}, {MAPPED}"
+        raise InputError(f"{where}: column {theirs}", "missing", expected)
+    if names is None and len(table.names) < 2:
+        raise InputError(where, "has no columns but t", "at least one channel")
 
 
-def _column(frame: pd.DataFrame, name: str, where: str) -> np.ndarray:
-    column = frame[name]
-    if column.dtype.kind not in "fiuO" and not pd.api.types.is_string_dtype(column):
-        raise InputError(f"{where}: column {name}", f"holds {column.dtype}", "numbers")
-    numbers = pd.Series(pd.to_numeric(column, errors="coerce"))
-    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
-    bad = np.flatnonzero((np.isnan(values) & column.notna().to_numpy()) | np.isinf(values))
-    if bad.size:
-        raise InputError(f"{where}: row {frame.index[bad[0]]}, column {name}",
-                         f"{column.iloc[bad[0]]} is not a finite number",
-                         "a number or an empty cell")  # fmt: skip
-    return values
+def _mapped(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:
+    """Values in SI: the mapping's unit, or the one that the file itself states."""
+    entry = columns.get(ours, Column())
+    unit = entry.unit if entry.unit is not None else table.units.get(source_of(ours, columns), 1.0)
+    if unit == 1.0 and entry.sign == 1 and entry.offset == 0:
+        return values
+    return entry.sign * si_factor(unit) * values + entry.offset
 
 
-def _check_times(t: np.ndarray, rows: pd.Index, where: str) -> None:
+def _check_times(t: np.ndarray, table: Table) -> None:
+    where, rows = table.file, table.rows
     if t.size < MIN_SAMPLES:
         raise InputError(where, f"has {t.size} samples", f"at least {MIN_SAMPLES}")
     missing = np.flatnonzero(~np.isfinite(t))

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.rig import Rig, read_toml
+from hmmseg.io.rig import Rig
+from hmmseg.io.schema import read_toml
 from hmmseg.io.task import BlockTask, Move
 from simgap.world.layout import Table, lay_out
 from simgap.world.performance import CONTROL_PERIOD

@@ -36,7 +36,7 @@ def test_process_prints_only_json_on_standard_output(task):
     assert done.returncode == 0
     document = json.loads(done.stdout)
     assert list(document)[:5] == ["format", "version", "seed", "warnings", "figures"]
-    assert document["format"] == "hmmseg.contact.decompose/1"
+    assert document["format"] == "hmmseg.decompose/1"
     assert (document["version"], document["seed"]) == (hmmseg.__version__, 7)
     assert "Subtask" in done.stderr
 

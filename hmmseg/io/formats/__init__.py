@@ -1,0 +1,99 @@
+"""One module a kind of file; `read_table` chooses among them.
+
+Each has `read(path, part, wanted)`: a `Table` with the columns in `wanted` (all for None) that
+the file has. Kinds that hold several recordings also have `parts(path)`; one of them is named
+after a `#`: `demos.hdf5#demo_3`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+from hmmseg.errors import InputError
+from hmmseg.io.table import Table, shown
+
+KINDS = {
+    ".csv": "delimited", ".tsv": "delimited", ".txt": "delimited", ".dat": "delimited",
+    ".parquet": "parquet", ".npz": "npz",
+    ".hdf5": "hdf5", ".h5": "hdf5", ".mcap": "mcap", ".bag": "bag", ".db3": "bag",
+}  # fmt: skip
+EXTRAS = {"parquet": "parquet", "lerobot": "parquet", "hdf5": "hdf5", "mcap": "mcap", "bag": "bag"}
+NEEDED = {"parquet": ("pyarrow",), "lerobot": ("pyarrow",), "hdf5": ("h5py",),
+          "mcap": ("mcap", "mcap_ros2"), "bag": ("rosbags",)}  # fmt: skip
+A_TRIAL = "a trial (.csv, .tsv, .parquet, .npz, .mcap, .bag, .hdf5 or a data set's folder)"
+
+
+def split_part(path: str | Path) -> tuple[Path, str | None]:
+    """The file and, after a `#`, which of its recordings; a file of that very name goes first."""
+    path = Path(path)
+    if path.exists() or "#" not in path.name:
+        return path, None
+    name, _, part = path.name.rpartition("#")
+    return (path.with_name(name), part) if name else (path, None)
+
+
+def kind_of(path: Path) -> str:
+    """The module that reads this file or folder; InputError where there is none."""
+    if path.is_dir():
+        if (path / "meta/info.json").is_file():
+            return "lerobot"
+        if (path / "metadata.yaml").is_file():
+            return "bag"
+        raise InputError(str(path), "is a folder", A_TRIAL)
+    if not path.exists():
+        raise InputError(str(path), "no such file", A_TRIAL)
+    if not path.is_file():
+        raise InputError(str(path), "is not a regular file", A_TRIAL)
+    kind = KINDS.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(str(path), f"unknown kind of file {path.suffix!r}", ", ".join(KINDS))
+    if kind == "mcap" and (path.parent / "metadata.yaml").is_file() and not path.stat().st_size:
+        raise InputError(str(path), "is empty", A_TRIAL)
+    return kind
+
+
+def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
+    """The table of a file; InputError for whatever a parser makes of one it cannot parse."""
+    file, part = split_part(path)
+    kind = kind_of(file)
+    try:
+        return _module(kind, path).read(file, part, wanted)
+    except InputError:
+        raise
+    except Exception as error:  # parsers of hostile files raise anything
+        raise InputError(
+            str(path), f"cannot be read ({_told(error)})", "a table with a header row"
+        ) from error
+
+
+def parts_of(path: str | Path) -> list[str]:
+    """Names of the recordings that a file holds; none where the file is one recording itself."""
+    file, part = split_part(path)
+    module = _module(kind_of(file), path)
+    if part is not None or not hasattr(module, "parts"):
+        return []
+    try:
+        return module.parts(file)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(str(path), f"cannot be read ({_told(error)})") from error
+
+
+def _module(kind: str, path: str | Path) -> ModuleType:
+    for library in NEEDED.get(kind, ()):
+        try:
+            importlib.import_module(library)
+        except ImportError:
+            extra = EXTRAS[kind]
+            raise InputError(str(path), f"needs {library}, which is not installed",
+                             f"pip install 'hmmseg[{extra}]'") from None  # fmt: skip
+    return importlib.import_module(f"hmmseg.io.formats.{kind}")
+
+
+def _told(error: Exception) -> str:
+    text = shown(error)
+    return text if text else type(error).__name__

@@ -1,0 +1,77 @@
+"""Parquet files, read column by column with pyarrow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hmmseg.errors import InputError
+from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
+
+
+def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
+    """Table of a Parquet file."""
+    with pq.ParquetFile(path) as file:
+        if file.metadata.num_rows > MAX_ROWS:
+            raise InputError(str(path), f"says it has {file.metadata.num_rows} rows", f"at most {MAX_ROWS}")
+        names = file.schema_arrow.names
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"{path}: column {name}", "appears twice", "one of each name")
+        columns = to_columns(file.read(columns=_chosen(names, wanted)))
+    rest = [name for name in names if not any(c == name or c.startswith(f"{name}[") for c in columns)]
+    if wanted is not None:
+        columns = {name: values for name, values in columns.items() if name in wanted}
+    return plain_table(str(path), columns, [*columns, *rest])
+
+
+def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
+    """Tables of at most `rows` rows each, in order: a long file in bounded memory."""
+    with pq.ParquetFile(path) as file:
+        names, first = file.schema_arrow.names, 1
+        for batch in file.iter_batches(batch_size=rows, columns=_chosen(names, wanted)):
+            columns = to_columns(pa.Table.from_batches([batch]))
+            numbers = np.arange(first, first + batch.num_rows)
+            first += batch.num_rows
+            yield Table(str(path), tuple(names), columns, numbers)
+
+
+def _chosen(names: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
+    return [
+        name for name in names
+        if wanted is None or name in wanted or any(each.startswith(f"{name}[") for each in wanted)
+    ]  # fmt: skip
+
+
+def to_columns(table: pa.Table) -> dict[str, np.ndarray]:
+    """Columns of an Arrow table; lists of equal length become `name[0]`, `name[1]`, ..."""
+    return flat({name: _array(table.column(name)) for name in table.column_names})
+
+
+def _array(column: pa.ChunkedArray) -> np.ndarray:
+    kind = column.type
+    if pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind):
+        if column.null_count:
+            return np.array(column.to_pylist(), dtype=object)
+        joined = column.combine_chunks()
+        values = joined.flatten().to_numpy(zero_copy_only=False)
+        length = len(values) // len(joined) if len(joined) else 1
+        lengths = np.diff(np.asarray(joined.offsets)) if hasattr(joined, "offsets") else np.array([length])
+        if len(joined) and (lengths == length).all():
+            return values.reshape(len(joined), length)
+        return np.array([None] * len(joined), dtype=object) if not len(joined) else _ragged(joined)
+    if pa.types.is_dictionary(kind):
+        return _array(column.cast(kind.value_type))
+    if pa.types.is_decimal(kind):
+        column = column.cast(pa.float64())
+    return column.to_numpy(zero_copy_only=False)
+
+
+def _ragged(joined: pa.Array) -> np.ndarray:
+    out = np.empty(len(joined), dtype=object)
+    out[:] = [str(entry) for entry in joined.to_pylist()]
+    return out

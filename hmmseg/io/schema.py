@@ -1,0 +1,92 @@
+"""What every TOML table has in common: strict fields, and one line for what is at fault."""
+
+from __future__ import annotations
+
+import tomllib
+import typing
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hmmseg.errors import InputError, nearest
+
+Positive = Annotated[float, Field(gt=0, strict=True)]  # inf allowed: a rigid pad
+FinitePositive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Deviation = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Name = Annotated[str, Field(min_length=1, max_length=500, strict=True)]
+MAX_TOML_BYTES = 1_000_000
+
+
+class StrictTable(BaseModel):
+    """A frozen table that refuses keys it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+Model = TypeVar("Model", bound=StrictTable)
+
+
+def validated(model: type[Model], table: dict[str, Any], where: str) -> Model:
+    """The table as this model; InputError names the key at fault and the nearest known one."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = _known_keys(model, first["loc"])
+        raise InputError(f"{where}: key {key}", "unknown key", nearest(str(first["loc"][-1]), known))
+    if first["type"] == "missing":
+        raise InputError(f"{where}: key {key}", "missing", "a value")
+    problem = first["msg"].removeprefix("Value error, ")
+    if first["type"] != "value_error":
+        found = repr(first.get("input"))
+        problem += f" (found {found if len(found) < 100 else found[:100] + '...'})"
+    raise InputError(f"{where}: key {key}" if key else where, problem)
+
+
+def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
+    """Keys of the table in which the unknown last part of `location` stands."""
+    for part in location[:-1]:
+        field = _field(model, str(part))
+        inner = None if field is None else _inner_model(field.annotation)
+        model = inner if inner is not None else model  # a table of tables: its names are not fields
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _field(model: type[BaseModel], key: str) -> Any:
+    named = {field.alias or name: field for name, field in model.model_fields.items()}
+    return named.get(key)
+
+
+def _inner_model(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in typing.get_args(annotation):
+        found = _inner_model(argument)
+        if found is not None:
+            return found
+    return None
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Table of a TOML file; InputError for an absent, malformed or hostile file."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_TOML_BYTES + 1)
+        if len(content) > MAX_TOML_BYTES:
+            raise InputError(str(path), f"larger than {MAX_TOML_BYTES} bytes", "a TOML file")
+        return tomllib.loads(content.decode("utf-8"))
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(str(path), "no such file", "a TOML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(str(path), f"cannot be read ({error})", "a TOML file") from None
+    except RecursionError:
+        raise InputError(str(path), "not valid TOML: nested too deeply") from None
+    except ValueError as error:  # malformed, or a number of thousands of digits
+        raise InputError(str(path), f"not valid TOML: {error}") from None

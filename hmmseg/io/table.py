@@ -1,0 +1,120 @@
+"""A table as a file has it, and numbers from its columns, before anything is mapped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hmmseg.errors import InputError
+
+MAX_ROWS = 200_000_000  # more is a damaged or hostile file: 13 columns of it would be 20 GB
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one file or frame under their own names; only those asked for are read.
+
+    `names` are all that the file has; `rows` (num_rows,) numbers the rows as an editor does;
+    `units` are those that the file itself states. `origin` is where t = 0 lies in ns since 1970
+    (logs), and `interpolated` marks by column what lies between two messages.
+    """
+
+    file: str
+    names: tuple[str, ...]
+    columns: dict[str, np.ndarray]
+    rows: np.ndarray
+    units: dict[str, str] = field(default_factory=dict)
+    origin: int | None = None
+    interpolated: dict[str, np.ndarray] = field(default_factory=dict)
+    messages: bool = False
+
+
+def plain_table(file: str, columns: dict[str, np.ndarray], names: Sequence[str] | None = None) -> Table:
+    """A table whose rows count from 1; InputError where columns differ in length."""
+    columns = flat(columns)
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        odd = min(lengths, key=lambda name: sum(n == lengths[name] for n in lengths.values()))
+        usual = max(set(lengths.values()), key=list(lengths.values()).count)
+        raise InputError(f"{file}: column {odd}", f"has {lengths[odd]} rows", f"{usual} as in the others")
+    count = next(iter(lengths.values()), 0)
+    return Table(file, tuple(names if names is not None else columns), columns, np.arange(1, count + 1))
+
+
+def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns of several numbers a row as one column each: `pose[0]`, `pose[1]`, ..."""
+    out: dict[str, np.ndarray] = {}
+    for name, values in columns.items():
+        values = np.atleast_1d(values)
+        if values.ndim == 1:
+            out[name] = values
+        else:
+            wide = values.reshape(len(values), -1)
+            out |= {f"{name}[{i}]": wide[:, i] for i in range(wide.shape[1])}
+    return out
+
+
+def numbers(table: Table, name: str) -> np.ndarray:
+    """A column as float64 (num_rows,), NaN where its cell is empty; InputError names the row."""
+    column = table.columns[name]
+    where = f"{table.file}: column {name}"
+    if column.dtype.kind in "fiu":
+        values = column.astype(np.float64)
+        bad = np.flatnonzero(np.isinf(values))
+    elif column.dtype.kind in "OUS":
+        import pandas as pd
+
+        texts = pd.Series(column)
+        if any(isinstance(entry, bool | np.bool_) for entry in column[:1000]):
+            raise InputError(where, "holds bool", "numbers")
+        values = pd.Series(pd.to_numeric(texts, errors="coerce")).to_numpy(np.float64, na_value=np.nan)
+        bad = np.flatnonzero((np.isnan(values) & texts.notna().to_numpy()) | np.isinf(values))
+    else:
+        raise InputError(where, f"holds {column.dtype}", "numbers")
+    if bad.size:
+        raise InputError(f"{table.file}: row {table.rows[bad[0]]}, column {name}",
+                         f"{shown(column[bad[0]])} is not a finite number",
+                         "a number or an empty cell")  # fmt: skip
+    return values
+
+
+def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
+    """A column of times (num_rows,), and where its zero lies in ns since 1970 if it holds dates.
+
+    ISO 8601 stamps and dates become s since the first; numbers stay as they are.
+    """
+    column = table.columns[name]
+    if column.dtype.kind == "m":
+        return column.astype("timedelta64[ns]").astype(np.float64) * 1e-9, None
+    if column.dtype.kind == "M":
+        stamps = column.astype("datetime64[ns]")
+    elif column.dtype.kind in "OU" and any(_is_date(entry) for entry in column[:1000]):
+        import pandas as pd
+
+        texts = pd.Series(column)
+        dates = pd.to_datetime(texts, errors="coerce", utc=True, format="ISO8601")
+        bad = np.flatnonzero((dates.isna() & texts.notna()).to_numpy())
+        if bad.size:
+            raise InputError(f"{table.file}: row {table.rows[bad[0]]}, column {name}",
+                             f"{shown(column[bad[0]])} is not a date", "ISO 8601 in every row")  # fmt: skip
+        stamps = dates.dt.tz_localize(None).to_numpy().astype("datetime64[ns]")
+    else:
+        return numbers(table, name), table.origin
+    present = np.flatnonzero(~np.isnat(stamps))
+    if not present.size:
+        raise InputError(f"{table.file}: column {name}", "has no values", "times")
+    first = stamps[present[0]]
+    seconds = (stamps - first).astype("timedelta64[ns]").astype(np.float64) * 1e-9
+    return np.where(np.isnat(stamps), np.nan, seconds), int(first.astype(np.int64))
+
+
+def _is_date(entry: object) -> bool:
+    return isinstance(entry, str) and len(entry) >= 8 and entry[:4].isdigit() and entry.count("-") >= 2
+
+
+def shown(value: object) -> str:
+    """A cell for a message: one line, not long."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= 60 else text[:60] + "..."

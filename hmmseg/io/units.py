@@ -1,0 +1,75 @@
+"""Units of other people's files: their size in SI and what they measure."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from hmmseg.errors import nearest
+
+# name: (what it measures, its size in SI)
+UNITS: dict[str, tuple[str, float]] = {
+    "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9),
+    "min": ("time", 60.0),
+    "m": ("length", 1.0), "dm": ("length", 0.1), "cm": ("length", 1e-2), "mm": ("length", 1e-3),
+    "um": ("length", 1e-6), "in": ("length", 0.0254),
+    "rad": ("angle", 1.0), "mrad": ("angle", 1e-3), "deg": ("angle", math.pi / 180),
+    "m/s": ("velocity", 1.0), "cm/s": ("velocity", 1e-2), "mm/s": ("velocity", 1e-3),
+    "rad/s": ("angular velocity", 1.0), "mrad/s": ("angular velocity", 1e-3),
+    "deg/s": ("angular velocity", math.pi / 180), "rpm": ("angular velocity", math.pi / 30),
+    "N": ("force", 1.0), "mN": ("force", 1e-3), "kN": ("force", 1e3), "gf": ("force", 9.80665e-3),
+    "kgf": ("force", 9.80665), "lbf": ("force", 4.4482216152605),
+    "Nm": ("torque", 1.0), "mNm": ("torque", 1e-3), "Nmm": ("torque", 1e-3), "Ncm": ("torque", 1e-2),
+    "A": ("current", 1.0), "mA": ("current", 1e-3),
+    "kg": ("mass", 1.0), "g": ("mass", 1e-3),
+    "1": ("number", 1.0), "%": ("number", 0.01),
+}  # fmt: skip
+SPELLINGS = {
+    "sec": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms",
+    "usec": "us", "µs": "us", "μs": "us", "micros": "us", "microseconds": "us", "nsec": "ns",
+    "nanos": "ns", "nanoseconds": "ns", "minutes": "min", "meter": "m", "metre": "m", "meters": "m",
+    "metres": "m", "µm": "um", "μm": "um", "inch": "in", "degree": "deg", "degrees": "deg", "°": "deg",
+    "°/s": "deg/s", "radian": "rad", "radians": "rad", "newton": "N", "newtons": "N", "n": "N",
+    "mn": "mN", "kn": "kN", "n.m": "Nm", "n*m": "Nm", "n-m": "Nm", "nm": "Nm", "n·m": "Nm",
+    "n.mm": "Nmm", "nmm": "Nmm", "mm/sec": "mm/s", "m/sec": "m/s", "amp": "A", "amps": "A",
+}  # fmt: skip
+
+
+def known_unit(text: str) -> str | None:
+    """This unit as `UNITS` spells it, None where it is unknown."""
+    text = re.sub(r"\s+", "", text)
+    return text if text in UNITS else SPELLINGS.get(text.lower())
+
+
+def si_factor(unit: str | float) -> float:
+    """Size of a unit in SI (a number is itself: SI per count); ValueError names the nearest known one."""
+    if not isinstance(unit, str):
+        return float(unit)
+    name = known_unit(unit)
+    if name is None:
+        raise ValueError(f"unknown unit {unit!r}; expected {nearest(unit, UNITS)}")
+    return UNITS[name][1]
+
+
+def measures(channel: str) -> str | None:
+    """What one of our channels measures, None for a channel of a plain task."""
+    if channel == "t":
+        return "time"
+    if re.fullmatch(r"d?q\d\d", channel):
+        return "angular velocity" if channel[0] == "d" else "angle"
+    if re.fullmatch(r"(v[xy]|[xy]|f[xy])[12]", channel):
+        return {"v": "velocity", "f": "force"}.get(channel[0], "length")
+    return None
+
+
+def unit_in_name(name: str) -> str | None:
+    """Unit that a column's name ends in: `left_x_mm`, `force [N]`, `t (ms)`."""
+    bracketed = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
+    if bracketed:
+        return known_unit(bracketed.group(1))
+    last = re.split(r"[_. ]", name)
+    if len(last) < 2:
+        return None
+    unit = known_unit(last[-1])
+    # a bare letter is rather a name (`joint_s`, `tip_m`) unless it is one that is written so
+    return unit if unit is not None and (len(unit) > 1 or unit in ("s", "m", "N")) else None
