@@ -22,7 +22,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.features import thin
+from hmmseg.segmentation.features import thin
 
 PROPERTIES = ("weight", "width", "height")
 

@@ -22,9 +22,9 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.segment.align import AlignedTrials, TrialAlignment
-from hmmseg.segment.emissions import TAIL
-from hmmseg.segment.features import acceleration, thin
+from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
+from hmmseg.segmentation.emissions import TAIL
+from hmmseg.segmentation.features import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
 MAX_RATE = 50.0  # Hz; noise of finer samples is averaged before it is weighed
@@ -121,14 +121,13 @@ class Aligned:
 
 
 def aligned_weights(
-    aligned: AlignedTrials, signals: list[Signals], rig: Rig, rng: np.random.Generator,
-    num_alignments: int = NUM_ALIGNMENTS,
-) -> tuple[list[Aligned], Noise]:  # fmt: skip
+    aligned: AlignedTrials, rng: np.random.Generator, num_alignments: int = NUM_ALIGNMENTS
+) -> tuple[list[Aligned], Noise]:
     """Weights of every grip's means for drawn alignments, and the noise of each channel."""
-    steps = aligned.subtasks
+    steps, rig = aligned.subtasks, aligned.rig
     prepared = []
-    for trial, raw in zip(aligned.trials, signals, strict=True):
-        thinned = thin(raw, MAX_RATE)
+    for trial in aligned.trials:
+        thinned = thin(trial.signals, MAX_RATE)
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
         drawn = draw_boundaries(trial, rng, num_alignments)
         best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]

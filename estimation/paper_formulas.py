@@ -25,8 +25,8 @@ from scipy.stats import norm
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask, decompose, height_equations, subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask
-from hmmseg.segment.spans import Segmentation
-from hmmseg.segment.thresholds import StateLabels, label_states
+from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.thresholds import StateLabels, label_states
 
 TRIM = 0.05  # share of the carry left out at either end of the weight estimate
 UNITS = {"weight": "N", "width": "m", "height": "m"}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from estimation.identify import Identification
+from estimation.identification import Identification
 from estimation.observations import channel_values, gravity_factor
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE
 

@@ -25,7 +25,7 @@ from experiments.recordings import Case
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Fingertip
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import TrialAlignment
+from hmmseg.segmentation.align import TrialAlignment
 
 RESULTS = Path(__file__).parent / "results"
 FIRST_SEED = 22_000
@@ -49,7 +49,7 @@ def no_inertia() -> Iterator[None]:
         return np.zeros_like(velocity)
 
     with (
-        patch("hmmseg.segment.features.acceleration", still),
+        patch("hmmseg.segmentation.features.acceleration", still),
         patch("estimation.observations.acceleration", still),
     ):
         yield
@@ -63,7 +63,7 @@ def rigid(case: Case) -> Case:
 @contextmanager
 def gaussian() -> Iterator[None]:
     """Student-t residuals with so many degrees of freedom that they are Gaussian."""
-    modules = ("hmmseg.segment.emissions", "hmmseg.segment.fit", "estimation.observations")
+    modules = ("hmmseg.segmentation.emissions", "hmmseg.segmentation.fit", "estimation.observations")
     with patch(f"{modules[0]}.TAIL", 1e8), patch(f"{modules[1]}.TAIL", 1e8), patch(f"{modules[2]}.TAIL", 1e8):
         yield
 
@@ -75,7 +75,7 @@ def flat_durations() -> Iterator[None]:
     def equal(gammas: Sequence[np.ndarray]) -> np.ndarray:
         return np.full(gammas[0].shape[1], 1.0 / gammas[0].shape[1])
 
-    with patch("hmmseg.segment.fit._mean_share", equal):
+    with patch("hmmseg.segmentation.fit._mean_share", equal):
         yield
 
 
@@ -98,7 +98,7 @@ def unrefined() -> Iterator[None]:
     def unknown(*_: object) -> None:
         return None
 
-    with patch("hmmseg.segment.crossings.Contacts.density", unknown):
+    with patch("hmmseg.segmentation.crossings.Contacts.density", unknown):
         yield
 
 

@@ -9,14 +9,14 @@ import numpy as np
 from scipy.stats import norm
 
 from estimation.design import PROPERTIES, build
-from estimation.identify import start
+from estimation.identification import start
 from estimation.mode import find_mode
 from estimation.observations import aligned_weights
 from estimation.posterior import pack
 from estimation.sampler import sample
 from experiments.recordings import Case
 from experiments.scoring import boundaries_covered, boundary_residuals
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 
 KINDS = ("touch", "lift", "land", "release")  # the boundaries of each move, in order
 LEVELS = {"68": 0.68, "95": 0.95}
@@ -43,13 +43,13 @@ class Estimates:
 
 def estimate(case: Case, trials: slice = slice(None), sampled: bool = True, seed: int = 0) -> Estimates:
     """Estimate a case from some of its trials, pooled; without the sampler if not `sampled`."""
-    chosen, signals = list(case.trials[trials]), list(case.signals[trials])
-    aligned = align_trials([t.file for t in chosen], signals, case.task, case.rig)
-    segmentations = [trial.segmentation for trial in aligned.trials]
+    chosen = list(case.trials[trials])
+    aligned = align(chosen, case.task, case.rig)
+    segmentations = aligned.segmentations
     truth = [t for t in case.truth[trials] if t is not None]
     pairs = list(zip(segmentations, truth, strict=True))
     rng = np.random.default_rng(seed)
-    weighed, noise = aligned_weights(aligned, signals, case.rig, rng)
+    weighed, noise = aligned_weights(aligned, rng)
     sd_force = case.rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(chosen, weighed, noise, case.task, case.rig, sd_force)
     mode = find_mode(start(design), pack(design))

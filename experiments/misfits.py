@@ -3,9 +3,9 @@
     python -m experiments.misfits RECORDINGS
 
 Each recording is edited in each way of experiments.misfit_edits and judged alone, and pooled with
-the unedited others of its case; unedited ones count false alarms. The constants of hmmseg.segment.conformity
-were chosen with these recordings in view, so the same is done with simulated trials of several
-tasks that were not. Writes experiments/results/misfits.json.
+the unedited others of its case; unedited ones count false alarms. The constants of
+hmmseg.segmentation.conformity were chosen with these recordings in view, so the same is done with
+simulated trials of several tasks that were not. Writes experiments/results/misfits.json.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from experiments.recordings import Case, list_cases, read_case
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.segment.conformity import MAX_RATE, Conformity, judge
-from hmmseg.segment.emissions import Features
-from hmmseg.segment.features import features, thin
+from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
+from hmmseg.segmentation.emissions import Features
+from hmmseg.segmentation.features import features, thin
 from simgap.world.properties import random_properties
 from simgap.world.simulate import simulate_trials
 
@@ -47,7 +47,7 @@ TASKS = {
 
 
 def to_features(signals: Signals, rig: Rig) -> Features:
-    """Features as `align_trials` judges them."""
+    """Features as `align` judges them."""
     return features(thin(signals, MAX_RATE), rig)
 
 

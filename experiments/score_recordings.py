@@ -28,8 +28,8 @@ from experiments.scoring import (
     summarise_properties,
 )
 from hmmseg.contact.decompose import subtasks
-from hmmseg.segment.spans import Segmentation
-from hmmseg.segment.thresholds import Rule, segment_qualitative
+from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.thresholds import Rule, segment_qualitative
 
 RESULTS = Path(__file__).parent / "results"
 Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
@@ -37,7 +37,7 @@ Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
 
 def by_hmm(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation], dict]:
     """Spans of the switching model and properties of the Bayesian model."""
-    from estimation.identify import identify  # JAX takes seconds to import; the rules do without
+    from estimation.identification import identify  # JAX takes seconds to import; the rules do without
 
     found = identify(case.trials[group], case.task, case.rig, seed)
     return found.segmentations, found.to_json()["properties"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.contact.decompose import Subtask
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 
 PROPERTIES = ("weight", "width", "height")
 

@@ -69,7 +69,7 @@ def run(
     if method is Method.PAPER:
         body, segmentations, found = _paper(out, signals, recordings, description)
     else:
-        found = _bayes(out, signals, recordings, description, hand)
+        found = _bayes(out, recordings, description, hand)
         body, segmentations = found.to_json(), found.segmentations
     if measured is not None:
         body["actual"] = _compared(body["properties"], measured)
@@ -90,7 +90,7 @@ def run(
 
 def _paper(out: Output, signals, recordings, task: BlockTask):
     from estimation.paper_formulas import estimate_plugin
-    from hmmseg.segment.thresholds import segment_qualitative
+    from hmmseg.segmentation.thresholds import segment_qualitative
 
     pairs = zip(recordings, signals, strict=True)
     segmentations = [segment_qualitative(trial, s, task) for trial, s in pairs]
@@ -101,11 +101,11 @@ def _paper(out: Output, signals, recordings, task: BlockTask):
     return body | estimates.to_json(), segmentations, None
 
 
-def _bayes(out: Output, signals, recordings, task: BlockTask, hand):
-    from estimation.identify import identify_aligned
-    from hmmseg.segment.align import align_trials
+def _bayes(out: Output, recordings, task: BlockTask, hand):
+    from estimation.identification import identify_aligned
+    from hmmseg.segmentation.align import align
 
-    aligned = align_trials([trial.file for trial in recordings], signals, task, hand)
+    aligned = align(recordings, task, hand)
     with out.progress("sampling the posterior", total=100) as advance:
         done = 0
 
@@ -114,7 +114,7 @@ def _bayes(out: Output, signals, recordings, task: BlockTask, hand):
             advance(100 * step // of - done)
             done = 100 * step // of
 
-        found = identify_aligned(recordings, signals, aligned, hand, out.seed, progress)
+        found = identify_aligned(aligned, out.seed, progress)
     for warning in found.warnings:
         out.warn(warning)
     return found

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask, read_task
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg_cli.console import (
     FiguresOption,
     JsonOption,
@@ -72,7 +72,7 @@ def _segment_blocks(
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
     from hmmseg.io.trial import read_trial
-    from hmmseg.segment.thresholds import segment_qualitative
+    from hmmseg.segmentation.thresholds import segment_qualitative
 
     rig = read_rig(rig_file)
     recordings = [read_trial(path, rig) for path in paths]
@@ -81,9 +81,9 @@ def _segment_blocks(
         pairs = zip(recordings, signals, strict=True)
         found = [segment_qualitative(trial, s, task, *thresholds) for trial, s in pairs]
     else:
-        from hmmseg.segment.align import segment_trials
+        from hmmseg.segmentation.align import segment
 
-        found = segment_trials([trial.file for trial in recordings], signals, task, rig)
+        found = segment(recordings, task, rig)
     if out.figures is not None:
         from hmmseg_cli.figures.signals import draw_signals
 

@@ -132,15 +132,14 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     import numpy as np
 
     from hmmseg.contact.decompose import subtasks
-    from hmmseg.hand.signals import task_space
     from hmmseg.io.trial import Trial, read_trial
-    from hmmseg.segment.align import segment_trials
+    from hmmseg.segmentation.align import segment
     from simgap.world.animation import Scene, Trace
     from simgap.world.replay import replay, residual_summary
     from simgap.world.writing import trial_files
 
     recording = read_trial(path, rig)
-    segmentation = segment_trials([recording.file], [task_space(recording, rig)], task, rig)[0]
+    segmentation = segment([recording], task, rig)[0]
     if segmentation.failed is not None:
         out.warn(f"{recording.file}: {segmentation.failed}")
     boundaries = np.array([span.start for span in segmentation.spans[1:]])
@@ -170,7 +169,7 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
 def _segmentation(file: str, signals, task, boundaries):
     """The truth as a segmentation without uncertainty, for the figures."""
     from hmmseg.contact.decompose import subtasks
-    from hmmseg.segment.spans import Segmentation, Span
+    from hmmseg.segmentation.spans import Segmentation, Span
 
     edges = [float(signals.t[0]), *map(float, boundaries), float(signals.t[-1])]
     spans = tuple(Span(s.name, s.object, s.state, a, b, 0.0, 0.0, (a, a), (b, b))

@@ -7,7 +7,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
 from hmmseg.contact.equations import Pads
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.segment.emissions import Features
+from hmmseg.segmentation.emissions import Features
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))

@@ -19,7 +19,7 @@ from estimation.observations import Aligned, gravity_factor
 from hmmseg.contact.decompose import ABOVE_GROUND, SLIDING, Subtask
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.segment.features import acceleration
+from hmmseg.segmentation.features import acceleration
 
 MOVING = 3.0  # noise sds of the velocity beyond which the block surely slides
 FEWEST = 4  # samples of sliding

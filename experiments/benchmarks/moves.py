@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from estimation.design import build
-from estimation.identify import start
+from estimation.identification import start
 from estimation.mode import Mode, find_mode
 from estimation.observations import aligned_weights
 from estimation.posterior import log_prob_batch, pack
@@ -35,7 +35,7 @@ from estimation.sampler import (
 )
 from experiments.bank import SEED, simulated_cases
 from experiments.recordings import Case
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 
 RESULTS = Path(__file__).parents[1] / "results"
 STEPS = 600
@@ -43,9 +43,9 @@ STEPS = 600
 
 def mode_of(case: Case, num_trials: int) -> Mode:
     """Posterior mode of a case's first trials."""
-    trials, signals = list(case.trials[:num_trials]), list(case.signals[:num_trials])
-    aligned = align_trials([t.file for t in trials], signals, case.task, case.rig)
-    weighed, noise = aligned_weights(aligned, signals, case.rig, np.random.default_rng(0))
+    trials = list(case.trials[:num_trials])
+    aligned = align(trials, case.task, case.rig)
+    weighed, noise = aligned_weights(aligned, np.random.default_rng(0))
     sd_force = case.rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(trials, weighed, noise, case.task, case.rig, sd_force)
     return find_mode(start(design), pack(design))

@@ -10,7 +10,7 @@ import numpy as np
 from estimation.paper_formulas import TRIM
 from experiments.paper.sources import BLOCKS, ONE, qualitative, recorded, save, true_blocks
 from hmmseg.contact.decompose import subtasks
-from hmmseg.segment.thresholds import label_states
+from hmmseg.segmentation.thresholds import label_states
 from simgap.world.replay import replay
 
 MOMENT = {"pregrasp": 0.6, "release": 0.25}  # share of a subtask at which it is shown, else half

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.identify import Identification
+from estimation.identification import Identification
 from experiments.paper.estimates import identified
 from experiments.paper.sources import ONE, recorded, save
 from hmmseg.contact.decompose import subtasks

@@ -13,14 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.identify import identify
+from estimation.identification import identify
 from estimation.paper_formulas import PluginEstimates, estimate_plugin
 from experiments.paper.estimates import identified
 from experiments.paper.sources import BLOCKS, PRINTED, qualitative, recorded, save, simulated
 from experiments.recordings import Case
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.segment.thresholds import label_states
+from hmmseg.segmentation.thresholds import label_states
 
 ACTUAL = {"block1": 0.0159, "block2": 0.0254}  # m, the paper's calipers
 GRIPS = np.linspace(1.0, 4.0, 31)  # N; its Figure 6 shows grips up to 4 N

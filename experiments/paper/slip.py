@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
-from estimation.identify import identify
+from estimation.identification import identify
 from estimation.paper_formulas import estimate_plugin
 from experiments.paper.rigid import by_formula
 from experiments.paper.sources import BLOCKS, PRINTED, recorded, save
@@ -26,7 +26,7 @@ from experiments.recordings import Case
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
-from hmmseg.segment.thresholds import segment_qualitative
+from hmmseg.segmentation.thresholds import segment_qualitative
 from simgap.world.operator import minimum_jerk
 from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import PAPER_BLOCKS

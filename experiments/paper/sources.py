@@ -13,8 +13,8 @@ import numpy as np
 
 from experiments.recordings import Case, read_case
 from hmmseg.hand.signals import task_space
-from hmmseg.segment.spans import Segmentation
-from hmmseg.segment.thresholds import segment_qualitative
+from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.thresholds import segment_qualitative
 from paper_figs.results import RESULTS
 from simgap.world.properties import PAPER_BLOCKS, UNITS, Block, Blocks
 from simgap.world.simulate import simulate_trials

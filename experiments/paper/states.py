@@ -12,7 +12,7 @@ import numpy as np
 from experiments.paper.sources import ONE, qualitative, recorded, save, simulated
 from experiments.recordings import Case
 from hmmseg.contact.decompose import FREE, subtasks
-from hmmseg.segment.thresholds import NUMBERS, label_states
+from hmmseg.segmentation.thresholds import NUMBERS, label_states
 
 EXPECTED = (1, 3, 2, 3, 1, 3, 2, 3, 1)
 

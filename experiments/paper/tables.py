@@ -14,7 +14,13 @@ from experiments.recordings import Case
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, decompose, subtasks
 from hmmseg.contact.notation import cell, equation
 from hmmseg.hand.signals import Signals
-from hmmseg.segment.thresholds import FORCE_THRESHOLD, NUMBERS, VELOCITY_THRESHOLD, label_states, threshold
+from hmmseg.segmentation.thresholds import (
+    FORCE_THRESHOLD,
+    NUMBERS,
+    VELOCITY_THRESHOLD,
+    label_states,
+    threshold,
+)
 
 COLUMNS = ("weight", "width", "height", "friction")
 SENSED = {"vx": VELOCITY_THRESHOLD, "vy": VELOCITY_THRESHOLD, "fx": FORCE_THRESHOLD,

@@ -12,8 +12,8 @@ from experiments.paper.replay import calibrated
 from experiments.paper.sources import ONE, qualitative, recorded, save
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.task import GROUND, BlockTask, Move
-from hmmseg.segment.spans import Segmentation
-from hmmseg.segment.thresholds import label_states, segment_qualitative
+from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.thresholds import label_states, segment_qualitative
 from simgap.world.simulate import simulate_trial
 
 TWICE = BlockTask({"block2": GROUND}, (Move("block2", GROUND), Move("block2", GROUND)))

@@ -21,7 +21,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.segment import segment_sequence
 

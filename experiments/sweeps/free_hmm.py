@@ -17,9 +17,9 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.dense import log_evidence, viterbi
 from hmmseg.hmm.padding import bucket
-from hmmseg.segment.features import noise_sd, thin
-from hmmseg.segment.fit import otsu
-from hmmseg.segment.thresholds import NUMBERS, StateLabels
+from hmmseg.segmentation.features import noise_sd, thin
+from hmmseg.segmentation.fit import otsu
+from hmmseg.segmentation.thresholds import NUMBERS, StateLabels
 
 ITERATIONS = 40
 STATES = 3

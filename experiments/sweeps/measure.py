@@ -36,9 +36,9 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.hmm.banded import InfeasibleAlignment
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.segment.align import align_trials
-from hmmseg.segment.spans import Segmentation
-from hmmseg.segment.thresholds import (
+from hmmseg.segmentation.align import align
+from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.thresholds import (
     FORCE_THRESHOLD,
     VELOCITY_THRESHOLD,
     StateLabels,
@@ -95,12 +95,12 @@ def _ours(recorded: Recorded, signals: Signals, told: Scene, seed: int | None) -
     """Our segmentation and Laplace posterior; with a seed, the sampled posterior beside it."""
     count = len(told.task.objects) * len(PROPERTIES)
     try:
-        aligned = align_trials([recorded.trial.file], [signals], told.task, told.rig)
+        aligned = align([recorded.trial], told.task, told.rig)
     except InfeasibleAlignment:
         lost, none = np.full(recorded.boundaries.size, np.nan), np.full(count, np.nan)
         return {"residual": lost, "inside_90": lost, "accuracy": 0.0, "property": none, "inside_95": none}
     scores = _scores(aligned.trials[0].segmentation, recorded, signals, told)
-    weighed, noise = aligned_weights(aligned, [signals], told.rig, np.random.default_rng(recorded.number))
+    weighed, noise = aligned_weights(aligned, np.random.default_rng(recorded.number))
     sd_force = told.rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build([recorded.trial], weighed, noise, told.task, told.rig, sd_force)
     columns = [(name, key) for name in told.task.objects for key in PROPERTIES]

@@ -12,8 +12,8 @@ from hmmseg.contact.decompose import Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.segment.spans import Failure, Segmentation, Span
-from hmmseg.segment.thresholds import NUMBERS, StateLabels
+from hmmseg.segmentation.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.thresholds import NUMBERS, StateLabels
 from simgap.world.properties import Block
 
 PROPERTIES = ("weight", "width", "height")

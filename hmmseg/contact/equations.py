@@ -12,7 +12,7 @@ leaves out):
 | sliding on ground | `block_y` constant; |net fx - m ax| <= mu `support_load` |
 | hold above ground | net fx = m ax; net fy = `carried_force` |
 
-Emissions (hmmseg.segment), observations of properties (estimation) and residuals of the gap (simgap) are
+Emissions (hmmseg.segmentation), observations of properties (estimation) and residuals of the gap (simgap) are
 built from these functions; the dynamics of the virtual model (simgap.world) is tested against them. All
 work on NumPy and JAX arrays alike, of any shape that broadcasts, in SI units, and raise nothing.
 """

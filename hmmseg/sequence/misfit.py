@@ -13,7 +13,7 @@ import numpy as np
 
 from hmmseg.hmm import dense as ergodic
 from hmmseg.hmm.padding import Alignment, bucket
-from hmmseg.segment.spans import Failure
+from hmmseg.segmentation.spans import Failure
 
 SPREADS = 6.0  # a trial this far outside the others does not fit
 LEAST_SPREAD = (2.0, 0.02)  # nats for the first score, nats per cell for the second

@@ -12,7 +12,7 @@ from hmmseg.hmm.banded import InfeasibleAlignment
 from hmmseg.hmm.padding import Alignment
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.spans import Failure, Segmentation, Span
 from hmmseg.sequence import misfit as sequence_misfit
 from hmmseg.sequence.features import Features, features
 from hmmseg.sequence.fit import fit_sequence

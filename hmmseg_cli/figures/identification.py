@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from estimation.actual import Actual
-from estimation.identify import Identification
+from estimation.identification import Identification
 from hmmseg.hand.signals import Signals
 from hmmseg.io.trial import Trial
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg_cli.console import Output
 from hmmseg_cli.figures.corner import draw_corner
 from hmmseg_cli.figures.estimates import draw_estimates

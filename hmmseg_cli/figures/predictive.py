@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hmmseg.drawing import BLUE, INK, RED, canvas
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg_cli.figures.spans import name_spans, shade_spans
 
 

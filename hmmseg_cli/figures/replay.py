@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hmmseg.drawing import BLUE, canvas
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg_cli.figures.spans import Panel, stacked_panels
 from simgap.world.replay import Replay
 

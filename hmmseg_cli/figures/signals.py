@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hmmseg.drawing import canvas
 from hmmseg.hand.signals import Signals
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg_cli.figures.spans import Panel, stacked_panels
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from hmmseg.drawing import INK, state_colours
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation
 
 LABEL_SLANT = 40  # degrees
 

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.effects import catalogue
 from simgap.gap import judge
 from simgap.gap.adapt import fingerprint
@@ -86,8 +85,7 @@ def frames(cases: Sequence[Sequence[Trial]], task: BlockTask, rig: Rig, tell: Pr
     """Aligned frames of the cases all of whose trials fit their task; InputError where most do not."""
     out = []
     for k, trials in enumerate(cases, 1):
-        signals = [task_space(t, rig) for t in trials]
-        aligned = align_trials([t.file for t in trials], signals, task, rig)
+        aligned = align(trials, task, rig)
         if all(a.segmentation.complete for a in aligned.trials):
             out.append(build(trials, aligned, rig))
         tell(f"{k} of {len(cases)} cases aligned")

@@ -20,8 +20,7 @@ import numpy as np
 
 from estimation.actual import Actual
 from hmmseg.errors import InputError
-from hmmseg.hand.signals import task_space
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits, deterministic
 from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem, slots
@@ -149,7 +148,7 @@ def _gains(
     seeds = [seed + 77 + k for k in range(TRIALS)]
     simulated = performed(task, rig, [blocks] * TRIALS, seeds, truth, OperatorSettings(**experiment.operator))
     trials = [recorded(s, task, rig, truth) for s in simulated]
-    aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    aligned = align(trials, task, rig)
     asked = problem(build(trials, aligned, rig), bank.noise, actual)
     healthy = fit(asked, [Start((), neutral(asked))])[0]
     own = _cost(asked, healthy, truth, tuple(truth))

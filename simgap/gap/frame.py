@@ -13,7 +13,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import AlignedTrials, TrialAlignment
+from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from simgap.effects.base import FORCES, World
 from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise
 

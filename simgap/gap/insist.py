@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import AlignedTrials, align_trials
+from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects import decoys
 from simgap.gap.bank import Bank
 from simgap.gap.candidates import best_fits
@@ -36,8 +35,7 @@ def insisted(
 
     Where none of them helps, `failed` as it is. The second is a warning that says so.
     """
-    task, files = failed.task, [t.file for t in trials]
-    aligned = align_trials(files, [task_space(t, rig) for t in trials], task, rig, insist=True)
+    aligned = align(trials, failed.task, rig, insist=True)
     for _ in range(ROUNDS):
         given = problem(build(trials, aligned, rig), bank.noise, actual)
         healthy = fit(given, [Start((), neutral(given))])[0]

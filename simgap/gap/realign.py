@@ -10,7 +10,7 @@ import numpy as np
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import AlignedTrials, align_trials
+from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects.base import tips
 from simgap.gap.fit import Fitted, Problem, world_without
 from simgap.gap.frame import thinned
@@ -28,7 +28,7 @@ def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, insist: bo
         columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
         small, _ = thinned(trial)
         rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
-    return align_trials([t.file for t in trials], rows, frame.task, _hand(rig, world), insist)
+    return align(trials, frame.task, _hand(rig, world), insist, rows)
 
 
 def _hand(rig: Rig, world) -> Rig:

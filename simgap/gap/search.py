@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import AlignedTrials, align_trials
+from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects import catalogue, decoys
 from simgap.gap import judge
 from simgap.gap.bank import Bank
@@ -64,7 +63,7 @@ def search(
 ) -> Search:
     """Fit the catalogue to recordings of one block task; InputError where no trial fits its task."""
     tell("aligning trials")
-    aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    aligned = align(trials, task, rig)
     names, misled = _names(rig, excluded), []
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
@@ -176,7 +175,5 @@ def _complete(
     if not keep:
         raise InputError(trials[0].file, str(failed[0]), "a recording that shows every subtask")
     out = [f"{t.name}: {f}; left out" for t, f in zip(trials, failed, strict=True) if f is not None]
-    chosen = AlignedTrials(
-        aligned.task, aligned.subtasks, aligned.fit, tuple(aligned.trials[k] for k in keep)
-    )
+    chosen = replace(aligned, trials=tuple(aligned.trials[k] for k in keep))
     return [trials[k] for k in keep], chosen, out

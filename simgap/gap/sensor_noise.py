@@ -6,7 +6,7 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.segment.features import noise_sd
+from hmmseg.segmentation.features import noise_sd
 
 MISFIT = 0.03  # share of a force's change between samples that no model of 20 Hz samples can tell,
 STARTING = 0.1  # and of that with which a block comes off its support or onto it: how fast is not recorded

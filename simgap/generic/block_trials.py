@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.generic.aligned import Cut, Ensembles
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
@@ -22,10 +21,8 @@ def block_ensembles(real: Sequence[Trial], sim: Sequence[Trial], task: BlockTask
     cuts: list[list[Cut]] = [[], []]
     warnings, names = [], ()
     for kind, trials in enumerate((real, sim)):
-        signals = [task_space(t, rig) for t in trials]
-        aligned = align_trials([t.file for t in trials], signals, task, rig)
-        for trial, signal, one in zip(trials, signals, aligned.trials, strict=True):
-            found = one.segmentation
+        for one in align(trials, task, rig).trials:
+            trial, signal, found = one.trial, one.signals, one.segmentation
             if not found.complete:
                 warnings.append(f"{trial.name}: does not fit its task and is left out")
                 continue

@@ -13,7 +13,7 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import segment_trials
+from hmmseg.segmentation.align import segment
 from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import Blocks
 from simgap.world.scene import Surroundings, finite_stiffness, physics, substeps_for
@@ -68,7 +68,7 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     """
     signals = task_space(trial, rig)
     if boundaries is None:
-        found = segment_trials([trial.file], [signals], task, rig)[0]
+        found = segment([trial], task, rig)[0]
         boundaries = [span.start for span in found.spans[1:]]
     path = finger_motion(signals, rig, infer_grip)
     t = np.arange(signals.t[0], signals.t[-1] + CONTROL_PERIOD / 2, CONTROL_PERIOD)

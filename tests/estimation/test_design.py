@@ -11,7 +11,7 @@ from estimation.observations import aligned_weights
 from estimation.posterior import pack
 from experiments.bank import simulated_cases
 from hmmseg.io.rig import Fingertip, Rig, Systematic
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 
 EVERY = Systematic(
     force_bias=(0.01,) * 4, force_gain=(0.02,) * 4, joint_offset=(0.001,) * 4,
@@ -26,9 +26,8 @@ def case():
 
 @pytest.fixture(scope="module")
 def aligned(case):
-    signals = list(case.signals)
-    found = align_trials([t.file for t in case.trials], signals, case.task, case.rig)
-    return (*aligned_weights(found, signals, case.rig, np.random.default_rng(0)), found)
+    found = align(case.trials, case.task, case.rig)
+    return (*aligned_weights(found, np.random.default_rng(0)), found)
 
 
 def design_of(case, aligned, systematic):

@@ -15,9 +15,9 @@ from estimation.observations import (
 )
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
-from hmmseg.segment.align import TrialAlignment
-from hmmseg.segment.boundaries import BoundaryPosterior
-from hmmseg.segment.emissions import TAIL
+from hmmseg.segmentation.align import TrialAlignment
+from hmmseg.segmentation.boundaries import BoundaryPosterior
+from hmmseg.segmentation.emissions import TAIL
 
 
 def made_signals(t, **columns):

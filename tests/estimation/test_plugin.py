@@ -13,8 +13,8 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move, read_task
 from hmmseg.io.trial import read_trial
-from hmmseg.segment.spans import Segmentation, Span
-from hmmseg.segment.thresholds import StateLabels, segment_qualitative
+from hmmseg.segmentation.spans import Segmentation, Span
+from hmmseg.segmentation.thresholds import StateLabels, segment_qualitative
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))

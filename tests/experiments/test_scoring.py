@@ -19,7 +19,7 @@ from experiments.scoring import (
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.segment.spans import Segmentation, Span
+from hmmseg.segmentation.spans import Segmentation, Span
 
 STEPS = subtasks(BlockTask({"block": "ground"}, (Move("block", "ground"),)))
 TRUTH = (1.0, 2.0, 3.0, 4.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hmmseg.segment.boundaries import (
+from hmmseg.segmentation.boundaries import (
     LAUNCH,
     MOTION,
     ONSET,

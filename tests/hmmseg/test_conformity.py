@@ -11,11 +11,10 @@ import pytest
 
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import list_cases, read_case
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial, read_trial
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation import align as segmentation
 
 STACK = Path(__file__).parents[1] / "data" / "stack"
 RIG = read_rig(STACK / "rig.toml")
@@ -26,12 +25,12 @@ TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for 
 ONE_BLOCK = BlockTask({"block1": "ground"}, (Move("block1", "ground"),))
 
 
-def align(*trials: Trial, task: BlockTask = TASK):
-    return align_trials([t.file for t in trials], [task_space(t, RIG) for t in trials], task, RIG)
+def aligned_of(*trials: Trial, task: BlockTask = TASK):
+    return segmentation.align(trials, task, RIG)
 
 
 def segment(*trials: Trial, task: BlockTask = TASK):
-    return [t.segmentation for t in align(*trials, task=task).trials]
+    return [t.segmentation for t in aligned_of(*trials, task=task).trials]
 
 
 def names(segmentation) -> list[str]:
@@ -57,8 +56,7 @@ def test_all_recordings_pass_whatever_effect_is_on_them(shared):
     for folder in list_cases(shared / "recordings"):
         case = read_case(folder)
         some = slice(0, 2)  # experiments/misfits.py takes all
-        files = [t.file for t in case.trials[some]]
-        aligned = align_trials(files, case.signals[some], case.task, case.rig)
+        aligned = segmentation.align(case.trials[some], case.task, case.rig)
         for trial in aligned.trials:
             assert trial.segmentation.complete, (case.name, trial.segmentation.failed)
 
@@ -92,7 +90,7 @@ def test_time_of_the_drop_is_told():
 
 
 def test_what_is_good_before_and_after_a_drop_is_kept():
-    aligned = align(EDITS["drop_first_go_on"](TRIALS[0], TRUTH[0])[0]).trials[0]
+    aligned = aligned_of(EDITS["drop_first_go_on"](TRIALS[0], TRUTH[0])[0]).trials[0]
     kept = aligned.segmentation.spans
     assert names(aligned.segmentation) == [
         "pregrasp block1", "pickup block1", "carry block1",
@@ -109,7 +107,7 @@ def test_what_is_good_before_and_after_a_drop_is_kept():
 
 def test_a_bad_trial_does_not_touch_the_others():
     bad, _ = EDITS["drop_first"](TRIALS[2], TRUTH[2])
-    alone, pooled = align(*TRIALS[:2]), align(TRIALS[0], bad, TRIALS[1])
+    alone, pooled = aligned_of(*TRIALS[:2]), aligned_of(TRIALS[0], bad, TRIALS[1])
     assert [t.segmentation.complete for t in pooled.trials] == [True, False, True]
     assert pooled.fit.parameters.weight == alone.fit.parameters.weight
     for a, b in zip(alone.trials, (pooled.trials[0], pooled.trials[2]), strict=True):
@@ -144,7 +142,7 @@ def test_unknown_number_of_rounds(rounds):
     b = TRUTH[0]
     piece = (b[0] - 0.6, b[3] + 0.5)
     trial = join(TRIALS[0], *[piece] * rounds)
-    aligned = align(trial, task=replace(ONE_BLOCK, repeat="unknown"))
+    aligned = aligned_of(trial, task=replace(ONE_BLOCK, repeat="unknown"))
     assert aligned.task.repeat == rounds
     assert len(aligned.subtasks) == 1 + 4 * rounds
     assert aligned.trials[0].segmentation.complete
@@ -171,7 +169,7 @@ def scattered(trial: Trial) -> Trial:
     ids=["eight samples", "eight in a carry", "no force", "constant force", "two samples of force"],
 )  # fmt: skip
 def test_hopeless_recordings_are_reported_not_raised(trial):
-    aligned = align(trial).trials[0]
+    aligned = aligned_of(trial).trials[0]
     assert aligned.segmentation.failed is not None
     assert len(aligned.boundaries) == 8
     json.dumps(aligned.segmentation.to_json(), allow_nan=False)

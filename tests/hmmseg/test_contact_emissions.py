@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.contact.equations import Pads
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.segment.emissions import (
+from hmmseg.segmentation.emissions import (
     STRAY,
     TAIL,
     Features,

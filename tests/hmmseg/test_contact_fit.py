@@ -9,9 +9,17 @@ from scipy import optimize, stats
 
 from hmmseg.hmm import em
 from hmmseg.hmm.banded import InfeasibleAlignment
-from hmmseg.segment import fit as contact_fit
-from hmmseg.segment.emissions import TAIL
-from hmmseg.segment.fit import MeanShares, _location, _scale, _weighted_median, fit, initial_parameters, otsu
+from hmmseg.segmentation import fit as contact_fit
+from hmmseg.segmentation.emissions import TAIL
+from hmmseg.segmentation.fit import (
+    MeanShares,
+    _location,
+    _scale,
+    _weighted_median,
+    fit,
+    initial_parameters,
+    otsu,
+)
 
 
 def test_otsu_against_trying_every_split():

@@ -16,7 +16,7 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move, SequenceTask, read_task
 from hmmseg.io.trial import Trial, read_trial
-from hmmseg.segment.thresholds import (
+from hmmseg.segmentation.thresholds import (
     NUMBERS,
     StateLabels,
     agreement,

@@ -15,7 +15,7 @@ from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
-from hmmseg.segment.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.spans import Failure, Segmentation, Span
 from hmmseg_cli.figures import corner, estimates
 from hmmseg_cli.figures.channels import MOST, draw_channels
 from hmmseg_cli.figures.corner import draw_corner
@@ -167,6 +167,6 @@ def test_predictive_band_and_its_coverage(tmp_path, texts):
 
 
 def test_the_packages_below_do_not_import_matplotlib():
-    modules = "hmmseg.segment.thresholds, estimation.paper_formulas"
+    modules = "hmmseg.segmentation.thresholds, estimation.paper_formulas"
     code = f"import sys, {modules}; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
-from hmmseg.hand.signals import task_space
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.gap.bank import load_bank
 from simgap.gap.diagnose import _inseparable
 from simgap.gap.experiments import ENOUGH, next_experiment, trusted
@@ -26,7 +25,7 @@ SOFTER = ("fingertip_compliance",)
 
 @pytest.fixture(scope="module")
 def given():
-    aligned = align_trials([t.file for t in TRIALS], [task_space(t, RIG) for t in TRIALS], TASK, RIG)
+    aligned = align(TRIALS, TASK, RIG)
     return problem(build(TRIALS, aligned, RIG), load_bank().noise)
 
 

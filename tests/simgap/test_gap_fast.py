@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from demo_recordings import RIG, TASK
 
-from hmmseg.hand.signals import task_space
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.gap.bank import load_bank
 from simgap.gap.candidate import Candidate
 from simgap.gap.diagnose import diagnose
@@ -39,7 +38,7 @@ def trials(effects, operator=None):
 def fast():
     """The problem of healthy work twice as fast as usual, and its fit."""
     made = trials({}, TWICE)
-    aligned = align_trials([t.file for t in made], [task_space(t, RIG) for t in made], TASK, RIG)
+    aligned = align(made, TASK, RIG)
     given = problem(build(made, aligned, RIG), load_bank().noise)
     return given, fit(given, [Start((), neutral(given))])[0]
 

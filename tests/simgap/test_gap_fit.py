@@ -7,11 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.gap.bank import load_bank
 from simgap.gap.fit import Start, fit, neutral, problem, residual_at, slots
 from simgap.gap.frame import build
@@ -23,7 +22,7 @@ from simgap.gap.spread import quantised
 def read(folder, count=2):
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in range(1, count + 1)]
-    aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    aligned = align(trials, task, rig)
     return build(trials, aligned, rig)
 
 

@@ -9,9 +9,8 @@ import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
 from hmmseg.errors import InputError
-from hmmseg.hand.signals import task_space
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import align_trials
+from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 
 
@@ -28,7 +27,7 @@ def turned(trial: Trial, angles: tuple[float, float]) -> Trial:
 def test_turned_sensors_that_hide_the_lift_are_named():
     angles = (-0.09, 0.09)
     trials = [turned(t, angles) for t in TRIALS]
-    aligned = align_trials([t.file for t in trials], [task_space(t, RIG) for t in trials], TASK, RIG)
+    aligned = align(trials, TASK, RIG)
     assert not any(t.segmentation.complete for t in aligned.trials)
     found = diagnose(trials, TASK, RIG)
     assert found.body["causes"] == ["sensor_rotation"]

@@ -14,8 +14,8 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
-from hmmseg.segment.align import AlignedTrials, align_trials
-from hmmseg.segment.boundaries import BoundaryPosterior
+from hmmseg.segmentation.align import AlignedTrials, align
+from hmmseg.segmentation.boundaries import BoundaryPosterior
 from simgap.effects import catalogue
 from simgap.gap.bank import load_bank
 from simgap.gap.candidate import scored
@@ -72,7 +72,7 @@ def _lift(aligned: AlignedTrials, at: float, known_to: float) -> AlignedTrials:
 def test_a_sample_that_may_be_on_either_side_of_a_lift_is_of_neither():
     rig, task = read_rig(DEMO / "rig.toml"), read_task(DEMO / "task.toml")
     trials = [read_trial(DEMO / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
-    aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    aligned = align(trials, task, rig)
     k = next(k for k, s in enumerate(aligned.subtasks) if s.name == "carry") - 1
     t = trials[0].t
     j = int(np.searchsorted(t, aligned.trials[0].boundaries[k].quantile(0.5)))
@@ -110,7 +110,7 @@ def test_a_dead_band_narrower_than_an_angles_noise_is_no_evidence():
 def test_a_dead_band_that_no_sensor_resolves_is_no_candidate():
     rig, task = read_rig(DEMO / "rig.toml"), read_task(DEMO / "task.toml")
     trials = [read_trial(DEMO / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
-    aligned = align_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    aligned = align(trials, task, rig)
     given = problem(build(trials, aligned, rig), load_bank().noise)
     healthy, found = (fit(given, [Start(e, neutral(given))], steps=1)[0] for e in ((), ("backlash",)))
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == "backlash")

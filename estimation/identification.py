@@ -15,12 +15,11 @@ from estimation.posterior import pack
 from estimation.predictive import PredictiveCheck, check
 from estimation.sampler import Draws, sample
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
-from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import AlignedTrials, align_trials
-from hmmseg.segment.spans import Segmentation
+from hmmseg.segmentation.align import AlignedTrials, align
+from hmmseg.segmentation.spans import Segmentation
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 NOT_LEVEL = 2e-3  # m; more than a tilted table or a slip in the grip make of a move on a level
@@ -51,7 +50,7 @@ class Identification:
     @property
     def segmentations(self) -> list[Segmentation]:
         """One segmentation a trial."""
-        return [trial.segmentation for trial in self.aligned.trials]
+        return self.aligned.segmentations
 
     def of(self, obj: str, prop: str) -> np.ndarray:
         """Posterior draws (num_draws,) of one property; KeyError where it is undetermined."""
@@ -110,18 +109,16 @@ def identify(
     `progress(steps_done, steps_at_most)` is called while sampling. Raises InputError for input
     that cannot be used; trials that do not fit the task are reported, not raised.
     """
-    signals = [task_space(trial, rig) for trial in trials]
-    aligned = align_trials([trial.file for trial in trials], signals, task, rig)
-    return identify_aligned(trials, signals, aligned, rig, seed, progress)
+    return identify_aligned(align(trials, task, rig), seed, progress)
 
 
 def identify_aligned(
-    trials: Sequence[Trial], signals: list[Signals], aligned: AlignedTrials, rig: Rig, seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> Identification:  # fmt: skip
+    aligned: AlignedTrials, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> Identification:
     """As `identify`, of trials that are aligned already."""
-    rng = np.random.default_rng(seed)
-    weighed, noise = aligned_weights(aligned, signals, rig, rng)
+    rng, rig = np.random.default_rng(seed), aligned.rig
+    trials = [one.trial for one in aligned.trials]
+    weighed, noise = aligned_weights(aligned, rng)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(trials, weighed, noise, aligned.task, rig, sd_force)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)

@@ -9,11 +9,10 @@ import pytest
 
 from experiments.bank import nominal, simulated_cases
 from experiments.recordings import read_case
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Fingertip, Noise, Rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
-from hmmseg.segment.align import align_trials, segment_trials
+from hmmseg.segmentation.align import align, segment
 from simgap.world.properties import random_properties
 from simgap.world.simulate import simulate_trials
 
@@ -23,7 +22,7 @@ NEAR = 0.05  # s
 
 def residuals(trials, truth, task, rig):
     """Boundary residuals [s] (num_trials, num_boundaries), spans checked for sense."""
-    found = segment_trials([t.file for t in trials], [task_space(t, rig) for t in trials], task, rig)
+    found = segment(trials, task, rig)
     out = []
     for segmentation, trial, times in zip(found, trials, truth, strict=True):
         assert segmentation.complete
@@ -102,9 +101,8 @@ def test_pads_taken_as_rigid():
 
 def test_pooling_shares_parameters_and_keeps_trials_apart():
     case = read_case(RECORDINGS / "none_1")
-    files, signals = [t.file for t in case.trials], list(case.signals)
-    together = align_trials(files, signals, case.task, case.rig)
-    turned = align_trials(files[::-1], signals[::-1], case.task, case.rig)
+    together = align(case.trials, case.task, case.rig)
+    turned = align(case.trials[::-1], case.task, case.rig)
     for a, b in zip(together.trials, turned.trials[::-1], strict=True):
         assert a.segmentation.file == b.segmentation.file
         ends = [[s.end for s in x.segmentation.spans] for x in (a, b)]
@@ -116,6 +114,6 @@ def test_one_object_picked_and_placed():
     rig, _ = nominal()
     task = BlockTask({"block": "ground"}, (Move("block", "ground"),))
     s = simulate_trials(task, rig, [random_properties(task, 20_960)], [20_960])[0]
-    segmentation = segment_trials(["one.csv"], [task_space(s.trial, rig)], task, rig)[0]
+    segmentation = segment([s.trial], task, rig)[0]
     starts = np.array([span.start for span in segmentation.spans[1:]])
     assert np.abs(starts - s.boundaries).max() < NEAR

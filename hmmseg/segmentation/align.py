@@ -8,26 +8,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
-from hmmseg.hand.signals import Signals
+from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.segment.boundaries import BoundaryPosterior, combine
-from hmmseg.segment.conformity import MAX_RATE, Conformity, judge
-from hmmseg.segment.crossings import NEAREST, Contacts, contacts
-from hmmseg.segment.emissions import Features
-from hmmseg.segment.features import WINDOW, features, thin
-from hmmseg.segment.fit import Fit, fit
-from hmmseg.segment.misfit import Plan, explain, plan, spread
-from hmmseg.segment.spans import Failure, Segmentation, Span
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.boundaries import BoundaryPosterior, combine
+from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
+from hmmseg.segmentation.crossings import NEAREST, Contacts, contacts
+from hmmseg.segmentation.emissions import Features
+from hmmseg.segmentation.features import WINDOW, features, thin
+from hmmseg.segmentation.fit import Fit, fit
+from hmmseg.segmentation.misfit import Plan, explain, plan, spread
+from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
 INTERVAL = (0.05, 0.95)
 
 
 @dataclass(frozen=True)
 class TrialAlignment:
-    """What later stages need of one aligned trial: signals, features and boundary posteriors."""
+    """What later stages need of one aligned trial: the trial, its signals and boundary posteriors.
 
+    `signals` are the recording's, `thinned` and `features` those that the emissions score.
+    """
+
+    trial: Trial
     signals: Signals
+    thinned: Signals
     features: Features
     boundaries: tuple[BoundaryPosterior, ...]
     segmentation: Segmentation
@@ -41,21 +47,32 @@ class AlignedTrials:
     """
 
     task: BlockTask
+    rig: Rig
     subtasks: tuple[Subtask, ...]
     fit: Fit
     trials: tuple[TrialAlignment, ...]
 
+    @property
+    def segmentations(self) -> list[Segmentation]:
+        """One segmentation a trial."""
+        return [trial.segmentation for trial in self.trials]
 
-def align_trials(
-    files: Sequence[str], signals: Sequence[Signals], task: BlockTask, rig: Rig, insist: bool = False
+
+def align(
+    trials: Sequence[Trial],
+    task: BlockTask,
+    rig: Rig,
+    insist: bool = False,
+    signals: Sequence[Signals] | None = None,
 ) -> AlignedTrials:
     """Fit the switching model to the trials, pooled, and align each of them.
 
     A trial that does not fit its task is kept out of the pool and aligned with the order that it
     shows instead: its subtasks before `failed` are the task's, boundaries after it are not. Its
     log evidence is that of the order it shows. `task` of the result has its number of rounds. `insist`: all
-    are taken to fit, whatever they show.
+    are taken to fit, whatever they show. `signals`: to be read instead of the trials' own.
     """
+    signals = [task_space(trial, rig) for trial in trials] if signals is None else signals
     thinned = [thin(s, window=WINDOW) for s in signals]
     tables = [features(s, rig) for s in thinned]
     task, verdicts = judge([features(thin(s, MAX_RATE), rig) for s in signals], task)
@@ -63,7 +80,7 @@ def align_trials(
     fitting = [i for i, verdict in enumerate(verdicts) if insist or verdict.failing is None]
     pooled = fit([tables[i] for i in fitting], steps) if fitting else _unfitted(verdicts)
     aligned = []
-    for i, (name, s, f) in enumerate(zip(files, thinned, tables, strict=True)):
+    for i, (trial, s, f) in enumerate(zip(trials, thinned, tables, strict=True)):
         first, last = float(signals[i].t[0]), float(signals[i].t[-1])
         verdict, failed = verdicts[i], None
         if insist or verdict.failing is None:
@@ -82,8 +99,9 @@ def align_trials(
             reason = explain(verdict, steps, [span.start for span in every])
             failed = Failure(step.index, step.name, step.object, reason)
         rate = float(1.0 / np.median(np.diff(signals[i].t)))
-        aligned.append(TrialAlignment(s, f, boundaries, Segmentation(name, rate, evidence, spans, failed)))
-    return AlignedTrials(task, steps, pooled, tuple(aligned))
+        found = Segmentation(trial.file, rate, evidence, spans, failed)
+        aligned.append(TrialAlignment(trial, signals[i], s, f, boundaries, found))
+    return AlignedTrials(task, rig, steps, pooled, tuple(aligned))
 
 
 def _fit_shown(f: Features, shown: Plan, verdict: Conformity) -> tuple[Fit | None, float]:
@@ -149,8 +167,6 @@ def to_spans(
     )  # fmt: skip
 
 
-def segment_trials(
-    files: Sequence[str], signals: Sequence[Signals], task: BlockTask, rig: Rig
-) -> list[Segmentation]:
+def segment(trials: Sequence[Trial], task: BlockTask, rig: Rig) -> list[Segmentation]:
     """Segmentation of each trial of one task; all are fitted together."""
-    return [trial.segmentation for trial in align_trials(files, signals, task, rig).trials]
+    return align(trials, task, rig).segmentations

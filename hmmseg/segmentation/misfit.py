@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
-from hmmseg.segment.boundaries import BoundaryPosterior
-from hmmseg.segment.conformity import Conformity, Run
-from hmmseg.segment.emissions import Parameters
+from hmmseg.segmentation.boundaries import BoundaryPosterior
+from hmmseg.segmentation.conformity import Conformity, Run
+from hmmseg.segmentation.emissions import Parameters
 
 PHRASES = {
     ON_GROUND: "held on the ground", ABOVE_GROUND: "held above the ground", SLIDING: "pushed along",

@@ -18,8 +18,8 @@ import numpy as np
 from hmmseg.contact.decompose import FREE, Subtask, height_equations, subtasks
 from hmmseg.hmm.padding import align
 from hmmseg.io.task import BlockTask
-from hmmseg.segment.emissions import Features
-from hmmseg.segment.free_contacts import (
+from hmmseg.segmentation.emissions import Features
+from hmmseg.segmentation.free_contacts import (
     IMPOSSIBLE,
     Block,
     FreeContacts,

@@ -25,7 +25,7 @@ from hmmseg.errors import InputError
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
-from hmmseg.segment.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
 FORCE_THRESHOLD = 0.05  # N
 VELOCITY_THRESHOLD = 0.05  # m/s

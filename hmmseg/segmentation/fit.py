@@ -15,7 +15,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.hmm.em import em
 from hmmseg.hmm.padding import Alignment, Bands
-from hmmseg.segment.emissions import TAIL, Features, Parameters, log_likelihoods
+from hmmseg.segmentation.emissions import TAIL, Features, Parameters, log_likelihoods
 
 
 @dataclass(frozen=True)

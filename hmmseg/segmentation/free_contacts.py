@@ -18,9 +18,9 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
 from hmmseg.hmm.padding import bucket
-from hmmseg.segment.emissions import Features, Parameters, log_likelihoods, log_student
-from hmmseg.segment.features import noise_sd
-from hmmseg.segment.fit import maximisation, otsu
+from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, log_student
+from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.fit import maximisation, otsu
 
 STRAY = 1e-3  # share of resting samples that move: contacts settle in states of their own here
 STILL = 0.1  # prior share of a carry's samples at which the block is held still

@@ -10,9 +10,9 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_y, hanging, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.segment.boundaries import POINTS, Crossing, crossing_density, first_of
-from hmmseg.segment.emissions import Parameters
-from hmmseg.segment.features import noise_sd
+from hmmseg.segmentation.boundaries import POINTS, Crossing, crossing_density, first_of
+from hmmseg.segmentation.emissions import Parameters
+from hmmseg.segmentation.features import noise_sd
 
 NEAREST = 6  # samples of a hold that locate the block next to a contact change
 

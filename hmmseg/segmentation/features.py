@@ -7,7 +7,7 @@ import numpy as np
 from hmmseg.contact.equations import pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.segment.emissions import Features
+from hmmseg.segmentation.emissions import Features
 
 MAX_RATE = 40.0  # Hz; faster recordings are read at this rate, fast enough for a hand
 WINDOW = 6e-3  # s over which such a reading is averaged; a contact changes no faster
