@@ -1,0 +1,81 @@
+"""What an effect on a robot is: composed around a simulator, never inside of it.
+
+An effect acts on what is read (`read`), on what is commanded (`command`), or on parameters that the
+simulator itself offers (`model`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simgap.simulators.protocol import Parameter, Simulator
+from simgap.simulators.recording import Recording
+
+Theta = Mapping[str, float]  # an effect's own parameters by short name
+Read = Callable[[np.ndarray, np.ndarray, Theta], np.ndarray]  # (times since the log's start, values, theta)
+Command = Callable[[Recording, Theta], Recording]
+
+
+@dataclass(frozen=True)
+class RobotEffect:
+    """One candidate. `parameters` by short name, neutral at their nominal; it reads, commands or models.
+
+    `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
+    `command` maps a whole recording to one whose commands are as the drives took them. `model` maps
+    short names to the simulator's parameters.
+    """
+
+    name: str
+    says: str
+    parameters: Mapping[str, Parameter]
+    channel: str = ""
+    read: Read | None = None
+    undo: Read | None = None
+    command: Command | None = None
+    model: Mapping[str, str] = field(default_factory=dict)
+
+    def neutral(self) -> dict[str, float]:
+        """Values at which nothing is changed."""
+        return {name: p.nominal for name, p in self.parameters.items()}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the candidates are made for: the simulator and the recordings."""
+
+    simulator: Simulator
+    recordings: Sequence[Recording]
+
+    def compared(self, *kinds: str) -> list[str]:
+        """Channels of these kinds that are compared (any but commands by default)."""
+        known = self.simulator.channels
+        return [n for n, c in known.items() if (c.kind in kinds if kinds else c.kind != "command")]
+
+    def spread(self, channel: str) -> float:
+        """Standard deviation of a channel over all recordings [its unit]; 1 where it is constant."""
+        values = np.concatenate([r[channel] for r in self.recordings])
+        found = float(np.nanstd(values))
+        return found if found > 0 else 1.0
+
+
+def delayed(since: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
+    """Values (num_timesteps,) `delay` [s] later, at these times; before their start they were a parabola."""
+    if len(values) < 3:
+        return values
+    late = since - delay
+    slope, bend = onset(since, values)
+    ahead = np.minimum(late - since[0], 0.0)
+    before = values[0] + slope * ahead + 0.5 * bend * ahead**2
+    return np.where(late < since[0], before, np.interp(late, since, values))
+
+
+def onset(since: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """First and second derivative at the start, of the parabola through three early samples."""
+    few = min(2, (len(values) - 1) // 2)
+    a, b = since[few] - since[0], since[2 * few] - since[0]
+    first, second = (values[few] - values[0]) / a, (values[2 * few] - values[0]) / b
+    bend = 2 * (second - first) / (b - a)
+    return float(first - 0.5 * bend * a), float(bend)

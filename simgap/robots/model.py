@@ -1,0 +1,99 @@
+"""Effects around a simulator: the channels of all windows for any values of all effects' parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from simgap.robot_effects.base import RobotEffect
+from simgap.robots.windows import Window, start_of
+from simgap.simulators.protocol import Channels, Job, Simulator, run_all
+from simgap.simulators.recording import Recording
+
+Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; what is not named is neutral
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A simulator with effects around it, along the windows of recordings."""
+
+    simulator: Simulator
+    recordings: tuple[Recording, ...]
+    windows: tuple[Window, ...]
+    effects: Mapping[str, RobotEffect]
+    noise: Mapping[str, float]
+
+    def commanded(self, point: Point) -> list[Recording]:
+        """The recordings with commands as the drives took them."""
+        out = list(self.recordings)
+        for name, theta in point.items():
+            act = self.effects[name].command
+            if act is not None:
+                out = [act(r, {**self.effects[name].neutral(), **theta}) for r in out]
+        return out
+
+    def parameters(self, point: Point) -> dict[str, float]:
+        """The simulator's parameters."""
+        out = {name: p.nominal for name, p in self.simulator.parameters.items()}
+        for name, theta in point.items():
+            for short, value in theta.items():
+                if short in self.effects[name].model:
+                    out[self.effects[name].model[short]] = value
+        return out
+
+    def jobs(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Job]:
+        """One run for each window."""
+        recordings, parameters = self.commanded(point), self.parameters(point)
+        return [
+            Job(parameters, recordings[w.log].window(w.begin, w.end), start)
+            for w, start in zip(self.windows, starts, strict=True)
+        ]
+
+    def read(self, true: Sequence[Channels | None], point: Point) -> list[Channels | None]:
+        """Channels of every window as they are read."""
+        acting = [(e, v) for e, v in self._acting(point) if e.read is not None]
+        out: list[Channels | None] = []
+        for window, channels in zip(self.windows, true, strict=True):
+            if channels is None or not acting:
+                out.append(channels)
+                continue
+            log, here = self.recordings[window.log], dict(channels)
+            since = log.t[window.begin : window.end] - log.t[0]
+            for effect, theta in acting:
+                if effect.read is not None:
+                    here[effect.channel] = effect.read(since, here[effect.channel], theta)
+            out.append(here)
+        return out
+
+    def starts(self, point: Point) -> list[Mapping[str, float] | None]:
+        """Every window's start, smoothed from the recordings with read-outs' effects undone."""
+        undone = self.unread(point)
+        if undone is None:
+            return [w.start for w in self.windows]
+        return [
+            None if w.start is None else {
+                n: v for n, (v, _) in
+                start_of(self.simulator, undone[w.log], w.begin, self.noise, w.forward).items()
+            }
+            for w in self.windows
+        ]  # fmt: skip
+
+    def unread(self, point: Point) -> list[Recording] | None:
+        """The recordings with read-outs' effects undone, None where none acts."""
+        acting = [(e, v) for e, v in self._acting(point) if e.undo is not None]
+        if not acting:
+            return None
+        out = list(self.recordings)
+        for effect, theta in reversed(acting):
+            for i, log in enumerate(out):
+                values = log[effect.channel]
+                assert effect.undo is not None
+                out[i] = log.with_columns({effect.channel: effect.undo(log.t - log.t[0], values, theta)})
+        return out
+
+    def _acting(self, point: Point) -> list[tuple[RobotEffect, dict[str, float]]]:
+        return [(self.effects[n], {**self.effects[n].neutral(), **v}) for n, v in point.items()]
+
+    def run(self, point: Point) -> list[Channels | None]:
+        """True channels of every window."""
+        return run_all(self.simulator, self.jobs(point, self.starts(point)))

@@ -1,0 +1,44 @@
+"""The noise of each channel: as stated or learned from second differences, at least its resolution's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from simgap.simulators.protocol import Simulator
+from simgap.simulators.recording import Recording
+
+
+def resolution(values: np.ndarray) -> float:
+    """The step that all values are whole multiples of apart, 0 where there is none."""
+    distinct = np.unique(np.round(values[np.isfinite(values)], 9))
+    if distinct.size < 3:
+        return 0.0
+    gaps = np.diff(distinct)
+    step = float(gaps.min())
+    multiples = gaps / step
+    off = np.abs(multiples - np.round(multiples))
+    return step if np.quantile(off, 0.95) < 0.05 else 0.0
+
+
+def learned(recordings: Sequence[Recording], name: str) -> float:
+    """Standard deviation of white noise from second differences (variance 6 sigma^2), robustly."""
+    second = np.concatenate([np.diff(r[name], 2) for r in recordings])
+    second = second[np.isfinite(second)]
+    if not second.size:
+        return 1.0
+    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
+
+
+def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:
+    """Standard deviation of one sample of every compared channel [its unit], at least step / sqrt(12)."""
+    out = {}
+    for name, channel in simulator.channels.items():
+        if channel.kind == "command":
+            continue
+        step = max(resolution(r[name]) for r in recordings)
+        stated = channel.noise if np.isfinite(channel.noise) else learned(recordings, name)
+        found = max(stated, step / np.sqrt(12.0))
+        out[name] = found if found > 0 else 1e-6 * max(1.0, float(np.nanstd(recordings[0][name])))
+    return out

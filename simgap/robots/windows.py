@@ -1,0 +1,111 @@
+"""Windows of a log, each restarted from a state smoothed from the log.
+
+Rollouts diverge, so a simulator is judged over short windows. A start is read from a polynomial through
+the samples around it; its error is no part of the gap but of the noise (`simgap.robots.whiten`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simgap.simulators.protocol import RATE, Simulator
+from simgap.simulators.recording import Recording
+from simgap.simulators.user import restarts
+
+LENGTH = 0.4  # s
+FEWEST = 6  # samples of a window
+REACH = 0.03  # s of samples on either side that a start is smoothed from, and at least NEIGHBOURS of them
+NEIGHBOURS = 5
+DOUBT = 3.0  # a start's error over what noise alone makes it: the window's own samples settle the rest
+
+
+@dataclass(frozen=True)
+class Window:
+    """Rows [begin, end) of log number `log`; `start` and its standard deviations by state, or None."""
+
+    log: int
+    begin: int
+    end: int
+    forward: bool  # the start is smoothed from later samples alone
+    start: dict[str, float] | None
+    doubt: dict[str, float]
+
+
+def cut(simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[str, float],
+        length: float = LENGTH) -> list[Window]:  # fmt: skip
+    """Windows of about `length` [s] that tile every log, new ones begun at the simulator's `contacts`.
+
+    A simulator that cannot be restarted has one window a log. `noise` by channel [its unit].
+    """
+    out = []
+    for number, log in enumerate(recordings):
+        if not restarts(simulator):
+            out.append(Window(number, 0, len(log), True, None, {}))
+            continue
+        edges = _edges(simulator, log, length)
+        forward = getattr(simulator, "contacts", None) is not None
+        for begin, end in itertools.pairwise(edges):
+            state = start_of(simulator, log, begin, noise, forward)
+            values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
+            out.append(Window(number, begin, end, forward, values, doubt))
+    return out
+
+
+def _edges(simulator: Simulator, log: Recording, length: float) -> list[int]:
+    """First rows of the windows, and one past the last."""
+    marks = [0.0]
+    contacts = getattr(simulator, "contacts", None)
+    span = float(log.t[-1] - log.t[0])
+    if contacts is not None:
+        marks += [float(t) - float(log.t[0]) for t in contacts(log)]
+    marks = [*sorted(m for m in marks if 0 <= m < span), span]
+    times: list[float] = []
+    for a, b in itertools.pairwise(marks):
+        pieces = max(1, round((b - a) / length))
+        times += list(a + (b - a) * np.arange(pieces) / pieces)
+    rows = [int(np.searchsorted(log.t - log.t[0], t - 1e-9)) for t in times]
+    edges = [0]
+    for row in rows[1:]:
+        if row - edges[-1] >= FEWEST and len(log) - row >= FEWEST:
+            edges.append(row)
+    return [*edges, len(log)]
+
+
+def start_of(simulator: Simulator, log: Recording, row: int, noise: Mapping[str, float],
+             forward: bool) -> dict[str, tuple[float, float]]:  # fmt: skip
+    """State name -> (value, standard deviation) at a row of a log; see `smoothed` for `forward`."""
+    own = getattr(simulator, "state_at", None)
+    if own is not None:
+        return {n: (float(v), float(s)) for n, (v, s) in own(log, float(log.t[row])).items()}
+    out: dict[str, tuple[float, float]] = {}
+    for name, channel in simulator.channels.items():
+        if channel.kind == "position":
+            (value, sd), (rate, rate_sd) = smoothed(log.t, log[name], row, noise[name], forward)
+            out[name], out[name + RATE] = (value, sd), (rate, rate_sd)
+    return out
+
+
+def smoothed(t: np.ndarray, values: np.ndarray, row: int, noise: float,
+             forward: bool = False) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
+    """Value and rate at a row, each with its standard deviation, of a parabola through its neighbours.
+
+    `forward` takes later samples alone: a contact changes rates. What the parabola misses counts as noise.
+    """
+    near = np.flatnonzero(np.isfinite(values) & (np.abs(t - t[row]) <= REACH))
+    if near.size < NEIGHBOURS or forward:
+        seen = np.flatnonzero(np.isfinite(values))
+        seen = seen[seen >= row] if forward and (seen >= row).sum() >= NEIGHBOURS else seen
+        near = np.sort(seen[np.argsort(np.abs(t[seen] - t[row]))[: max(NEIGHBOURS, near.size // 2)]])
+    since = t[near] - t[row]
+    scale = float(np.abs(since).max())
+    design = np.vander(since / scale, 3, increasing=True)
+    inverse = np.linalg.inv(design.T @ design)
+    found = inverse @ design.T @ values[near]
+    misses = values[near] - design @ found
+    variance = max(noise**2, float(misses @ misses) / max(near.size - 3, 1))
+    sd = DOUBT * np.sqrt(variance * np.diag(inverse))
+    return (float(found[0]), float(sd[0])), (float(found[1] / scale), float(sd[1] / scale))

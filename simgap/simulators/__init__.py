@@ -1,0 +1,1 @@
+"""Simulators that a recording is compared with: the protocol, any Python object, MuJoCo models."""

@@ -1,0 +1,111 @@
+"""What the diagnosis asks of a simulator: its parameters, its channels, and to be run.
+
+A simulator is any object with `parameters`, `channels` and `simulate`; it need not inherit from anything
+here, and `parameters` and `channels` may hold plain dicts (`simgap.simulators.user` reads them).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from simgap.simulators.recording import Recording
+
+KINDS = ("position", "velocity", "force", "torque", "command")
+RATE = "_rate"  # a position channel's rate in `start` is its name with this behind it
+
+Values = Mapping[str, float]  # parameter or state name -> value
+Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter: `nominal` value, prior standard deviation `sd` about it, `unit`, bounds `low`, `high`.
+
+    Parameters of the same `effect` act as one candidate cause; without one, a parameter is its own.
+    """
+
+    nominal: float
+    sd: float
+    unit: str = "1"
+    low: float = -math.inf
+    high: float = math.inf
+    effect: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.nominal) and math.isfinite(self.sd) and self.sd > 0):
+            raise ValueError(f"nominal {self.nominal} and sd {self.sd}: expected finite, sd above 0")
+        if not self.low <= self.nominal <= self.high:
+            raise ValueError(f"nominal {self.nominal} lies outside of its bounds {self.low} to {self.high}")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One column of the logs: `unit`, standard deviation `noise` of one sample, `kind` (one of KINDS).
+
+    A command is given to the simulator and not compared. NaN noise is learned from the recording.
+    """
+
+    unit: str
+    kind: str
+    noise: float = math.nan
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind {self.kind!r}: expected one of {', '.join(KINDS)}")
+        if self.noise <= 0:
+            raise ValueError(f"noise {self.noise}: expected above 0")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: full `parameters`, the `recording` (a window of it) that it is run along, `start` or None."""
+
+    parameters: Values
+    recording: Recording
+    start: Values | None
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """A model of the robot that can be run along a recording.
+
+    `simulate` gives every channel that is no command at the times `recording.t`. `start` maps each
+    position channel to its value at `recording.t[0]`, and its name followed by `_rate` to its
+    rate; None starts as the simulator sees fit. A simulator that takes no `start` is compared open loop.
+
+    Optional: `state_at(recording, t)` gives state name -> (value, standard deviation) where position
+    channels do not tell the state; `contacts(recording)` gives times [s] at which windows are to begin;
+    `simulate_many(jobs)` runs several jobs at once, None in the place of one that diverged.
+    """
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]: ...  # noqa: D102
+
+    @property
+    def channels(self) -> Mapping[str, Channel]: ...  # noqa: D102
+
+    def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
+        """Channels along the recording."""
+        ...
+
+
+def run_all(simulator: Simulator, jobs: Sequence[Job]) -> list[Channels | None]:
+    """Every job's channels; None where the simulator diverged (a value that is not finite)."""
+    many = getattr(simulator, "simulate_many", None)
+    if many is not None:
+        return list(many(jobs))
+    run = simulator.simulate
+    return [
+        finite(run(j.parameters, j.recording) if j.start is None else run(j.parameters, j.recording, j.start))
+        for j in jobs
+    ]
+
+
+def finite(channels: Channels) -> Channels | None:
+    """The channels, or None where any value is not finite."""
+    return channels if all(np.isfinite(v).all() for v in channels.values()) else None

@@ -1,0 +1,130 @@
+"""Windows, sensitivities and identifiability against closed forms and planted values."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from simgap_swing import Swing, log
+
+from simgap.robot_effects import candidates
+from simgap.robot_effects.base import Setting, delayed
+from simgap.robot_effects.readout_lowpass import lowpass
+from simgap.robots.identifiable import identifiability
+from simgap.robots.linear import linearise
+from simgap.robots.model import Composed
+from simgap.robots.noise import noises, resolution
+from simgap.robots.windows import cut, smoothed
+from simgap.simulators.user import checked
+
+
+def composed(recordings, length: float = 0.4) -> Composed:
+    simulator = checked(Swing(), "Swing")
+    noise = noises(simulator, recordings)
+    windows = tuple(cut(simulator, recordings, noise, length))
+    return Composed(simulator, tuple(recordings), windows, candidates(Setting(simulator, recordings)), noise)
+
+
+def test_windows_tile_every_log():
+    model = composed([log(0), log(1, seconds=2.05)])
+    for number, recording in enumerate(model.recordings):
+        mine = [w for w in model.windows if w.log == number]
+        assert mine[0].begin == 0 and mine[-1].end == len(recording)
+        assert all(a.end == b.begin for a, b in itertools.pairwise(mine))
+
+
+def test_a_start_is_right_within_what_it_says():
+    t = np.linspace(0, 1, 201)
+    off = []
+    for seed in range(200):
+        values = 0.3 * np.sin(5 * t) + 1e-3 * np.random.default_rng(seed).standard_normal(t.size)
+        (value, sd), (rate, rate_sd) = smoothed(t, values, 80, 1e-3)
+        off.append([(value - 0.3 * np.sin(2.0)) / sd, (rate - 1.5 * np.cos(2.0)) / rate_sd])
+    # what is said is three times what white noise makes of it
+    assert np.all(np.std(off, 0) < 0.45) and np.all(np.std(off, 0) > 0.2)
+
+
+def test_whitened_residuals_of_a_true_model_are_white():
+    model = composed([log(s) for s in range(4)])
+    rows = linearise(model, {}, [])
+    assert 0.9 < np.sqrt(np.mean(rows.residual**2)) < 1.05
+    inside = rows.window[1:] == rows.window[:-1]
+    assert abs(np.mean((rows.residual[1:] * rows.residual[:-1])[inside])) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("effect", "values"),
+    [
+        ("viscous", {"viscous": 4e-4}),
+        ("gravity_torque", {"gravity_torque": 0.505}),
+        ("readout:angle.bias", {"bias": 2e-3}),
+        ("readout:angle.lag", {"delay": 1e-3}),
+        ("command.delay", {"delay": 2e-3}),
+        ("readout:angle.gain", {"gain": 2e-3}),
+    ],
+)
+def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
+    """A small effect, starts read through it too, changes the residual by its Jacobian times it."""
+    recording = log(3, noise=1e-9)
+    model = composed([recording])
+    made = model.effects[effect]
+    if made.model:
+        planted = log(3, noise=1e-9, **values)
+    elif made.command is not None:
+        acted = made.command(recording, values)
+        robot = Swing()
+        nominal = {n: p["nominal"] for n, p in robot.parameters.items()}
+        planted = recording.with_columns({"angle": robot.simulate(nominal, acted)["angle"]})
+    else:
+        read = made.read(recording.t - recording.t[0], recording["angle"], values)
+        planted = recording.with_columns({"angle": read})
+    changed = composed([planted])
+    before = linearise(model, {}, [effect])
+    after = linearise(changed, {}, [effect])
+    shift = after.residual - before.residual
+    predicted = after.jacobian[effect] @ np.array([values[n] - p.nominal for n, p in made.parameters.items()])
+    left = np.linalg.norm(shift - predicted) / np.linalg.norm(shift)
+    assert np.linalg.norm(shift) > 2 and left < 0.1
+
+
+def test_an_effect_at_its_value_leaves_noise_alone():
+    recording = log(5)
+    late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)
+    model = composed([recording.with_columns({"angle": late})])
+    nominal = linearise(model, {}, [])
+    there = linearise(model, {"readout:angle.lag": {"delay": 0.01}}, [])
+    assert np.mean(nominal.residual**2) > 3 and np.mean(there.residual**2) < 1.2
+
+
+def test_lowpass_of_a_ramp_and_of_a_sine():
+    t = np.linspace(0, 3, 3001)
+    np.testing.assert_allclose(lowpass(t, 2 * t + 1, 0.1), 2 * (t - 0.1) + 1, atol=1e-12)
+    w, tau = 2 * np.pi, 0.05
+    found = lowpass(t, np.sin(w * t), tau)
+    exact = np.imag(np.exp(1j * w * t) / (1 + 1j * w * tau))
+    np.testing.assert_allclose(found[1000:], exact[1000:], atol=1e-5)
+
+
+def test_what_only_acts_together_is_said():
+    """Torques and inertia scaled together change no motion: all four parameters are one set, exactly."""
+    model = composed([log(s) for s in range(2)])
+    rows = linearise(model, {"viscous": {"viscous": 0.02}}, list(model.simulator.parameters))
+    names = list(rows.jacobian)
+    scale = [model.simulator.parameters[n].sd for n in names]
+    found = identifiability(names, np.concatenate([rows.jacobian[n] for n in names], 1) * np.array(scale))
+    assert any(a.own < 1e-3 and set(a.names) == set(names) for a in found.alike)
+    without = [n for n in names if n != "torque_scale"]
+    columns = np.concatenate([rows.jacobian[n] for n in without], 1)
+    assert (
+        identifiability(
+            without, columns * np.array([model.simulator.parameters[n].sd for n in without])
+        ).alike
+        == ()
+    )
+
+
+def test_resolution_is_found_and_only_where_there_is_one():
+    values = np.random.default_rng(0).standard_normal(500)
+    assert resolution(values) == 0.0 or resolution(values) < 1e-4
+    assert resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)

@@ -1,0 +1,95 @@
+"""A simulator read from a user's file, and every line that says what is wrong with one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmmseg.errors import InputError
+from simgap.simulators.protocol import Job, Simulator, run_all
+from simgap.simulators.recording import Recording, read_recording
+from simgap.simulators.user import load_simulator, restarts
+
+GOOD = """
+parameters = {"slope": {"nominal": 1.0, "sd": 0.1, "unit": "1/s", "low": 0.0}}
+channels = {
+    "u": {"unit": "rad", "kind": "command"},
+    "y": {"unit": "rad", "kind": "position", "noise": 1e-3},
+}
+
+class Robot:
+    parameters, channels = parameters, channels
+    def simulate(self, parameters, recording, start=None):
+        return {"y": parameters["slope"] * (recording.t - recording.t[0]) + (start or {"y": 0.0})["y"]}
+
+def open_loop(parameters, recording):
+    return {"y": parameters["slope"] * recording["u"]}
+open_loop.parameters, open_loop.channels = parameters, channels
+thing = Robot()
+number = 3
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text: str = GOOD):
+        path = tmp_path / "robot.py"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(("name", "restarted"), [("Robot", True), ("thing", True), ("open_loop", False)])
+def test_classes_objects_and_functions_will_do(file, name, restarted):
+    simulator = load_simulator(f"{file()}:{name}")
+    assert isinstance(simulator, Simulator) and restarts(simulator) is restarted
+    assert simulator.parameters["slope"].sd == 0.1 and simulator.channels["u"].kind == "command"
+
+
+def test_a_run_that_diverges_is_none(file):
+    simulator = load_simulator(f"{file()}:open_loop")
+    log = Recording("a.csv", np.arange(3.0), {"u": np.ones(3)})
+    found = run_all(simulator, [Job({"slope": 2.0}, log, None), Job({"slope": np.inf}, log, None)])
+    assert found[0] is not None and found[0]["y"].tolist() == [2.0, 2.0, 2.0] and found[1] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("Robt", GOOD, r"has no Robt; expected one of .*did you mean Robot\?"),
+        ("number", GOOD, "has no mapping 'parameters'; expected parameters, channels and simulate"),
+        ("Robot", "raise KeyError('x')", "KeyError: 'x'; expected a file that runs"),
+        ("Robot", GOOD.replace('"sd": 0.1', '"sd": 0.0'), "slope: nominal 1.0 and sd 0.0: expected"),
+        ("Robot", GOOD.replace('"low": 0.0', '"low": 2.0'), "parameter slope: nominal 1.0 lies outside of"),
+        ("Robot", GOOD.replace('"sd": 0.1', '"std": 0.1'), r"slope: std: unknown key; .*did you mean sd\?"),
+        ("Robot", GOOD.replace("position", "place"), "channel y: kind 'place': expected one of position,"),
+        ("Robot", GOOD.replace("1e-3", "-1e-3"), "channel y: noise -0.001: expected above 0"),
+        ("Robot", GOOD.replace("position", "command"), "no channel to compare"),
+        ("Robot", GOOD.replace("def simulate", "def run"), "cannot be run; expected a method simulate"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line(file, name, text, line):
+    with pytest.raises(InputError, match=line):
+        load_simulator(f"{file(text)}:{name}")
+
+
+def test_a_missing_file_and_a_spec_without_a_name():
+    with pytest.raises(InputError, match=r"names no object; expected FILE\.py:NAME"):
+        load_simulator("robot.py")
+    with pytest.raises(InputError, match=r"no such file missing\.py"):
+        load_simulator("missing.py:Robot")
+
+
+def test_logs_with_their_own_name_for_time(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("stamp,y\n" + "".join(f"{0.1 * i},{i}\n" for i in range(10)))
+    log = read_recording(path, ["y"], "stamp")
+    assert log.t[3] == pytest.approx(0.3) and log["y"][3] == 3 and log.name == "log.csv"
+    with pytest.raises(InputError, match=r"log\.csv: column time: missing"):
+        read_recording(path, ["y"], "time")
+    with pytest.raises(InputError, match=r"log\.csv: column z: missing"):
+        read_recording(path, ["z"], "stamp")
+    path.write_text("t,y\n" + "".join(f"{0.1 * (i if i != 5 else 3)},{i}\n" for i in range(10)))
+    with pytest.raises(InputError, match=r"row 7, column t: 0\.3 after 0\.4; expected strictly increasing"):
+        read_recording(path, ["y"])
