@@ -200,7 +200,7 @@ def _unnamed(task: BlockTask, design: Design) -> list[str]:
 
 def _misfits(aligned: AlignedTrials) -> list[str]:
     found = [trial.segmentation for trial in aligned.trials]
-    return [f"{s.file}: {s.failed}" for s in found if s.failed is not None]
+    return [f"{s.file}: {failure}" for s in found for failure in s.failures]
 
 
 def _unconverged(found: bool, sampled: Draws) -> list[str]:

@@ -131,7 +131,7 @@ def aligned_weights(
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
         drawn = draw_boundaries(trial, rng, num_alignments)
         best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]
-        present = _present(trial, len(steps))
+        present = trial.present
         masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
         prepared.append((thinned, best & present[:, None], masks))
     moves = sorted({s.move for s in steps if s.move is not None})
@@ -160,12 +160,6 @@ def aligned_weights(
         weights = Weights(grips, counts, free / max(free.sum(), 1), float(free.sum()))
         out.append(Aligned(thinned, masks, weights))
     return out, _noise(pooled, scales)
-
-
-def _present(trial: TrialAlignment, num_subtasks: int) -> np.ndarray:
-    """Subtasks that the trial shows: all, or those before the one at which it fails."""
-    failed = trial.segmentation.failed
-    return np.arange(num_subtasks) < (num_subtasks if failed is None else failed.index)
 
 
 def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: str, rig: Rig) -> float:

@@ -63,10 +63,10 @@ def on_edits(cases: Sequence[Case]) -> dict[str, dict]:
                     continue
                 edited, expected = edit(trial, truth)
                 f = to_features(task_space(edited, case.rig), case.rig)
-                (verdict,) = judge([f], case.task)[1]
+                (verdict,) = judge([f], [case.task])
                 alone.append((verdict.failing is not None, verdict.failing == expected))
                 if others := [h for j, h in enumerate(healthy) if j != i]:
-                    among = judge([f, *others], case.task)[1][0]
+                    among = judge([f, *others], [case.task] * (1 + len(others)))[0]
                     pooled.append((among.failing is not None, among.failing == expected))
                 if verdict.wrong_rise is None:
                     odds.append(verdict.log_odds)
@@ -91,12 +91,12 @@ def on_recordings(cases: Sequence[Case]) -> dict:
     seconds = []
     for case in cases:
         every = [to_features(s, case.rig) for s in case.signals]
-        judge(every[:1], case.task)  # compiles
+        judge(every[:1], [case.task])  # compiles
         for f in every:
             start = time.perf_counter()
-            alone += judge([f], case.task)[1]
+            alone += judge([f], [case.task])
             seconds.append(time.perf_counter() - start)
-        pooled += judge(every, case.task)[1]
+        pooled += judge(every, [case.task] * len(every))
     return {
         "trials": len(alone), "false_alarms": sum(v.failing is not None for v in alone),
         "false_alarms_pooled": sum(v.failing is not None for v in pooled),
@@ -110,7 +110,7 @@ def on_simulations(rig: Rig) -> dict[str, dict]:
     for name, task in TASKS.items():
         seeds = list(range(FIRST_SEED, FIRST_SEED + NUM_SIMULATED))
         simulated = simulate_trials(task, rig, [random_properties(task, s) for s in seeds], seeds)
-        verdicts = [judge([to_features(task_space(s.trial, rig), rig)], task)[1][0] for s in simulated]
+        verdicts = [judge([to_features(task_space(s.trial, rig), rig)], [task])[0] for s in simulated]
         out[name] = {"trials": len(verdicts), "false_alarms": sum(v.failing is not None for v in verdicts)}
     return out
 

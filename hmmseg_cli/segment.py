@@ -111,9 +111,10 @@ def _segment_sequence(out: Output, paths, task: SequenceTask, model_file, method
 
 
 def warn_of_misfit(out: Output, segmentation: Segmentation) -> None:
-    """Say which subtask a trial fails at, if it does."""
-    if segmentation.failed is not None:
-        out.warn(f"{segmentation.file}: {segmentation.failed}")
+    """Say which subtask a trial fails at, if it does, in every repetition that does."""
+    failed = () if segmentation.failed is None else (segmentation.failed,)
+    for failure in segmentation.failures or failed:
+        out.warn(f"{segmentation.file}: {failure}")
 
 
 def spans_table(segmentation: Segmentation) -> Table:

@@ -59,12 +59,13 @@ def record_cell(cell: Cell, numbers: Sequence[int], rig: Rig, task: BlockTask) -
     blocks = [random_properties(task, number) for number in numbers]
     simulated = simulate_trials(task, recording_rig(cell, rig), blocks, list(numbers), operator)
     return [
-        Recorded(number, _disturbed(s.trial, s.boundaries, cell, number), s.boundaries, b)
+        Recorded(number, disturbed(s.trial, s.boundaries, cell, number), s.boundaries, b)
         for s, number, b in zip(simulated, numbers, blocks, strict=True)
     ]
 
 
-def _disturbed(trial: Trial, boundaries: np.ndarray, cell: Cell, number: int) -> Trial:
+def disturbed(trial: Trial, boundaries: np.ndarray, cell: Cell, number: int) -> Trial:
+    """The trial with ringing contacts and lost values, as its cell has them."""
     channels = dict(trial.channels)
     if cell.vibration > 0:
         rng = np.random.default_rng([number, 3])

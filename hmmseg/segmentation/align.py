@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from hmmseg.segmentation.crossings import NEAREST, Contacts, contacts
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.features import WINDOW, features, thin
 from hmmseg.segmentation.fit import Fit, fit
-from hmmseg.segmentation.misfit import Plan, explain, plan, spread
+from hmmseg.segmentation.misfit import Plan, at, explain, plan, spread
+from hmmseg.segmentation.rounds import cut, merge_point, one_round, part, round_tasks, slices
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
 INTERVAL = (0.05, 0.95)
@@ -28,7 +29,8 @@ INTERVAL = (0.05, 0.95)
 class TrialAlignment:
     """What later stages need of one aligned trial: the trial, its signals and boundary posteriors.
 
-    `signals` are the recording's, `thinned` and `features` those that the emissions score.
+    `signals` are the recording's, `thinned` and `features` those that the emissions score. `present`
+    (num_subtasks,): which subtasks it shows as the task has them.
     """
 
     trial: Trial
@@ -37,13 +39,15 @@ class TrialAlignment:
     features: Features
     boundaries: tuple[BoundaryPosterior, ...]
     segmentation: Segmentation
+    present: np.ndarray
 
 
 @dataclass(frozen=True)
 class AlignedTrials:
     """All trials of one task; those that fit it are aligned together by one fit.
 
-    `fit` pools the trials without `failed`, in order; without any it has no posteriors.
+    `fit` pools the trials, or the rounds of a repeated task, that fit, in order; without any it has no
+    posteriors.
     """
 
     task: BlockTask
@@ -58,6 +62,21 @@ class AlignedTrials:
         return [trial.segmentation for trial in self.trials]
 
 
+@dataclass(frozen=True)
+class _Piece:
+    """One round of one recording (of a task done once: all of it), aligned.
+
+    `first`, `last` [s] are its ends; `failed` counts subtasks from its own first.
+    """
+
+    boundaries: tuple[BoundaryPosterior, ...]
+    spans: tuple[Span, ...]
+    failed: Failure | None
+    evidence: float
+    first: float
+    last: float
+
+
 def align(
     trials: Sequence[Trial],
     task: BlockTask,
@@ -69,39 +88,132 @@ def align(
 
     A trial that does not fit its task is kept out of the pool and aligned with the order that it
     shows instead: its subtasks before `failed` are the task's, boundaries after it are not. Its
-    log evidence is that of the order it shows. `task` of the result has its number of rounds. `insist`: all
-    are taken to fit, whatever they show. `signals`: to be read instead of the trials' own.
+    log evidence is that of the order it shows. `insist`: all are taken to fit, whatever they show.
+
+    Of a repeated task every round is such a trial: one that fails leaves the others as they are. `task`
+    of the result has its number of rounds (of several recordings with an unknown number, the most).
+    `signals`: to be read instead of the trials' own.
     """
     signals = [task_space(trial, rig) for trial in trials] if signals is None else signals
-    thinned = [thin(s, window=WINDOW) for s in signals]
-    tables = [features(s, rig) for s in thinned]
-    task, verdicts = judge([features(thin(s, MAX_RATE), rig) for s in signals], task)
-    steps = subtasks(task)
-    fitting = [i for i, verdict in enumerate(verdicts) if insist or verdict.failing is None]
-    pooled = fit([tables[i] for i in fitting], steps) if fitting else _unfitted(verdicts)
-    aligned = []
-    for i, (trial, s, f) in enumerate(zip(trials, thinned, tables, strict=True)):
-        first, last = float(signals[i].t[0]), float(signals[i].t[-1])
-        verdict, failed = verdicts[i], None
-        if insist or verdict.failing is None:
-            j = fitting.index(i)
-            boundaries = boundary_posteriors(s, rig, steps, pooled, j)
-            evidence = float(pooled.posteriors[j].log_evidence)
-            spans = to_spans(steps, boundaries, first, last)
-        else:
-            shown = plan(verdict, steps)
-            own, evidence = _fit_shown(f, shown, verdict)
-            found = boundary_posteriors(s, rig, shown.steps, own, 0) if own else ()
-            boundaries = spread(shown, found, len(steps), first, last)
-            every = to_spans(shown.steps, found, first, last)
-            spans = (*every[: shown.num_before], *every[len(every) - shown.num_after :])
-            step = steps[verdict.failing]
-            reason = explain(verdict, steps, [span.start for span in every])
-            failed = Failure(step.index, step.name, step.object, reason)
-        rate = float(1.0 / np.median(np.diff(signals[i].t)))
-        found = Segmentation(trial.file, rate, evidence, spans, failed)
-        aligned.append(TrialAlignment(trial, signals[i], s, f, boundaries, found))
-    return AlignedTrials(task, rig, steps, pooled, tuple(aligned))
+    judged = [features(thin(s, MAX_RATE), rig) for s in signals]
+    if task.repeat == 1 or insist:
+        every = [[slice(0, s.t.size)] for s in signals]
+        verdicts = [[v] for v in judge(judged, [task] * len(signals))]
+    else:
+        every, verdicts = _rounds(signals, judged, task, rig)
+    steps = subtasks(task if insist else one_round(task))
+    thinned = [[thin(part(s, p), window=WINDOW) for p in own] for s, own in zip(signals, every, strict=True)]
+    flat = [s for own in thinned for s in own]
+    tables, of = [features(s, rig) for s in flat], [v for own in verdicts for v in own]
+    fitting = [i for i, verdict in enumerate(of) if insist or verdict.failing is None]
+    pooled = fit([tables[i] for i in fitting], steps) if fitting else _unfitted(of)
+    ends = [(float(s.t[p][0]), float(s.t[p][-1])) for s, own in zip(signals, every, strict=True) for p in own]
+    pieces = iter([
+        _aligned(s, f, steps, pooled, fitting.index(i), rig, ends[i]) if i in set(fitting)
+        else _departed(s, f, steps, of[i], rig, ends[i])
+        for i, (s, f) in enumerate(zip(flat, tables, strict=True))
+    ])  # fmt: skip
+    joined = [[next(pieces) for _ in own] for own in every]
+    number = task.repeat if task.repeat != "unknown" else max(len(own) for own in joined)
+    performed = replace(task, repeat=number)
+    every_step = subtasks(performed)
+    return AlignedTrials(performed, rig, every_step, pooled, tuple(
+        _joined(trial, s, own, every_step, 1 if insist else number, task.repeat == "unknown", rig)
+        for trial, s, own in zip(trials, signals, joined, strict=True)
+    ))  # fmt: skip
+
+
+def _rounds(
+    signals: Sequence[Signals], judged: Sequence[Features], task: BlockTask, rig: Rig
+) -> tuple[list[list[slice]], list[list[Conformity]]]:
+    """Samples and verdict of every round of every recording."""
+    cuts = [cut(f, task) for f in judged]
+    while True:
+        every = [slices(s.t, at) for s, at in zip(signals, cuts, strict=True)]
+        parts = [[features(thin(part(s, p), MAX_RATE), rig) for p in own]
+                 for s, own in zip(signals, every, strict=True)]  # fmt: skip
+        tasks = [own for p in parts for own in round_tasks(task, len(p))]
+        found = iter(judge([f for own in parts for f in own], tasks))
+        verdicts = [[next(found) for _ in own] for own in parts]
+        changed = False
+        for i, own in enumerate(verdicts):
+            if task.repeat != "unknown" and len(own) > task.repeat:
+                k = merge_point(own, [f.t for f in parts[i]])
+                if k is not None:
+                    del cuts[i][k]
+                    changed = True
+        if not changed:
+            return every, verdicts
+
+
+def _aligned(
+    s: Signals, f: Features, steps: tuple[Subtask, ...], pooled: Fit, j: int, rig: Rig,
+    ends: tuple[float, float],
+) -> _Piece:  # fmt: skip
+    boundaries = boundary_posteriors(s, rig, steps, pooled, j)
+    evidence = float(pooled.posteriors[j].log_evidence)
+    return _Piece(boundaries, to_spans(steps, boundaries, *ends), None, evidence, *ends)
+
+
+def _departed(
+    s: Signals, f: Features, steps: tuple[Subtask, ...], verdict: Conformity, rig: Rig,
+    ends: tuple[float, float],
+) -> _Piece:  # fmt: skip
+    """A trial aligned with the order that it shows in place of its task's."""
+    assert verdict.failing is not None
+    shown = plan(verdict, steps)
+    own, evidence = _fit_shown(f, shown, verdict)
+    found = boundary_posteriors(s, rig, shown.steps, own, 0) if own else ()
+    boundaries = spread(shown, found, len(steps), *ends)
+    every = to_spans(shown.steps, found, *ends)
+    spans = (*every[: shown.num_before], *every[len(every) - shown.num_after :])
+    step = steps[verdict.failing]
+    reason = explain(verdict, steps, [span.start for span in every])
+    return _Piece(boundaries, spans, Failure(step.index, step.name, step.object, reason), evidence, *ends)
+
+
+def _joined(
+    trial: Trial, signals: Signals, pieces: Sequence[_Piece], steps: tuple[Subtask, ...], number: int,
+    open_end: bool, rig: Rig,
+) -> TrialAlignment:  # fmt: skip
+    """One recording from its rounds, `number` of them by its task (`open_end`: at most)."""
+    thinned = thin(signals, window=WINDOW)
+    per_round = (len(steps) - 1) // number
+    last = float(signals.t[-1])
+    boundaries = [b for piece in pieces[:number] for b in piece.boundaries]
+    boundaries += [at(last)] * (len(steps) - 1 - len(boundaries))
+    present = np.zeros(len(steps), bool)
+    failures, spans = [], []
+    for r, piece in enumerate(pieces[:number]):
+        base, stop = r * per_round, per_round if piece.failed is None else piece.failed.index
+        present[base : base + stop + (piece.failed is None)] = True
+        spans = _continued(spans, piece.spans)
+        if piece.failed is not None:
+            index = base + piece.failed.index
+            failures.append(replace(piece.failed, index=index, repetition=r + 1 if number > 1 else None))
+    if len(pieces) > number:
+        grip = pieces[number].boundaries[0].quantile(0.5)
+        reason = f"the recording goes on after the task's end with another grip at {grip:.2f} s"
+        failures.append(Failure(steps[-1].index, steps[-1].name, steps[-1].object, reason, number + 1))
+    elif len(pieces) < number and not open_end:
+        step = steps[len(pieces) * per_round + 1]
+        reason = "the recording ends before it"
+        failures.append(Failure(step.index, step.name, step.object, reason, len(pieces) + 1))
+    rate = float(1.0 / np.median(np.diff(signals.t)))
+    segmentation = Segmentation(
+        trial.file, rate, sum(p.evidence for p in pieces), tuple(spans), failures[0] if failures else None,
+        len(pieces) if number > 1 or open_end else None, tuple(failures),
+    )  # fmt: skip
+    table = features(thinned, rig)
+    return TrialAlignment(trial, signals, thinned, table, tuple(boundaries), segmentation, present)
+
+
+def _continued(before: list[Span], after: Sequence[Span]) -> list[Span]:
+    """Spans of the rounds so far and of the next; the free motion between them is one release."""
+    if before and after and before[-1].state == FREE and after[0].state == FREE:
+        free = replace(before[-1], end=after[0].end, end_sd=after[0].end_sd, end_90=after[0].end_90)
+        return [*before[:-1], free, *after[1:]]
+    return [*before, *after]
 
 
 def _fit_shown(f: Features, shown: Plan, verdict: Conformity) -> tuple[Fit | None, float]:

@@ -18,25 +18,20 @@ import numpy as np
 from hmmseg.contact.decompose import FREE, Subtask, height_equations, subtasks
 from hmmseg.hmm.padding import align
 from hmmseg.io.task import BlockTask
+from hmmseg.segmentation.departure import column, departing, leaving, scored, settled
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.free_contacts import (
-    IMPOSSIBLE,
     Block,
     FreeContacts,
     fit_free_contacts,
     log_evidence,
     most_probable,
-    switching,
 )
 
-DEPARTURE = 1e-4  # prior probability that a trial leaves its task at any one boundary
 ENDING = 1e-3  # and that its recording stops before the task's end
-SETTLING, STAGES = 0.2, 3  # s, and most stages in which a contact state settles; to end before ...
-RINGING = 0.1  # share of samples that ring while a contact settles
-BRIEF = 1e-8  # ... is less likely by this: a bounce is no new grip, a halt in the air no place
 MAX_RATE = 50.0  # Hz
 MAX_ASSIGNMENTS = 24
-MAX_ROUNDS = 6  # of a task repeated an unknown number of times
+MANY = 20  # trials; of more than these one alone does not sway what most have learned
 BETWEEN_TRIALS = 2.0  # slack of like blocks: poses, pads and cables shift widths and weights as well
 WRONG_RISE = 3e-3  # m against the task's direction; blocks are taller than that, slips shorter
 
@@ -80,30 +75,22 @@ class Conformity:
         return None if index is None else self.free.blocks[index]
 
 
-def judge(features: Sequence[Features], task: BlockTask) -> tuple[BlockTask, list[Conformity]]:
-    """Conformity of every trial of one task, and the task with its number of rounds settled.
+def judge(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Conformity]:
+    """Conformity of every trial; `tasks` have the same moves, each from where its trial starts.
 
     `features` need no more than MAX_RATE: contact states last longer than its samples.
 
     Each trial is judged by its own parameters; what most others have learned of the blocks then
-    tells whether it moved the same ones. An unknown number of rounds is the one that explains all
-    trials best.
+    tells whether it moved the same ones.
     """
-    free = [fit_free_contacts(f, any(move.slide for move in task.moves)) for f in features]
-    if task.repeat != "unknown":
-        return task, _judge(features, free, task)
-    rounds = max(f.num_grips for f in free) // len(task.moves) + 1
-    candidates = [replace(task, repeat=n) for n in range(1, min(rounds, MAX_ROUNDS) + 1)]
-    judged = [(each, _judge(features, free, each)) for each in candidates]
-    return max(judged, key=lambda pair: sum(c.log_evidence for c in pair[1]))
-
-
-def _judge(features: Sequence[Features], free: Sequence[FreeContacts], task: BlockTask) -> list[Conformity]:
-    steps = subtasks(task)
-    alone = [conformity(each, steps) for each in free]
+    steps = subtasks(tasks[0])
+    sliding = any(move.slide for move in tasks[0].moves)
+    alone = [conformity(fit_free_contacts(f, sliding), steps) for f in features]
+    fitting = [c for c in alone if c.failing is None]
+    among_many = _consensus(fitting) if len(fitting) > MANY else None
     found = []
-    for i, (f, c) in enumerate(zip(features, alone, strict=True)):
-        known = _consensus([other for j, other in enumerate(alone) if j != i and other.failing is None])
+    for f, c, task in zip(features, alone, tasks, strict=True):
+        known = among_many or _consensus([other for other in fitting if other is not c])
         if known and (c.failing is not None or any(_differ(c.block(n), b) for n, b in known.items())):
             c = conformity(c.free, steps, known)
         found.append(_check_rises(f, c, steps, task))
@@ -161,7 +148,7 @@ def conformity(
     distinct ones (the first with which the trial fits, if any), unless `known` blocks say it.
     """
     names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
-    candidates = _assignments(free, names)
+    candidates = assignments(free, names)
     if known:
         fixed = _recognised(free, known)
         candidates = [assignment | fixed for assignment in candidates]
@@ -182,7 +169,7 @@ def _recognised(free: FreeContacts, known: dict[str, Block]) -> dict[str, int | 
     return out
 
 
-def _assignments(free: FreeContacts, names: list[str]) -> list[dict[str, int | None]]:
+def assignments(free: FreeContacts, names: list[str]) -> list[dict[str, int | None]]:
     """Assignments of objects to the trial's blocks: distinct ones as long as there are enough."""
     numbers = range(len(free.blocks))
     if not numbers:
@@ -197,24 +184,16 @@ def _assignments(free: FreeContacts, names: list[str]) -> list[dict[str, int | N
 
 def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[str, int | None]) -> Conformity:
     n, num_subtasks = len(free.table), len(steps)
-    columns = [_column(free, s, assignment) for s in steps]
-    chain = [np.full(n, IMPOSSIBLE) if c is None else free.table[:, c] for c in columns]
-    table = np.column_stack([*chain, free.table])
-    table[-1, : num_subtasks - 1] += np.log(ENDING)
-    num_states = table.shape[1]
-    stages = int(np.clip(round(SETTLING / free.interval / 2), 1, STAGES))
-    model = _settling(
-        *_departing(free.states, columns, n), stages, min(0.5, stages * free.interval / SETTLING)
-    )
+    columns = [column(free, s, assignment) for s in steps]
+    leave = leaving(num_subtasks, n)
+    table, stages, model = settled(free, columns, *departing(free.states, columns, leave))
+    num_states = num_subtasks + len(free.states)
     last = np.arange(num_states) == num_subtasks - 1
-
-    settling = _settling_table(
-        table, np.r_[[-1 if c is None else c for c in columns], np.arange(len(free.states))], free.states
-    )
+    table[-1, np.tile(np.arange(num_states) < num_subtasks - 1, stages + 1)] += np.log(ENDING)
+    table[-1, : stages * num_states] += np.log(ENDING)  # to end amid a change of contact is rare
 
     def ending(in_these: np.ndarray) -> np.ndarray:
-        every = np.hstack([np.tile(settling, stages), table])
-        every[-1, : stages * num_states] += np.log(ENDING)  # to end amid a change of contact is rare
+        every = table.copy()
         every[-1, ~np.tile(in_these, stages + 1)] = -np.inf
         return every
 
@@ -224,80 +203,13 @@ def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[st
         runs = _runs(most_probable(ending(~last), *model) % num_states, steps, free, columns)
         failing = min(sum(r.subtask is not None for r in runs), num_subtasks - 1)
     else:
-        leave = np.full(num_subtasks, _leaving(num_subtasks, n))
-        path = align(table[:, :num_subtasks], np.log1p(-leave), np.log(leave[:-1])).path
+        chain = scored(free, columns)[:, :num_subtasks]
+        chain[-1, :-1] += np.log(ENDING)
+        leaves = np.full(num_subtasks, leave)
+        path = align(chain, np.log1p(-leaves), np.log(leaves[:-1])).path
         runs = _runs(path, steps, free, columns)
     total = float(np.logaddexp(log_left, log_complete))
     return Conformity(free, assignment, runs, failing, log_left - log_complete, total)
-
-
-def _leaving(num_subtasks: int, n: int) -> float:
-    """Probability per sample that a contact state ends: as many of them as the task has."""
-    return min(0.5, num_subtasks / n)
-
-
-def _settling(
-    log_initial: np.ndarray, log_transition: np.ndarray, stages: int, settle: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Every state stages + 1 times: it is entered in the first and settled in the last.
-
-    A stage passes to the next with `settle` per sample, so that durations are Erlang rather than
-    geometric; before the last, leaving the state has BRIEF of its probability. A recording starts
-    settled. Log initial and transition probabilities over (stages, states).
-    """
-    same = np.eye(log_initial.size, dtype=bool)
-    stay, move = np.where(same, log_transition, -np.inf), np.where(same, -np.inf, log_transition)
-    blocks = [[np.full_like(stay, -np.inf)] * (stages + 1) for _ in range(stages + 1)]
-    for i in range(stages):
-        blocks[i][i], blocks[i][i + 1] = stay + np.log1p(-settle), stay + np.log(settle)
-        blocks[i][0] = np.logaddexp(blocks[i][0], move + np.log(BRIEF))
-    blocks[-1][-1], blocks[-1][0] = stay, move
-    return np.r_[np.full(stages * log_initial.size, -np.inf), log_initial], np.block(blocks)
-
-
-def _settling_table(
-    table: np.ndarray, columns: np.ndarray, states: tuple[tuple[str, int | None], ...]
-) -> np.ndarray:
-    """Log-likelihoods (num_timesteps, num_states) while a contact settles.
-
-    Fingers and block ring for a while after any contact change. What the forces of a ringing sample
-    do says which block is held, but not how: every hold of it scores as the likeliest of them.
-    """
-    out = table.copy()
-    blocks = np.array([-1 if block is None else block for _, block in states])
-    block = np.where(columns < 0, -1, blocks[columns])
-    for number in np.unique(block[block >= 0]):
-        same = block == number
-        ringing = np.log(RINGING) + table[:, same].max(axis=1, keepdims=True)
-        out[:, same] = np.logaddexp(np.log1p(-RINGING) + table[:, same], ringing)
-    return out
-
-
-def _column(free: FreeContacts, step: Subtask, assignment: dict[str, int | None]) -> int | None:
-    state = (step.state, None if step.state == FREE else assignment.get(str(step.object)))
-    return free.states.index(state) if state in free.states else None
-
-
-def _departing(
-    states: tuple[tuple[str, int | None], ...], columns: Sequence[int | None], n: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Log initial and transition probabilities of the chain followed by the free states."""
-    k, num_states = len(columns), len(states)
-    leave = _leaving(k, n)
-    out = np.full((k + num_states, k + num_states), -np.inf)
-    out[k:, k:] = switching(states, leave)
-    index = np.arange(k)
-    out[index, index] = np.log1p(-leave)
-    out[index[:-1], index[1:]] = np.log(leave) + np.log1p(-DEPARTURE)
-    for i, column in enumerate(columns):
-        if column is not None:
-            follows = np.isfinite(out[k + column, k:])
-            follows[column] = False  # to go on in the same state is not to leave
-            out[i, k:][follows] = np.log(leave * DEPARTURE / max(follows.sum(), 1))
-    initial = np.full(k + num_states, np.log(DEPARTURE / num_states))
-    initial[: k + 1] = -np.inf  # whatever is free motion at the start is the task's own
-    initial[0] = np.log1p(-DEPARTURE)
-    return initial, out
 
 
 def _runs(path: np.ndarray, steps: Sequence[Subtask], free: FreeContacts,

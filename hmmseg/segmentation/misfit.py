@@ -90,7 +90,7 @@ def spread(
 
     The failing subtask takes all that belongs to none; missing ones after it have no length.
     """
-    every = [_at(first), *found, _at(last)]  # every[i] is where step i starts
+    every = [at(first), *found, at(last)]  # every[i] is where step i starts
     resume = every[len(shown.steps) - shown.num_after]
     out = []
     for k in range(1, num_subtasks):
@@ -104,7 +104,8 @@ def spread(
     return tuple(out)
 
 
-def _at(t: float) -> BoundaryPosterior:
+def at(t: float) -> BoundaryPosterior:
+    """A boundary that is known to be at t [s]."""
     return BoundaryPosterior(np.array([t]), np.array([1.0]))
 
 

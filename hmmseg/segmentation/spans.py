@@ -27,23 +27,36 @@ class Span:
 
 @dataclass(frozen=True)
 class Failure:
-    """The first subtask (0-based index in the task's order) that the recording does not show."""
+    """The first subtask (0-based index in the task's order) that the recording does not show.
+
+    `repetition` (from 1) says in which round of a repeated task; None where it has but one.
+    """
 
     index: int
     subtask: str
     object: str | None
     reason: str
+    repetition: int | None = None
 
     def __str__(self) -> str:
         step = f"{self.subtask} {self.object or ''}".strip()
-        return f"does not fit its task at {step}: {self.reason}"
+        number = "" if self.repetition is None else f"repetition {self.repetition}: "
+        return f"does not fit its task at {step}: {number}{self.reason}"
+
+    def to_json(self) -> dict:
+        """The entry `failed` of one trial."""
+        document = asdict(self)
+        if self.repetition is None:
+            del document["repetition"]
+        return document
 
 
 @dataclass(frozen=True)
 class Segmentation:
     """Spans of one trial; `failed` where the recording does not fit its task.
 
-    `log_evidence` is None from a method that has no likelihood.
+    `log_evidence` is None from a method that has no likelihood. Of a repeated task, `repetitions` says
+    how often the recording shows it and `failures` holds all rounds that do not fit, `failed` the first.
     """
 
     file: str
@@ -51,6 +64,8 @@ class Segmentation:
     log_evidence: float | None
     spans: tuple[Span, ...]
     failed: Failure | None = None
+    repetitions: int | None = None
+    failures: tuple[Failure, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -67,5 +82,8 @@ class Segmentation:
             "segments": [asdict(span) for span in self.spans],
         }
         if self.failed is not None:
-            document["failed"] = asdict(self.failed)
+            document["failed"] = self.failed.to_json()
+        if self.repetitions is not None:
+            document["repetitions"] = self.repetitions
+            document["failures"] = [failure.to_json() for failure in self.failures]
         return document

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -56,10 +56,12 @@ def simulate_trial(task: BlockTask, rig: Rig, properties: Blocks, seed: int,
 
 def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], seeds: Sequence[int],
                     operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
+                    alter: Callable[[Plan, np.random.Generator], Plan] | None = None,
                     ) -> list[SimulatedTrial]:  # fmt: skip
     """Many performances at once, one for each seed with its blocks; each as `simulate_trial` gives it.
 
-    They are integrated side by side, which costs far less than one after another.
+    They are integrated side by side, which costs far less than one after another. `alter` changes what
+    the operator commands, by a generator of its own.
     """
     settings = operator or OperatorSettings()
     if not seeds:
@@ -70,6 +72,8 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
                 raise InputError("properties", f"object {name!r} is missing", "a block for every object")
     plans = [plan(task, rig, blocks, settings, np.random.default_rng([seed, 0]))
              for blocks, seed in zip(properties, seeds, strict=True)]  # fmt: skip
+    if alter is not None:
+        plans = [alter(p, np.random.default_rng([seed, 4])) for p, seed in zip(plans, seeds, strict=True)]
     scenes = [physics(rig, [blocks[name] for name in task.objects], surroundings) for blocks in properties]
     substeps = max(substeps_for(scene, CONTROL_PERIOD) for scene in scenes)
     length = -(-max(len(p.command) for p in plans) // BUCKET) * BUCKET

@@ -1,0 +1,111 @@
+"""Repeated tasks: a recording is cut into its rounds, each of which is then a trial of one round.
+
+The task's chain closes on itself: from the free motion after its last move the next round may
+begin, and from wherever a path has left the chain as well, so that a round that fails does not
+carry the others away. One Viterbi path over the chain's few states finds the rounds, at a cost
+linear in the length of the recording whatever their number.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hmmseg.contact.decompose import FREE, Subtask, subtasks
+from hmmseg.hand.signals import Signals
+from hmmseg.io.task import BlockTask
+from hmmseg.segmentation.conformity import Conformity, assignments
+from hmmseg.segmentation.departure import DEPARTURE, column, departing, settled
+from hmmseg.segmentation.emissions import Features
+from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts, log_evidence, most_probable
+
+GLANCE = 4096  # samples that tell which of the recording's blocks is which object
+
+
+def one_round(task: BlockTask) -> BlockTask:
+    """The task performed once."""
+    return replace(task, repeat=1)
+
+
+def round_tasks(task: BlockTask, number: int) -> list[BlockTask]:
+    """The moves of each round as a task of its own, from where its blocks then stand."""
+    support, out = dict(task.initial), []
+    for _ in range(number):
+        out.append(BlockTask(dict(support), task.moves))
+        for move in task.moves:
+            support[move.object] = move.to
+    return out
+
+
+def cut(f: Features, task: BlockTask) -> list[float]:
+    """Times [s] amid the free motions between the rounds of one recording, in order.
+
+    `f` need no more than conformity's MAX_RATE. A recording without a second round has none.
+    """
+    free = fit_free_contacts(f, any(move.slide for move in task.moves))
+    steps = subtasks(one_round(task))
+    names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
+    leave = min(0.5, max(4 * free.num_grips + 1, len(steps)) / len(f.t))
+    models = [_closed(free, steps, assignment, leave) for assignment in assignments(free, names)]
+    glances = [log_evidence(table[:GLANCE], *model) for table, model in models] if len(models) > 1 else [0.0]
+    table, model = models[int(np.argmax(glances))]
+    num_states = len(steps) + len(free.states)
+    path = most_probable(table, *model) % num_states
+    states = np.array([s.state for s in steps] + [state for state, _ in free.states])
+    open_ = (states == FREE)[path]
+    begins = np.flatnonzero((path[1:] == 1) & open_[:-1]) + 1
+    if begins.size and (~open_[: begins[0]]).any():
+        begins = np.r_[-1, begins]  # what is held before the first whole round is a round cut short
+    cuts = []
+    for begin in begins[1:]:
+        held = np.flatnonzero(~open_[:begin])
+        before = held[-1] + 1 if held.size else 0  # the first sample of the free motion before the round
+        cuts.append(float(f.t[(before + begin) // 2]))
+    return cuts
+
+
+def _closed(
+    free: FreeContacts, steps: Sequence[Subtask], assignment: dict[str, int | None], leave: float
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Log-likelihoods and model of the chain that begins anew after its end, settling stages and all."""
+    columns = [column(free, s, assignment) for s in steps]
+    initial, transition = departing(free.states, columns, leave)
+    k = len(steps)
+    for i, step in enumerate(steps[:-1]):
+        if step.state == FREE and i > 0:  # a round broken off between two moves
+            transition[i, 1] = np.log(leave * DEPARTURE)
+    transition[k - 1, 1] = np.log(leave)
+    transition[k + free.states.index((FREE, None)), 1] = np.log(leave / 2)
+    table, _, model = settled(free, columns, initial, transition)
+    return table, model
+
+
+def slices(t: np.ndarray, cuts: Sequence[float]) -> list[slice]:
+    """Samples of each round, t (num_timesteps,) [s]."""
+    edges = [0, *np.searchsorted(t, cuts), t.size]
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+
+
+def part(signals: Signals, samples: slice) -> Signals:
+    """A stretch of a recording."""
+    sliced = {k: v[samples] if isinstance(v, np.ndarray) else v for k, v in vars(signals).items()}
+    return Signals(**sliced)  # type: ignore[arg-type]
+
+
+def merge_point(verdicts: Sequence[Conformity], times: Sequence[np.ndarray]) -> int | None:
+    """Which round to join with its next where there is one too many; None where all fit.
+
+    Of rounds that fail, the one whose next grip follows soonest: a block that was gripped again.
+    `times` [s] are those of the samples that were judged.
+    """
+    waits = {}
+    for r in range(len(verdicts) - 1):
+        if verdicts[r].failing is not None:
+            held = [run for run in verdicts[r].runs if run.state != FREE]
+            then = [run for run in verdicts[r + 1].runs if run.state != FREE]
+            let_go = times[r][held[-1].stop - 1] if held else times[r][0]
+            waits[r] = float((times[r + 1][then[0].start] if then else times[r + 1][-1]) - let_go)
+    return min(waits, key=lambda r: waits[r], default=None)
