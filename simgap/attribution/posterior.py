@@ -1,0 +1,268 @@
+"""Which effects act together: a spike-and-slab posterior over sets of candidates.
+
+Every set's evidence is Laplace's approximation about its mode, found by iteratively reweighted least
+squares: groups of rows count by their expected precision under the background (`background`), parameters by
+that of their Cauchy prior. Sets are found by adding, removing and exchanging effects as long as that leads
+to sets within a window of the best (Occam's window: Madigan & Raftery, JASA 89, 1994).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import gammaln
+
+from simgap.attribution.background import Background
+from simgap.attribution.problem import Candidate, Gap, Spectrum, spectrum
+
+STEPS = 30
+CLOSE = 0.02  # nats
+SCREEN, REFINED = 3, 5  # steps by which neighbours of a set are screened, how many of them are fitted
+WINDOW = 12.0  # nats behind the best set within which a set is kept
+BEAM = 5  # sets of each size that are extended
+MOST = 6  # effects of a set at most
+
+
+@dataclass(frozen=True)
+class Model:
+    """One set of effects: its log posterior (unnormalised), and the mode of its parameters.
+
+    `effects`: indices of candidates, ascending; `x` (K + sum k,): nuisances, then each effect's deviations
+    over scale; `covariance` of x; `energy` (G,), `precision` (G,) of the groups at the mode; `at_bound`
+    marks coordinates held at a bound.
+    """
+
+    effects: tuple[int, ...]
+    score: float
+    x: np.ndarray
+    covariance: np.ndarray
+    energy: np.ndarray
+    precision: np.ndarray
+    at_bound: np.ndarray
+
+
+@dataclass(frozen=True)
+class Forms:
+    """Quadratic forms of a gap by group: products (G, M, M) of the spectrum's columns, counts (G,)."""
+
+    gap: Gap
+    spectrum: Spectrum
+    background: Background
+    product: np.ndarray
+    count: np.ndarray
+
+    @cached_property
+    def extra(self) -> np.ndarray:
+        """Mean variance (J, G) that each candidate adds to a group."""
+        out = np.zeros((len(self.gap.candidates), self.count.size))
+        for j, c in enumerate(self.gap.candidates):
+            if c.variance is not None:
+                out[j] = np.bincount(self.spectrum.group, c.variance, self.count.size) / self.count
+        return out
+
+    def shift(self, effects: tuple[int, ...]) -> np.ndarray:
+        """Log variance (G,) that a set's effects give to the groups."""
+        return np.log1p(self.extra[list(effects)].sum(0))
+
+    @cached_property
+    def log_odds(self) -> float:
+        """Prior log odds of one effect to act."""
+        share = min(self.gap.expected / max(len(self.gap.candidates), 1), 0.5)
+        return float(np.log(share / (1 - share)))
+
+
+def forms(gap: Gap, background: Background | None = None) -> Forms:
+    """The quadratic forms that all sets of candidates share."""
+    s = spectrum(gap)
+    count = np.bincount(s.group).astype(float)
+    product = np.zeros((count.size, s.columns.shape[1], s.columns.shape[1]))
+    order = np.argsort(s.group, kind="stable")
+    for g, mine in enumerate(np.split(order, np.cumsum(count)[:-1].astype(int))):
+        product[g] = s.columns[mine].T @ s.columns[mine]
+    return Forms(gap, s, background or Background.usual(), product, count)
+
+
+def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
+    """The set's mode and evidence, the better one of two starts: all groups count alike, and as they would
+    with every effect as it was linearised."""
+    taken = _taken(f, effects)
+    found = [_mode(f, taken, np.ones(f.count.size))]
+    if effects:
+        x = np.zeros(taken.low.size)
+        for j, mine in taken.blocks:
+            c = f.gap.candidates[j]
+            x[mine] = (c.at - c.neutral) / c.scale
+        found.append(_mode(f, taken, f.background.marginal(taken.energy(x), f.count, taken.shift)[1], x))
+    return max(found, key=lambda m: m.score)
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """The quadratic forms of one set: square (G,), pull (G, n), bend (G, n, n) of its coordinates x (n,)."""
+
+    effects: tuple[int, ...]
+    square: np.ndarray
+    pull: np.ndarray
+    bend: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    blocks: list[tuple[int, np.ndarray]]
+    shift: np.ndarray
+
+    def energy(self, x: np.ndarray) -> np.ndarray:
+        """Squares (G,) of what is left at x."""
+        return np.maximum(self.square - 2 * self.pull @ x + (self.bend @ x) @ x, 0.0)
+
+
+def _taken(f: Forms, effects: tuple[int, ...]) -> _Taken:
+    z, own = f.spectrum.num_nuisances, f.spectrum.own
+    free = np.concatenate([np.arange(1, 1 + z), *(own[j][1:] for j in effects)]).astype(int)
+    constant = np.array([0, *(own[j][0] for j in effects)])
+    sign = np.array([1.0, *(-1.0 for _ in effects)])
+    square = np.einsum("i,gij,j->g", sign, f.product[:, constant[:, None], constant], sign)
+    pull = np.einsum("i,gij->gj", sign, f.product[:, constant[:, None], free])
+    bend = f.product[:, free[:, None], free]
+    return _Taken(
+        effects, square, pull, bend, *_limits(f, effects, z), _blocks(f, effects, z), f.shift(effects)
+    )
+
+
+def _mode(
+    f: Forms, taken: _Taken, precision: np.ndarray, x: np.ndarray | None = None, steps: int = STEPS
+) -> Model:
+    """Iteratively reweighted least squares from given precisions of the groups."""
+    z, size = f.spectrum.num_nuisances, taken.low.size
+    x = np.zeros(size) if x is None else x
+    value, prior, energy = -np.inf, np.ones(size), taken.square
+    held = np.zeros(size, bool)
+    for _ in range(steps):
+        for _, mine in taken.blocks:
+            prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
+        matrix = np.tensordot(precision, taken.bend, 1) + np.diag(prior)
+        x, held = _bounded(matrix, precision @ taken.pull, x, taken.low, taken.high)
+        energy = taken.energy(x)
+        density, precision = f.background.marginal(energy, f.count, taken.shift)
+        last, value = value, float(density.sum()) + _log_prior(x, z, taken.blocks)
+        if abs(value - last) < CLOSE:
+            break
+    for _, mine in taken.blocks:
+        prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
+    matrix = np.tensordot(precision, taken.bend, 1) + np.diag(prior)
+    loose = ~held
+    covariance = np.zeros_like(matrix)
+    covariance[np.ix_(loose, loose)] = np.linalg.inv(matrix[np.ix_(loose, loose)])
+    volume = 0.5 * (loose.sum() - z) * np.log(2 * np.pi)
+    volume -= 0.5 * float(np.linalg.slogdet(matrix[np.ix_(loose, loose)])[1])
+    known = sum(f.gap.candidates[j].evidence for j in taken.effects) + len(taken.effects) * f.log_odds
+    return Model(taken.effects, value + volume + known, x, covariance, energy, precision, held)
+
+
+def _bounded(
+    matrix: np.ndarray, pull: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The least of x' matrix x / 2 - pull x inside bounds, by an active set, and which are held."""
+    out, held = np.linalg.solve(matrix, pull), np.zeros(x.size, bool)
+    for _ in range(x.size):
+        past = ~held & ((out < low) | (out > high))
+        if not past.any():
+            break
+        held |= past
+        out[held] = np.clip(out[held], low[held], high[held])
+        free = ~held
+        rest = pull[free] - matrix[np.ix_(free, held)] @ out[held]
+        out[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
+    return out, held
+
+
+def _blocks(f: Forms, effects: tuple[int, ...], z: int) -> list[tuple[int, np.ndarray]]:
+    """Coordinates of each effect in x."""
+    out, at = [], z
+    for j in effects:
+        k = f.gap.candidates[j].at.size
+        out.append((j, np.arange(at, at + k)))
+        at += k
+    return out
+
+
+def _limits(f: Forms, effects: tuple[int, ...], z: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of x."""
+    chosen = [f.gap.candidates[j] for j in effects]
+    low = [np.full(z, -np.inf), *((c.low - c.neutral) / c.scale for c in chosen)]
+    high = [np.full(z, np.inf), *((c.high - c.neutral) / c.scale for c in chosen)]
+    return np.concatenate(low), np.concatenate(high)
+
+
+def _log_prior(x: np.ndarray, z: int, blocks: list[tuple[int, np.ndarray]]) -> float:
+    """Log prior density of x, nuisances' (2 pi)^(-K/2) left out as it cancels."""
+    out = -0.5 * float(x[:z] @ x[:z])
+    for _, mine in blocks:
+        k = mine.size
+        if k:
+            out += gammaln((1 + k) / 2) - gammaln(0.5) - 0.5 * k * np.log(np.pi)
+            out -= 0.5 * (1 + k) * np.log1p(x[mine] @ x[mine])
+    return float(out)
+
+
+def sought(f: Forms) -> list[Model]:
+    """All sets found within the window of the best, best first; the empty set is always one.
+
+    Neighbours of a set are screened from its mode in a few steps; those that lead are fitted to the end.
+    """
+    every = range(len(f.gap.candidates))
+    empty = fitted(f, ())
+    seen: dict[tuple[int, ...], Model] = {(): empty, **{(j,): fitted(f, (j,)) for j in every}}
+    rough: set[tuple[int, ...]] = set()
+    opened: set[tuple[int, ...]] = {()}
+    while True:
+        best = max(m.score for m in seen.values())
+        ranked = sorted(seen.values(), key=lambda m: -m.score)
+        leading = [m for m in ranked if m.score > best - WINDOW][:BEAM]
+        leading += [m for m in ranked if len(m.effects) == 1][:2]
+        todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
+        if not todo:
+            break
+        for m in todo:
+            opened.add(m.effects)
+            new = [e for e in _neighbours(m.effects, every) if e not in seen and e not in rough]
+            first = sorted(new, key=lambda e: -_mode(f, _taken(f, e), m.precision, steps=SCREEN).score)
+            seen |= {e: fitted(f, e) for e in first[:REFINED]}
+            rough |= set(first[REFINED:])
+    best = max(m.score for m in seen.values())
+    kept = [m for m in seen.values() if m.score > best - WINDOW or not m.effects]
+    return sorted(kept, key=lambda m: -m.score)
+
+
+def _neighbours(effects: tuple[int, ...], every: range) -> list[tuple[int, ...]]:
+    """Sets with one effect more, one left out, or one exchanged."""
+    fewer = [tuple(j for j in effects if j != out) for out in effects]
+    more = [tuple(sorted({*e, j})) for e in (effects, *fewer) for j in every if j not in effects]
+    return list(dict.fromkeys([*more, *fewer]))
+
+
+def weights(models: list[Model]) -> np.ndarray:
+    """Posterior probabilities of the sets, which sum to 1."""
+    score = np.array([m.score for m in models])
+    return np.exp(score - np.logaddexp.reduce(score))
+
+
+def deviations(c: Candidate, x: np.ndarray) -> np.ndarray:
+    """Parameters from deviations over scale."""
+    return c.neutral + c.scale * x
+
+
+def squares_left(
+    f: Forms, effects: tuple[int, ...], weight: np.ndarray, x: np.ndarray | None = None
+) -> np.ndarray:
+    """Squares (G,) that a set leaves at x, or at best, groups weighted, its variances taken off; and as one
+    more entry those of the nuisances themselves, for what was measured of them is data as well."""
+    taken, z = _taken(f, effects), f.spectrum.num_nuisances
+    weight = weight * np.exp(-taken.shift)
+    if x is None:
+        prior = np.ones(taken.low.size)
+        for _, mine in taken.blocks:
+            prior[mine] = 1e-3
+        matrix = np.tensordot(weight, taken.bend, 1) + np.diag(prior)
+        x, _ = _bounded(matrix, weight @ taken.pull, np.zeros(prior.size), taken.low, taken.high)
+    return np.append(weight * taken.energy(x), x[:z] @ x[:z])

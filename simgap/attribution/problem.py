@@ -1,0 +1,144 @@
+"""What an attribution is asked: whitened residuals, nuisances, and candidate effects about their best fits.
+
+    residual = nuisance @ z + sum over acting effects shift_j(theta_j) + background + noise
+
+Every row is divided by its noise's standard deviation. An effect is affine about `at`, where it was
+linearised: shift_j(theta) = shift + jacobian @ (theta - at).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.fft import dct
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What each of n residuals is: indices of its trial, channel and part, and its time [s].
+
+    A part is a subtask, or any stretch of a trial. Rows of one cell (a channel in a part of a trial) are in
+    the order of time. `bands` [Hz]: lower edges of the frequency bands that are told apart.
+    """
+
+    trial: Int[np.ndarray, " n"]
+    channel: Int[np.ndarray, " n"]
+    part: Int[np.ndarray, " n"]
+    time: Float[np.ndarray, " n"]
+    trials: tuple[str, ...]
+    channels: tuple[str, ...]
+    parts: tuple[str, ...]
+    bands: tuple[float, ...] = (0.0, 1.0, 5.0)
+
+    def taken(self, chosen: np.ndarray) -> Rows:
+        """The rows of a mask (n,) or of indices; names stay."""
+        return Rows(self.trial[chosen], self.channel[chosen], self.part[chosen], self.time[chosen],
+                    self.trials, self.channels, self.parts, self.bands)  # fmt: skip
+
+    @property
+    def cell(self) -> Int[np.ndarray, " n"]:
+        """One number for each trial, channel and part."""
+        return (self.trial * len(self.channels) + self.channel) * len(self.parts) + self.part
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect with k `parameters`; it changes nothing at `neutral`, and was linearised at `at`.
+
+    `scale`: the usual size of each deviation from neutral. The prior of all k together is a multivariate
+    Cauchy distribution of that scale, so that gross faults stay possible (Gelman et al., Ann. Appl. Stat. 2,
+    2008). `shift` (n,): by how much the effect at `at` shifts the residual, `jacobian` (n, k) its derivatives
+    there. `variance` (n,) is what it adds to each row's variance instead, at `at`; `evidence` [nats] what
+    else speaks for it. What is not `named` fits anything, and may only win the verdict "unknown". `form`: by
+    which share the effect's own form is usually off from one part of a recording to another.
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+    at: Float[np.ndarray, " k"]
+    neutral: Float[np.ndarray, " k"]
+    scale: Float[np.ndarray, " k"]
+    shift: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n k"]
+    low: Float[np.ndarray, " k"]
+    high: Float[np.ndarray, " k"]
+    variance: Float[np.ndarray, " n"] | None = None
+    evidence: float = 0.0
+    named: bool = True
+    form: float = 0.1
+
+    def taken(self, rows: np.ndarray) -> Candidate:
+        """The candidate on some rows."""
+        variance = None if self.variance is None else self.variance[rows]
+        return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
+                         self.jacobian[rows], self.low, self.high, variance, self.evidence, self.named,
+                         self.form)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Residuals (n,) at the nominal, derivatives by nuisances whose prior is N(0, 1), and candidates.
+
+    `expected`: how many of all candidates act, beforehand.
+    """
+
+    rows: Rows
+    residual: Float[np.ndarray, " n"]
+    nuisance: Float[np.ndarray, "n z"]
+    candidates: tuple[Candidate, ...]
+    expected: float = 1.0
+
+    def taken(self, rows: np.ndarray) -> Gap:
+        """The gap on some rows (a mask or indices)."""
+        return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
+                   tuple(c.taken(rows) for c in self.candidates), self.expected)  # fmt: skip
+
+    def without(self, names: tuple[str, ...]) -> Gap:
+        """The gap with some candidates not thought of."""
+        kept = tuple(c for c in self.candidates if c.name not in names)
+        return Gap(self.rows, self.residual, self.nuisance, kept, self.expected)
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Columns (n, M) of a gap as cosines of each cell: residual, nuisances, and of every candidate its
+    constant part and its derivatives by deviations over `scale`.
+
+    `group` (n,): channel, part and band of each coefficient, numbered without holes, trials together;
+    `own` the columns of candidate j, the first its constant part.
+    """
+
+    columns: np.ndarray
+    group: np.ndarray
+    band: np.ndarray
+    own: tuple[np.ndarray, ...]
+    num_nuisances: int
+
+
+def spectrum(gap: Gap) -> Spectrum:
+    """The gap's columns under an orthonormal cosine transform of every cell (white noise stays white)."""
+    parts, own, at = [gap.residual[:, None], gap.nuisance], [], 1 + gap.nuisance.shape[1]
+    for c in gap.candidates:
+        constant = c.shift - c.jacobian @ (c.at - c.neutral)
+        parts += [constant[:, None], c.jacobian * c.scale]
+        own.append(np.arange(at, at + 1 + c.at.size))
+        at += 1 + c.at.size
+    columns, (band,) = cosines(gap.rows, np.concatenate(parts, 1))
+    key = (gap.rows.channel * len(gap.rows.parts) + gap.rows.part) * len(gap.rows.bands) + band
+    return Spectrum(columns, np.unique(key, return_inverse=True)[1], band, tuple(own), gap.nuisance.shape[1])
+
+
+def cosines(rows: Rows, columns: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray]]:
+    """Columns (n, M) under an orthonormal cosine transform of every cell, and the coefficients' bands."""
+    out, band = np.empty_like(columns, float), np.zeros(len(columns), int)
+    order = np.argsort(rows.cell, kind="stable")
+    starts = np.flatnonzero(np.diff(rows.cell[order], prepend=-1))
+    edges = np.asarray(rows.bands[1:])
+    for mine in np.split(order, starts[1:]):
+        out[mine] = dct(columns[mine], axis=0, norm="ortho")
+        if mine.size > 1:
+            step = float(np.median(np.diff(rows.time[mine])))
+            band[mine] = np.searchsorted(edges, np.arange(mine.size) / (2 * mine.size * step), side="right")
+    return out, (band,)

@@ -1,0 +1,235 @@
+"""Attribution against enumeration, closed forms, quadrature and planted effects."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from simgap.attribution.attribute import attribute
+from simgap.attribution.background import Background
+from simgap.attribution.cells import significant
+from simgap.attribution.detection import detected, statistic
+from simgap.attribution.heldout import how_far
+from simgap.attribution.invariance import WANDER, invariance
+from simgap.attribution.posterior import Forms, forms, sought, weights
+from simgap.attribution.problem import Candidate, Gap, Rows, cosines
+
+
+def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
+    """Rows of a small recording at 20 Hz, every cell with as many samples."""
+    trial, channel, part, k = (z.ravel() for z in np.indices((trials, channels, parts, samples)))
+    time = (part * samples + k) / 20.0
+    return Rows(trial, channel, part, time, tuple(f"t{i}" for i in range(trials)),
+                tuple(f"c{i}" for i in range(channels)), tuple(f"p{i}" for i in range(parts)))  # fmt: skip
+
+
+def linear(name: str, jacobian: np.ndarray, scale: float = 1.0, named: bool = True) -> Candidate:
+    """An effect that is linear in its parameters."""
+    k = jacobian.shape[1]
+    nothing, far = np.zeros(k), np.full(k, np.inf)
+    return Candidate(name, tuple(f"{name}{i}" for i in range(k)), nothing, nothing, np.full(k, scale),
+                     np.zeros(len(jacobian)), jacobian, -far, far, named=named)  # fmt: skip
+
+
+def gap_of(theta: dict[int, float], seed: int = 0, more: np.ndarray | float = 0.0, same: bool = False) -> Gap:
+    """A gap of four one-parameter effects, of which `theta` act; `same`: two of them are one."""
+    rng, rows = np.random.default_rng(seed), rows_of()
+    n = rows.time.size
+    push = rng.standard_normal((4, n)) * np.isin(rows.channel, (0, 1)) / 4
+    if same:
+        push[1] = push[0]
+    residual = rng.standard_normal(n) + sum(v * push[j] for j, v in theta.items()) + more
+    nuisance = (rows.channel == 2)[:, None] * np.ones((1, 1))
+    return Gap(rows, residual, nuisance, tuple(linear("abcd"[j], push[j][:, None]) for j in range(4)))
+
+
+def test_cosines_are_orthonormal_within_each_cell():
+    rows = rows_of()
+    values = np.random.default_rng(1).standard_normal((rows.time.size, 2))
+    out, (band,) = cosines(rows, values)
+    for cell in np.unique(rows.cell):
+        mine = rows.cell == cell
+        np.testing.assert_allclose(out[mine].T @ out[mine], values[mine].T @ values[mine], atol=1e-10)
+        assert band[mine][0] == 0 and band[mine].max() == 2
+        assert out[mine][0] == pytest.approx(values[mine].mean(0) * np.sqrt(mine.sum()))
+
+
+def test_background_is_the_integral_over_variances():
+    b = Background.usual()
+    energy, count = np.array([3.0, 400.0]), np.array([5.0, 20.0])
+    total, precision = b.marginal(energy, count)
+    for g in range(2):
+        each = [lp - 0.5 * count[g] * v - 0.5 * energy[g] * np.exp(-v)
+                for v, lp in zip(b.log_phi, b.log_prior, strict=True)]  # fmt: skip
+        assert total[g] == pytest.approx(float(np.log(np.sum(np.exp(each)))))
+        share = np.exp(each) / np.sum(np.exp(each))
+        assert precision[g] == pytest.approx(float(share @ np.exp(-b.log_phi)))
+    assert precision[0] > 0.5 and precision[1] == pytest.approx(20 / 400, rel=0.25)
+    assert float(np.exp(b.log_prior).sum()) == pytest.approx(1.0)
+
+
+def enumerated(gap: Gap) -> dict[tuple[int, ...], float]:
+    """Log posterior of all 2^n sets under noise as stated: the Cauchy prior of each effect is a normal whose
+    precision is Gamma(1/2, 1/2), integrated by quadrature (in the logarithm), all else in closed form."""
+    grid = np.linspace(-16, 4, 60)
+    log_gamma = 0.5 * grid - 0.5 * np.exp(grid) - 0.5 * np.log(2 * np.pi) + np.log(grid[1] - grid[0])
+    odds = np.log((1 / len(gap.candidates)) / (1 - 1 / len(gap.candidates)))
+    columns = np.concatenate([gap.nuisance, *(c.jacobian for c in gap.candidates)], 1)
+    inner, pull = columns.T @ columns, columns.T @ gap.residual
+    out, z = {}, gap.nuisance.shape[1]
+    for effects in itertools.chain.from_iterable(itertools.combinations(range(4), k) for k in range(3)):
+        mine = [*range(z), *(z + j for j in effects)]
+        each = []
+        for at in itertools.product(range(grid.size), repeat=len(effects)):
+            prior = np.concatenate([np.ones(z), np.exp(grid[list(at)])])
+            h = inner[np.ix_(mine, mine)] + np.diag(prior)
+            value = 0.5 * pull[mine] @ np.linalg.solve(h, pull[mine]) - 0.5 * np.linalg.slogdet(h)[1]
+            each.append(value + 0.5 * np.log(prior).sum() + log_gamma[list(at)].sum())
+        out[effects] = float(np.logaddexp.reduce(each)) + len(effects) * odds
+    return out
+
+
+def test_sets_are_weighed_as_enumeration_does():
+    gap = gap_of({0: 1.5, 2: 0.8})
+    exact = enumerated(gap)
+    found = {m.effects: m.score for m in sought(forms(gap, Background.plain()))}
+    for effects, value in exact.items():
+        if value > max(exact.values()) - 8 and effects in found:
+            difference = (found[effects] - found[()]) - (value - exact[()])
+            assert abs(difference) < 0.35, (effects, difference)  # Laplace, of a Cauchy prior
+    total = np.logaddexp.reduce(list(exact.values()))
+    for j in range(4):
+        truth = sum(np.exp(v - total) for e, v in exact.items() if j in e)
+        models = sought(forms(gap, Background.plain()))
+        told = sum(w for m, w in zip(models, weights(models), strict=True) if j in m.effects)
+        assert told == pytest.approx(truth, abs=0.06)
+
+
+def test_invariance_is_the_random_effects_likelihood():
+    gap = gap_of({0: 2.0}, seed=3)
+    f: Forms = forms(gap, Background.plain())
+    model = next(m for m in sought(f) if m.effects == (0,))
+    found = invariance(f, model, 0, gap.rows.trial)
+    push, left = gap.candidates[0].jacobian[:, 0], None
+    left = gap.residual - gap.nuisance @ model.x[:1] - push * model.x[1]
+    size = 1.01 * model.x[1] ** 2 + 1e-12
+    score = np.zeros(WANDER.size)
+    for trial in range(4):
+        mine = gap.rows.trial == trial
+        for i, wander in enumerate(WANDER):
+            covariance = np.eye(mine.sum()) + wander**2 * size * np.outer(push[mine], push[mine])
+            score[i] += multivariate_normal(np.zeros(mine.sum()), covariance).logpdf(left[mine])
+    same, other = WANDER <= 0.1, WANDER >= 0.5
+    exact = (
+        np.logaddexp.reduce(score[same])
+        - np.log(same.sum())
+        - np.logaddexp.reduce(score[other])
+        + np.log(other.sum())
+    )
+    assert found.log_bayes_factor == pytest.approx(float(one - several), abs=1e-6)
+    assert found.log_bayes_factor > 1 and found.p_value > 0.01
+    np.testing.assert_allclose(found.estimates[:, 0], 2.0, atol=4 * np.nanmax(found.sds))
+
+
+def test_what_changes_sign_between_trials_is_no_cause():
+    rows = rows_of(samples=30)
+    push = np.ones(rows.time.size) * (rows.channel == 0)
+    sizes = np.array([3.0, -1.0, 2.5, 0.2])[rows.trial]
+    residual = np.random.default_rng(0).standard_normal(rows.time.size) + sizes * push
+    gap = Gap(rows, residual, np.zeros((rows.time.size, 0)), (linear("a", push[:, None]),))
+    f = forms(gap)
+    model = next(m for m in sought(f) if m.effects == (0,))
+    assert invariance(f, model, 0, rows.trial).log_bayes_factor < -3
+    assert attribute(gap, nested=False).verdict == "unknown"
+
+
+def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
+    values = np.array([statistic(forms(gap_of({}, seed=s))) for s in range(30)])
+    assert np.mean(np.exp(-np.maximum(values, 0)) < 0.05) <= 0.1
+    assert statistic(forms(gap_of({0: 3.0}))) > 20
+    assert detected(1e3).p_value == 0.0 and detected(-2.0).p_value == 1.0
+
+
+def test_twins_are_taken_until_the_answer_is_clear():
+    taken = []
+
+    def twins():
+        for k in range(100):
+            taken.append(k)
+            yield float(k % 2)
+
+    found = detected(0.5, twins())
+    assert len(taken) == 20 and found.p_value == pytest.approx(0.5)
+    rare = detected(5.0, [0.0] * 19)
+    assert rare.p_value == rare.resolution == pytest.approx(1 / 20)
+
+
+def test_a_planted_cell_is_the_one_listed():
+    rows = rows_of(samples=40)
+    left = np.random.default_rng(2).standard_normal(rows.time.size)
+    mine = (rows.trial == 1) & (rows.channel == 2) & (rows.part == 0)
+    left[np.flatnonzero(mine)[:3]] += 9.0
+    band = np.zeros(left.size, int)
+    (cell,) = significant(rows, band, left, np.ones(left.size))
+    assert (cell.trial, cell.channel, cell.part) == ("t1", "c2", "p0")
+    assert cell.share == pytest.approx(1.0) and cell.z > 5
+
+
+def test_one_effect_is_named_with_its_size_and_share():
+    found = attribute(gap_of({1: 3.0}))
+    assert found.verdict == "named" and found.causes == ("b",) and found.indistinguishable == ()
+    value = found.effects["b"].parameters["b0"]
+    assert value.mean == pytest.approx(3.0, abs=4 * value.sd) and found.effects["b"].probability > 0.95
+    assert found.effects["b"].share > 0.8 and found.remainder.share < 0.1 and found.remainder.p_value > 0.05
+    assert found.how_far is not None and found.how_far.fraction > 0.8
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert {(c.channel) for c in found.where} <= {"c0", "c1"}
+
+
+def test_two_effects_and_a_healthy_recording():
+    assert attribute(gap_of({0: 3.0, 2: 3.0}), nested=False).causes == ("a", "c")
+    healthy = attribute(gap_of({}, seed=5))
+    assert healthy.verdict == "none" and healthy.where == () and healthy.how_far is None
+
+
+def test_effects_that_nothing_tells_apart_are_a_set():
+    found = attribute(gap_of({0: 3.0}, same=True), nested=False)
+    assert found.verdict == "set" and {*found.causes, *found.indistinguishable} == {"a", "b"}
+
+
+def test_what_no_effect_explains_is_unknown_and_told_where():
+    rows = rows_of()
+    mine = (rows.channel == 0) & (rows.part == 1)
+    wave = 6 * np.sin(7 * rows.time) * mine
+    found = attribute(gap_of({}, seed=7, more=wave))
+    assert found.verdict == "unknown" and found.remainder.share > 0.5
+    leading = [c for c in found.where if c.share > 0.05]
+    assert leading and {(c.channel, c.part) for c in leading} == {("c0", "p1")}
+
+
+def test_a_gap_below_what_matters_is_none_and_told_with_its_size():
+    gap = gap_of({1: 3.0})
+    n = gap.residual.size
+    small = attribute(gap, tolerance=np.full(n, 10.0), nested=False)
+    assert small.verdict == "none" and small.small_gap is not None and 0 < small.small_gap.size < 1
+    assert attribute(gap, tolerance=np.full(n, 0.05), nested=False).verdict == "named"
+
+
+def test_a_noise_stated_too_low_is_no_gap():
+    gap = gap_of({}, seed=11)
+    louder = Gap(gap.rows, 1.25 * gap.residual, gap.nuisance, gap.candidates)
+    found = attribute(louder, nested=False)
+    assert found.verdict == "none"
+    assert np.mean(list(found.noise.values())) == pytest.approx(1.25, abs=0.15)
+
+
+def test_how_far_is_nested_and_covers_what_was_planted():
+    gap = gap_of({0: 4.0}, seed=4)
+    far = how_far(gap, np.ones(3))
+    push = gap.candidates[0].jacobian[:, 0] * 4.0
+    assert far is not None and far.noise_floor == 1.0
+    assert far.before - 1 == pytest.approx(float(push @ push) / gap.residual.size, rel=0.35)
+    assert far.interval_90[0] < far.fraction <= 1.0 and far.fraction > 0.85
