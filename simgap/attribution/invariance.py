@@ -67,9 +67,7 @@ def invariance(f: Forms, model: Model, effect: int, part: np.ndarray) -> Invaria
         sds[p, loose] = c.scale[loose] * np.sqrt(np.diag(covariance))
     weight_of = np.exp(score - np.logaddexp.reduce(score))
     same, other = (c.form >= WANDER), (OTHER <= WANDER)
-    factor = (np.logaddexp.reduce(score[same]) - np.log(same.sum())) - (
-        np.logaddexp.reduce(score[other]) - np.log(other.sum())
-    )
+    one, several = (np.logaddexp.reduce(score[k]) - np.log(k.sum()) for k in (same, other))
     freedom = (len(parts) - 1) * int(loose.sum())
     return Invariance(
         float(one - several), float(chi2.sf(far, freedom)), float(weight_of @ WANDER), estimates, sds
