@@ -24,9 +24,10 @@ from rich.console import Console
 
 import hmmseg
 from hmmseg.errors import InputError
+from hmmseg.io.formats import KINDS, kind_of, parts_of, split_part
 
 TrialsArgument = Annotated[list[Path], typer.Argument(
-    metavar="TRIAL...", help="Recordings (.csv, .parquet or .npz); several are pooled.")]  # fmt: skip
+    metavar="TRIAL...", help="Recordings (CSV, Parquet, NPZ, MCAP, ...); several are pooled.")]  # fmt: skip
 TaskArgument = Annotated[Path, typer.Argument(metavar="TASK", help="Task description (TOML).")]
 TaskOption = Annotated[Path, typer.Option("--task", metavar="T", help="Task description (TOML).")]
 RigOption = Annotated[Path, typer.Option("--rig", metavar="R", help="Nominal hand (TOML).")]
@@ -43,7 +44,7 @@ QuietOption = Annotated[bool, typer.Option(
     "--quiet", help="Print nothing but errors; warnings stand in the JSON.")]  # fmt: skip
 
 STANDARD_OUTPUT = "-"
-INPUT_SUFFIXES = (".csv", ".parquet", ".npz", ".toml")
+INPUT_SUFFIXES = (*KINDS, ".toml")
 
 
 class Output:
@@ -152,21 +153,43 @@ def _plain(value: Any) -> Any:
 
 
 def distinct_trials(paths: Sequence[Path]) -> list[Path]:
-    """The trials' paths; InputError where one trial is given twice, under two names even.
+    """The trials' paths, `FILE#NAME` for each recording of a file that holds several.
 
-    A trial pooled with itself would count its noise as independent evidence.
+    InputError where one trial is given twice, under two names even: pooled with itself it would
+    count its noise as independent evidence.
     """
     seen: dict[str, Path] = {}
-    for path in paths:
-        if not path.is_file():
-            problem = "is a folder" if path.is_dir() else "no such file"
-            raise InputError(str(path), problem, "a trial (.csv, .parquet or .npz)")
-        with path.open("rb") as file:
-            content = hashlib.file_digest(file, "sha256").hexdigest()
-        if content in seen:
-            raise InputError(str(path), f"the same trial as {seen[content]}", "every trial once")
-        seen[content] = path
-    return list(paths)
+    out: list[Path] = []
+    for given in paths:
+        file, part = split_part(given)
+        kind_of(file)
+        parts = [part] if part is not None else parts_of(given)
+        for name in parts or [None]:
+            path = given if name is None or name == part else given.with_name(f"{given.name}#{name}")
+            content = f"{_digest(file)}#{name or ''}"
+            if content in seen:
+                raise InputError(str(path), f"the same trial as {seen[content]}", "every trial once")
+            seen[content] = path
+            out.append(path)
+    return out
+
+
+def _digest(path: Path) -> str:
+    if path.is_dir():
+        return str(path.resolve())
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any = None) -> list[Any]:
+    """The trials of a command; what is unlikely about them is warned of."""
+    from hmmseg.io.trial import read_trial
+
+    found = [read_trial(path, rig, task) for path in paths]
+    for trial in found:
+        for warning in trial.warnings:
+            out.warn(warning)
+    return found
 
 
 def check_folder(option: str, folder: Path) -> None:

@@ -23,6 +23,7 @@ from hmmseg_cli.console import (
     TaskOption,
     TrialsArgument,
     distinct_trials,
+    read_trials,
 )
 
 EffectOption = Annotated[
@@ -124,14 +125,13 @@ def run(
 ) -> dict[str, Any]:
     """Diagnose, put table, figures and page where `out` has them go, and give the document."""
     from estimation.actual import read_actual
-    from hmmseg.io.trial import read_trial
     from simgap.effects import effect_named
     from simgap.gap.diagnose import STAGES
     from simgap.gap.diagnose import diagnose as find
 
     measured = None if actual is None else read_actual(actual, task.objects)
     forced = [effect_named(name).name for name in dict.fromkeys(effect)]
-    recordings = [read_trial(path, rig) for path in paths]
+    recordings = read_trials(out, paths, rig)
     bank = _own_bank(out, recordings, task, rig) if calibrate else None
     with out.progress("diagnosing", total=STAGES) as advance:
         found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1), bank)
@@ -155,7 +155,6 @@ def _against(
     out: Output, paths, against, task, rig_file, actual, effect: list[str], model_file: Path | None
 ) -> None:
     """The generic diagnosis, against given simulated trials."""
-    from hmmseg.io.trial import read_trial
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.diagnose import diagnose_blocks
 
@@ -172,13 +171,13 @@ def _against(
             if model_file is not None:
                 raise InputError(f"--model {model_file}", "goes only with a plain ordered task")
             hand = read_rig(rig_file)
-            read = [read_trial(path, hand) for path in every]
+            read = read_trials(out, every, hand)
             real, sim = read[: len(paths)], read[len(paths) :]
             found = diagnose_blocks(real, sim, task, hand, effect, out.seed, tell)
         else:
             from hmmseg.sequence.model import load_model
 
-            read = [read_trial(path, task=task) for path in every]
+            read = read_trials(out, every, task=task)
             learned = None if model_file is None else load_model(model_file, task)
             found = compare(read[: len(paths)], read[len(paths) :], task, learned, effect, out.seed, tell)
     for warning in found.warnings:

@@ -19,13 +19,14 @@ from hmmseg_cli.console import (
     TrialsArgument,
     check_file,
     distinct_trials,
+    read_trials,
 )
 
 LabelsOption = Annotated[Path | None, typer.Option(
     "--labels", metavar="DIR", help="Folder with NAME.json for some or all trials.")]  # fmt: skip
 ModelOption = Annotated[Path, typer.Option("--model", metavar="M.npz", help="Where the model is written.")]
 RigFile = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Accepted for symmetry; a plain ordered task needs none.")]  # fmt: skip
+    "--rig", metavar="R", help="Its [columns] or [topics], if the trials need them.")]  # fmt: skip
 
 
 def fit(
@@ -40,15 +41,15 @@ def fit(
         if not isinstance(description, SequenceTask):
             raise InputError(str(task), "a task of blocks needs no fitting: its emissions are physics",
                              "a task with `sequence`")  # fmt: skip
-        from hmmseg.io.trial import read_trial
         from hmmseg.sequence.fit import fit_sequence
         from hmmseg.sequence.model import save_model
 
+        hand = None
         if rig is not None:
             from hmmseg.io.rig import read_rig
 
-            read_rig(rig)
-        recordings = [read_trial(path, task=description) for path in paths]
+            hand = read_rig(rig)
+        recordings = read_trials(out, paths, hand, description)
         names = [trial.name for trial in recordings]
         known = {} if labels is None else read_label_folder(labels, names)
         learned = fit_sequence(recordings, description, known, seed)

@@ -24,6 +24,7 @@ from hmmseg_cli.console import (
     TaskOption,
     TrialsArgument,
     distinct_trials,
+    read_trials,
 )
 from hmmseg_cli.segment import warn_of_misfit
 
@@ -60,11 +61,10 @@ def run(
     from estimation.actual import read_actual
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
-    from hmmseg.io.trial import read_trial
 
     hand = read_rig(rig)
     measured = None if actual is None else read_actual(actual, description.objects)
-    recordings = [read_trial(path, hand) for path in paths]
+    recordings = read_trials(out, paths, hand)
     signals = [task_space(trial, hand) for trial in recordings]
     if method is Method.PAPER:
         body, segmentations, found = _paper(out, signals, recordings, description)

@@ -21,6 +21,7 @@ from hmmseg_cli.console import (
     TaskOption,
     TrialsArgument,
     distinct_trials,
+    read_trials,
 )
 
 
@@ -32,7 +33,7 @@ class Method(StrEnum):
 
 
 RigFile = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Nominal hand (TOML); a plain ordered task needs none.")]  # fmt: skip
+    "--rig", metavar="R", help="Nominal hand (TOML); a plain task needs only its [columns].")]  # fmt: skip
 ModelFile = Annotated[Path | None, typer.Option(
     "--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit.")]  # fmt: skip
 ForceThreshold = Annotated[float, typer.Option(
@@ -52,7 +53,7 @@ def segment(
         paths = distinct_trials(trials)
         description = read_task(task)
         if isinstance(description, SequenceTask):
-            found = _segment_sequence(out, paths, description, model, method, seed)
+            found = _segment_sequence(out, paths, description, rig, model, method, seed)
         else:
             if rig is None:
                 raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
@@ -71,11 +72,10 @@ def _segment_blocks(
 ) -> list[Segmentation]:
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
-    from hmmseg.io.trial import read_trial
     from hmmseg.segmentation.thresholds import segment_qualitative
 
     rig = read_rig(rig_file)
-    recordings = [read_trial(path, rig) for path in paths]
+    recordings = read_trials(out, paths, rig)
     signals = [task_space(trial, rig) for trial in recordings]
     if method is Method.QUALITATIVE:
         pairs = zip(recordings, signals, strict=True)
@@ -88,25 +88,27 @@ def _segment_blocks(
         from hmmseg_cli.figures.signals import draw_signals
 
         for trial, s, segmentation in zip(recordings, signals, found, strict=True):
-            draw_signals(s, segmentation, out.figure(f"{Path(trial.name).stem}_segments.png"))
+            draw_signals(s, segmentation, out.figure(f"{trial.stem}_segments.png"))
     return found
 
 
-def _segment_sequence(out: Output, paths, task: SequenceTask, model_file, method: Method, seed: int):
-    from hmmseg.io.trial import read_trial
+def _segment_sequence(
+    out: Output, paths, task: SequenceTask, rig_file, model_file, method: Method, seed: int
+) -> list[Segmentation]:
+    from hmmseg.io.rig import read_rig
     from hmmseg.sequence.model import load_model
     from hmmseg.sequence.segment import segment_sequence
 
     if method is Method.QUALITATIVE:
         raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
-    recordings = [read_trial(path, task=task) for path in paths]
+    recordings = read_trials(out, paths, None if rig_file is None else read_rig(rig_file), task)
     learned = None if model_file is None else load_model(model_file, task)
     found = segment_sequence(recordings, task, learned, seed)
     if out.figures is not None:
         from hmmseg_cli.figures.channels import draw_channels
 
         for trial, segmentation in zip(recordings, found, strict=True):
-            draw_channels(trial, segmentation, out.figure(f"{Path(trial.name).stem}_segments.png"))
+            draw_channels(trial, segmentation, out.figure(f"{trial.stem}_segments.png"))
     return found
 
 

@@ -19,6 +19,7 @@ from hmmseg_cli.console import (
     SeedOption,
     TaskOption,
     check_folder,
+    read_trials,
 )
 
 
@@ -132,13 +133,13 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     import numpy as np
 
     from hmmseg.contact.decompose import subtasks
-    from hmmseg.io.trial import Trial, read_trial
+    from hmmseg.io.trial import Trial
     from hmmseg.segmentation.align import segment
     from simgap.world.animation import Scene, Trace
     from simgap.world.replay import replay, residual_summary
     from simgap.world.writing import trial_files
 
-    recording = read_trial(path, rig)
+    recording = read_trials(out, [path], rig)[0]
     segmentation = segment([recording], task, rig)[0]
     if segmentation.failed is not None:
         out.warn(f"{recording.file}: {segmentation.failed}")

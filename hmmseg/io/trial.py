@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ class Trial:
     """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
 
     `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
-    channels of a log, the samples that lie between two messages.
+    channels of a log, the samples that lie between two messages; `warnings` say what is unlikely.
     """
 
     file: str
@@ -38,6 +38,7 @@ class Trial:
     channels: dict[str, np.ndarray]
     origin: int | None = None
     interpolated: dict[str, np.ndarray] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     @property
     def rate(self) -> float:
@@ -49,13 +50,20 @@ class Trial:
         """The file's name without its folder."""
         return Path(self.file).name
 
+    @property
+    def stem(self) -> str:
+        """The name without its ending; `demos_demo_3` of `demos.hdf5#demo_3`."""
+        name, _, part = self.name.partition("#")
+        return Path(name).stem + f"_{part}" * bool(part)
+
 
 def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceTask | None = None) -> Trial:
     """Trial from a file, a pandas or polars DataFrame or a dict of arrays; InputError says where it fails.
 
     The channels kept are the rig's (joint space, Cartesian or a gripper's), or for a plain ordered
     task the ones it names (every column but `t` otherwise), taken from the columns or messages
-    that the rig's `[columns]` or `[topics]` map to them.
+    that the rig's `[columns]` or `[topics]` map to them. A hand's recording that cannot be as it is
+    (other units, flipped signs, swapped fingers) is refused with what to write into the rig.
     """
     if task is None and rig is None:
         raise ValueError("a block task's trial needs its rig")
@@ -85,7 +93,12 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
-    return Trial(table.file, t, channels, origin, between)
+    trial = Trial(table.file, t, channels, origin, between)
+    if task is not None or rig is None or rig.gripper is not None:
+        return trial
+    from hmmseg.hand.plausibility import check  # which reads trials itself
+
+    return replace(trial, warnings=check(trial, rig))
 
 
 def _channels(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:

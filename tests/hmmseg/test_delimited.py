@@ -82,7 +82,7 @@ def test_only_wanted_columns_are_read(tmp_path):
 
 REFUSED = [
     (written(";", ",").replace("1234,5", "1234.5"),
-     r"row 2, column f: 1234.5 has a decimal point, others decimal commas; expected one kind"),
+     r"row 2, column f: 1234.5 has a decimal point, others have commas; expected one kind"),
     (written(";", ",").replace("1234,5", "1.234,5"), r"row 2, column f: 1.234,5 has a decimal point"),
     (written(before=["# one", "# two"], comment_after=3).replace("0.2,", "0.2.1,", 1),
      r"row 9, column t: 0.2.1 is not a finite number"),

@@ -22,7 +22,7 @@ PLAIN = SequenceTask(("a", "b"))
 
 
 def table(channels=JOINT_CHANNELS, samples=12) -> pd.DataFrame:
-    values = np.random.default_rng(0).normal(size=(samples, len(channels))).round(6)
+    values = np.random.default_rng(0).normal(scale=0.1, size=(samples, len(channels))).round(6)
     frame = pd.DataFrame(values, columns=list(channels))
     frame.insert(0, "t", np.arange(samples) * 0.05)
     return frame
@@ -248,14 +248,14 @@ def test_cartesian_velocities_given_or_derived():
     np.testing.assert_array_equal(given.vx1, frame["vx1"])
     assert given.sd_vx == pytest.approx(np.full(200, 0.01))
     t = frame["t"].to_numpy()
-    frame["x1"], frame["x2"] = t**2, t**2 + 1
+    frame["x1"], frame["x2"] = t**2 / 100, t**2 / 100 + 0.1
     frame.loc[7, "x1"] = np.nan
     derived = task_space(
         read_trial(frame.drop(columns=["vx1", "vy2"]).assign(vx2=np.nan), CARTESIAN), CARTESIAN
     )
     assert np.isnan(derived.vx1[7])
-    np.testing.assert_allclose(np.delete(derived.vx1, 7)[1:-1], 2 * np.delete(t, 7)[1:-1], atol=1e-12)
-    np.testing.assert_allclose(derived.vx2[1:-1], 2 * t[1:-1], atol=1e-12)
+    np.testing.assert_allclose(np.delete(derived.vx1, 7)[1:-1], np.delete(t, 7)[1:-1] / 50, atol=1e-12)
+    np.testing.assert_allclose(derived.vx2[1:-1], t[1:-1] / 50, atol=1e-12)
     np.testing.assert_array_equal(derived.vy1, frame["vy1"])
 
 

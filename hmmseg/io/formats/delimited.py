@@ -76,7 +76,7 @@ def _no_points(columns: dict[str, np.ndarray], rows: np.ndarray, where: str) -> 
         for i, cell in enumerate(values):
             if isinstance(cell, str) and "." in cell and NUMBER.fullmatch(cell.replace(",", "").strip()):
                 raise InputError(f"{where}: row {rows[i]}, column {name}",
-                                 f"{cell} has a decimal point, others decimal commas", "one kind")  # fmt: skip
+                                 f"{cell} has a decimal point, others have commas", "one kind")  # fmt: skip
 
 
 def find_layout(path: Path) -> Layout:

@@ -1,0 +1,174 @@
+"""What two fingers cannot do: hold a block from the wrong sides, or carry it with the wrong signs.
+
+Fingers that hold something press towards each other, finger 1 from the left; what is carried up
+weighs on them. Forces are what a fingertip exerts on the block, so a grip has fx1 > 0 and
+fx2 < 0, and a carry fy1 + fy2 > 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.hand.signals import task_space
+from hmmseg.io.plausibility import Finding, entry, written
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+
+ALL = 0.95  # share of the samples that must agree
+MOST = 0.75  # the same where a hold goes on after its block has been put down
+LIFTED = 0.005  # [m]
+FINGERS = (("x", "y", "vx", "vy", "fx", "fy"), ("q{}1", "q{}2", "dq{}1", "dq{}2", "fx{}", "fy{}"))
+BRIEF = 5  # samples: a shorter touch holds nothing
+
+
+@dataclass(frozen=True)
+class Holds:
+    """Samples (num_timesteps,) in which the fingers press, how high the hand is above each hold's
+    first sample [m], and which samples come before the first touch; whether each hold that moves
+    the hand goes up first.
+    """
+
+    pressed: np.ndarray
+    height: np.ndarray
+    before: np.ndarray
+    rises: tuple[bool, ...]
+
+
+def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
+    """Swapped fingers, flipped signs, and weight that is not the block's."""
+    signals = task_space(trial, rig)
+    squeeze, common = (signals.fx1 - signals.fx2) / 2, (signals.fx1 + signals.fx2) / 2
+    there = (
+        np.isfinite(squeeze)
+        & np.isfinite(signals.distance)
+        & np.isfinite(signals.y)
+        & np.isfinite(signals.fy)
+    )
+    if there.sum() < 4 * BRIEF:
+        return []
+    load = signals.fy[there]
+    same = _pushing_alike(common[there], squeeze[there], load)
+    if same is not None:
+        finger = 2 if same > 0 else 1
+        problem = "fx1 and fx2 push the same way all along, a grip pushes from both sides"
+        return [Finding(f"fx{finger}", problem, written(entry(f"fx{finger}", rig, sign=-1)))]
+    holds = find_holds(squeeze[there], signals.y[there])
+    if holds is None:
+        return []
+    apart = _agreed(signals.distance[there][holds.pressed])
+    towards = _agreed(squeeze[there][holds.pressed])
+    lifts = holds.pressed & (holds.height > LIFTED)
+    idle = float(np.median(load[holds.before])) if holds.before.sum() >= BRIEF else 0.0
+    carried = _agreed(load[lifts] - idle, MOST) if lifts.sum() >= BRIEF else 0
+    found = _sides(apart, towards, carried, trial, rig)
+    found = found or _downwards(holds, load, rig)
+    if found or lifts.sum() < BRIEF:
+        return found
+    grip = float(np.median(np.abs(squeeze[there][holds.pressed])))
+    return _own_weight(idle, float(np.median(load[lifts])) - idle, grip, rig)
+
+
+def _sides(apart: int, towards: int, carried: int, trial: Trial, rig: Rig) -> list[Finding]:
+    """From the signs of x2 - x1 and fx1 - fx2 in a hold and of the load in a lift (0: unclear)."""
+    if apart < 0 and towards < 0:
+        problem = "finger 1 holds from the right, finger 2 from the left: the fingers are swapped"
+        return [Finding("x1", problem, written(*_exchanged(rig)))]
+    if apart > 0 and towards < 0:
+        if carried < 0:
+            problem = "is negative in a grip and fy1 + fy2 in a lift: forces on the finger, not by it"
+            entries = [entry(name, rig, sign=-1) for name in ("fx1", "fy1", "fx2", "fy2")]
+        else:
+            problem = "is negative and fx2 positive in a grip: their signs are flipped"
+            entries = [entry(name, rig, sign=-1) for name in ("fx1", "fx2")]
+        return [Finding("fx1", problem, written(*entries))]
+    if apart < 0 and towards > 0 and not rig.jointed:
+        problem = "is right of x2 in a grip, but fx1 pushes to the right: positions swapped or x flipped"
+        entries = [entry(name, rig, sign=-1) for name in ("x1", "vx1", "x2", "vx2") if name in trial.channels]
+        return [Finding("x1", problem, written(*entries))]
+    if apart > 0 and towards > 0 and carried < 0:
+        problem = "and fy2 are negative in sum while a block is lifted: their signs are flipped"
+        return [Finding("fy1", problem, written(*(entry(name, rig, sign=-1) for name in ("fy1", "fy2"))))]
+    return []
+
+
+def _downwards(holds: Holds, load: np.ndarray, rig: Rig) -> list[Finding]:
+    """Holds that all go down first, through what the block stands on: y points down."""
+    if any(holds.rises) or not holds.rises or rig.jointed:
+        return []
+    low = holds.pressed & (holds.height < -LIFTED)
+    changes = [entry(name, rig, sign=-1) for name in ("y1", "y2", "fy1", "fy2")]
+    if float(np.median(load[low])) > 0:
+        changes = changes[:2]
+    problem = (
+        "every hold first goes down from where it began, through what the block stands on: y points down"
+    )
+    return [Finding("y1", problem, written(*changes), certain=False)]
+
+
+def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Finding]:
+    """A load in free motion [N] beside what a lift adds: the hand's own weight, or no zero taken.
+
+    Smaller ones are a bias, which is estimated.
+    """
+    if abs(idle) < max(abs(lifted), 0.1 * grip):
+        return []
+    problem = (
+        f"and fy2 sum to {idle:.3g} N before the first touch, a lift adds {lifted:.3g} N: gravity or "
+        "an offset is still in the forces"
+    )
+    entries = [entry(name, rig, offset=round(-idle / 2, 4)) for name in ("fy1", "fy2")]
+    return [Finding("fy1", problem, written(*entries), certain=False)]
+
+
+def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
+    """Runs of samples with at least half the usual grip; None where nothing is ever held."""
+    scale = float(np.quantile(np.abs(squeeze), 0.95))
+    noise = 1.4826 * float(np.median(np.abs(np.diff(squeeze)))) / np.sqrt(2)
+    if scale == 0 or scale < 10 * noise:
+        return None
+    pressed = np.abs(squeeze) > scale / 2
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], pressed.astype(int), [0]])))
+    height, rises = np.zeros(y.size), []
+    kept = np.zeros(y.size, dtype=bool)
+    for start, end in edges.reshape(-1, 2):
+        if end - start >= BRIEF:
+            kept[start:end] = True
+            height[start:end] = y[start:end] - y[start]
+            moved = height[start:end][np.abs(height[start:end]) > LIFTED]
+            rises += [bool(moved[0] > 0)] if moved.size else []
+    if not kept.any():
+        return None
+    touched = int(np.flatnonzero(np.abs(squeeze) > scale / 10)[0])
+    return Holds(kept, height, np.arange(y.size) < touched, tuple(rises))
+
+
+def _pushing_alike(common: np.ndarray, squeeze: np.ndarray, load: np.ndarray) -> int | None:
+    """Sign of both fx where they push the same way as strongly and as long as a grip would."""
+    scale = float(np.quantile(np.abs(common), 0.95))
+    noise = 1.4826 * float(np.median(np.abs(np.diff(common)))) / np.sqrt(2)
+    strong = np.abs(common) > scale / 2
+    if scale < max(10 * noise, 3 * float(np.quantile(np.abs(squeeze), 0.95))):
+        return None
+    if scale < 0.25 * float(np.quantile(np.abs(load), 0.95)) or not 0.1 < strong.mean() < ALL:
+        return None  # too weak to hold, a touch, or no grip that begins and ends
+    return _agreed(common[strong]) or None
+
+
+def _agreed(values: np.ndarray, share: float = ALL) -> int:
+    """The sign that so many samples have, 0 where they disagree."""
+    positive = float((values > 0).mean())
+    return 1 if positive >= share else -1 if positive <= 1 - share else 0
+
+
+def _exchanged(rig: Rig) -> list[str]:
+    stems = FINGERS[1] if rig.jointed else tuple(f"{stem}{{}}" for stem in FINGERS[0])
+    out = []
+    for stem in stems:
+        for ours, theirs in (("1", "2"), ("2", "1")):
+            name, other = stem.format(ours), stem.format(theirs)
+            mapped = rig.columns.get(other)
+            source = other if mapped is None or mapped.source is None else mapped.source
+            out.append(f'{name} = "{source}"')
+    return out

@@ -1,0 +1,156 @@
+"""What a recording cannot be: times, lengths and angles in other units than stated.
+
+Recognised by what a hand can do: it is sampled from a few Hz to some 20 kHz, travels less than
+3 m, its links do not wind twice around, and its velocities are the derivatives of its positions.
+Nothing is guessed: a finding says in one line what to write into `rig.toml`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+
+SLOWEST = 2.0  # [Hz]; hands are recorded at 10 Hz at least
+REACH = 3.0  # [m]
+STILL = 2e-4  # [m]: travel of a hand that moved nothing
+WINDING = 4 * np.pi  # [rad]
+YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9  # [s] since 1970
+SAME = 0.15  # relative: a factor of 1000 or 57.3 is told apart from 1 by far more
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that cannot be, or is unlikely: where, what, and what to write; `certain` refuses."""
+
+    channel: str
+    problem: str
+    remedy: str
+    certain: bool = True
+
+
+def entry(channel: str, rig: Rig | None, **change: object) -> str:
+    """The `[columns]` entry of rig.toml that reads a channel so."""
+    mapped = None if rig is None else rig.columns.get(channel)
+    source = channel if mapped is None or mapped.source is None else mapped.source
+    said = {"from": source, **change}
+    inner = ", ".join(f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in said.items())
+    return f"{channel} = {{{inner}}}"
+
+
+def written(*entries: str) -> str:
+    """What to write where."""
+    return f"{', '.join(entries)} under [columns] in rig.toml"
+
+
+def check_clock(trial: Trial, rig: Rig | None) -> list[Finding]:
+    """Times in ms, us or ns: by `rate` of the rig, or because no hand is sampled so slowly."""
+    period = float(np.median(np.diff(trial.t)))
+    stated = None if rig is None else rig.rate
+    unit = None
+    for name, size in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
+        if stated is not None and 0.5 < period * size * stated < 2:
+            unit = name
+    if unit is None and period > 1 / SLOWEST:
+        unit = "ms" if period < 500 else "us" if period < 5e5 else "ns"
+    if unit is not None:
+        problem = f"is sampled at {1 / period:.2g} Hz if it is in s"
+        if stated is not None:
+            problem += f", but rate = {stated:g} in rig.toml"
+        return [Finding("t", f"{problem}: it looks like {unit}", written(entry("t", rig, unit=unit)))]
+    if YEAR_1990 < trial.t[0] < YEAR_2100:
+        date = np.datetime64(int(trial.t[0]), "s")
+        problem = f"counts seconds since 1970 (from {date}), and so will all results"
+        remedy = written(entry("t", rig, offset=-float(np.floor(trial.t[0]))))
+        return [Finding("t", problem, f"for times from 0, {remedy}", certain=False)]
+    return []
+
+
+def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
+    """Positions in mm or cm (no hand travels so far), or far too small."""
+    travels = {
+        name: float(np.nanmax(values) - np.nanmin(values))
+        for name, values in trial.channels.items() if name in ("x1", "y1", "x2", "y2")
+    }  # fmt: skip
+    far = {name: travel for name, travel in travels.items() if travel > REACH}
+    if far:
+        name, travel = max(far.items(), key=lambda item: item[1])
+        unit = "cm" if travel < 30 else "mm" if travel < 5e3 else "um"
+        other = ' (or "cm")' if unit == "mm" and travel < 100 else ""
+        entries = [entry(each, rig, unit=unit) for each in travels if each in far]
+        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {unit}{other}"
+        return [Finding(name, problem, written(*entries))]
+    if travels and max(travels.values()) < STILL:
+        problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were not in m"
+        return [Finding("x1", problem, written(entry("x1", rig, unit="...")), certain=False)]
+    return []
+
+
+def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
+    """Joint angles in degrees: no link winds twice around."""
+    joints = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
+    widest = {name: float(np.nanmax(np.abs(trial.channels[name]))) for name in joints}
+    wound = {name: value for name, value in widest.items() if value > WINDING}
+    if not wound:
+        return []
+    name, value = max(wound.items(), key=lambda item: item[1])
+    unit = "deg" if value < 3600 else "mrad"
+    entries = [entry(each, rig, unit=unit) for each in joints]
+    entries += [
+        entry(f"d{each}", rig, unit=f"{unit}/s")
+        for each in joints if abs(_slope(trial, each, f"d{each}") - 1) < SAME
+    ]  # fmt: skip
+    problem = f"reaches {value:.4g} rad, {value / 2 / np.pi:.0f} turns of a link: it looks like {unit}"
+    return [Finding(name, problem, written(*entries))]
+
+
+def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
+    """Velocities that are the positions' derivatives times a factor of units, or with the other sign."""
+    factors = {"q": ((180 / np.pi, "deg/s"), (1e3, "mrad/s")), "x": ((1e3, "mm/s"), (1e2, "cm/s"))}
+    found: dict[str, tuple[float, dict[str, object]]] = {}
+    for position, velocity in _pairs(trial):
+        slope = _slope(trial, position, velocity)
+        for factor, unit in factors["q" if position[0] == "q" else "x"]:
+            if abs(slope / factor - 1) < SAME:
+                found[velocity] = slope, {"unit": unit}
+        if abs(slope + 1) < SAME:
+            found[velocity] = slope, {"sign": -1}
+    if not found:
+        return []
+    name, (slope, _) = next(iter(found.items()))
+    entries = [entry(each, rig, **what) for each, (_, what) in found.items()]
+    told = f"is {slope:.3g} times what {name.removeprefix('d').removeprefix('v')} changes by"
+    return [Finding(name, told, written(*entries))]
+
+
+def _pairs(trial: Trial) -> list[tuple[str, str]]:
+    named = [(f"q{i}{j}", f"dq{i}{j}") for i in "12" for j in "12"]
+    named += [(f"{axis}{i}", f"v{axis}{i}") for i in "12" for axis in "xy"]
+    return [pair for pair in named if all(name in trial.channels for name in pair)]
+
+
+def _slope(trial: Trial, position: str, velocity: str) -> float:
+    """What integrated velocity is to displacement over windows in which the hand moves; nan if unclear.
+
+    Windows make noise small beside displacement, as a difference of neighbours does not.
+    """
+    q, v, t = trial.channels[position], trial.channels[velocity], trial.t
+    there = np.isfinite(q) & np.isfinite(v)
+    q, v, t = q[there], v[there], t[there]
+    if t.size < 20:
+        return np.nan
+    width = max(2, t.size // 50)
+    integral = np.concatenate([[0.0], np.cumsum(np.diff(t) * (v[1:] + v[:-1]) / 2)])
+    moved, swept = q[width:] - q[:-width], integral[width:] - integral[:-width]
+    far = np.abs(moved) >= np.quantile(np.abs(moved), 0.8)
+    moved, swept = moved[far], swept[far]
+    noise = 1.5 * np.median(np.abs(np.diff(q)))
+    norm = float(np.sqrt((moved**2).sum() * (swept**2).sum()))
+    if norm == 0 or np.median(np.abs(moved)) < 5 * noise / np.sqrt(width):
+        return np.nan
+    if abs(float((moved * swept).sum())) < 0.9 * norm:
+        return np.nan
+    return float((moved * swept).sum() / (moved**2).sum())
