@@ -11,7 +11,7 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.columns import Column, source_of
-from hmmseg.io.formats import read_table
+from hmmseg.io.formats import LOGS, kind_of, read_table, split_part
 from hmmseg.io.frames import frame_table
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
@@ -68,13 +68,11 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     if task is None and rig is None:
         raise ValueError("a block task's trial needs its rig")
     names, optional = _channels(rig, task)
-    log = isinstance(source, str | Path) and Path(source).suffix.lower() in (".mcap", ".bag", ".db3")
+    log = isinstance(source, str | Path) and kind_of(split_part(source)[0]) in LOGS
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if log else rig.columns)
     theirs = None if names is None else [source_of(name, columns) for name in ("t", *names)]
     read = read_table if isinstance(source, str | Path) else frame_table
     table = read(source, theirs)
-    if table.messages and rig is not None:  # a folder of messages
-        columns = rig.topics
     _check_names(table, columns, names, optional, task is not None)
     stamps, origin = times(table, source_of("t", columns))
     t = _mapped(stamps, "t", columns, table)
@@ -123,9 +121,10 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
     for name in table.names:
         if table.names.count(name) > 1:
             raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
+    tables = "[topics]" if table.messages else "[columns]"
     for ours in columns:
         if names is not None and ours not in ("t", *names):
-            raise InputError(f"{where}: [columns] {ours}", "is no channel of this hand or task",
+            raise InputError(f"{where}: {tables} {ours}", "is no channel of this hand or task",
                              nearest(ours, ("t", *names)))  # fmt: skip
     for ours in ("t", *(names or ())):
         theirs = source_of(ours, columns)

@@ -23,6 +23,7 @@ KINDS = {
 EXTRAS = {"parquet": "parquet", "lerobot": "parquet", "hdf5": "hdf5", "mcap": "mcap", "bag": "bag"}
 NEEDED = {"parquet": ("pyarrow",), "lerobot": ("pyarrow",), "hdf5": ("h5py",),
           "mcap": ("mcap", "mcap_ros2"), "bag": ("rosbags",)}  # fmt: skip
+LOGS = ("mcap", "bag")  # made of messages: `[topics]` maps them
 A_TRIAL = "a trial (.csv, .tsv, .parquet, .npz, .mcap, .bag, .hdf5 or a data set's folder)"
 
 

@@ -1,0 +1,86 @@
+"""HDF5 in robomimic's layout, `data/demo_0/obs/...`, or with columns at the top; read with h5py.
+
+A column's name is its path below the demonstration, `obs/robot0_eef_pos[0]`. Robomimic stores no
+times: `t` is made from `control_freq` in the file's `env_args` where it stands there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from hmmseg.errors import InputError
+from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
+
+MAX_WIDTH = 64  # numbers a row: images are no channels
+
+
+def parts(path: Path) -> list[str]:
+    """Names of the demonstrations; none where the file is one recording."""
+    with h5py.File(path, "r") as file:
+        data = file.get("data")
+        if not isinstance(data, h5py.Group):
+            return []
+        names = [name for name in data if isinstance(data.get(name), h5py.Group)]
+    return sorted(names, key=lambda name: (len(name), name))
+
+
+def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
+    """Table of one demonstration, or of the file's own columns."""
+    found = parts(path)
+    if part is None and len(found) > 1:
+        raise InputError(
+            str(path), f"holds {len(found)} recordings", f"{path.name}#{found[0]} for one of them"
+        )
+    if part is not None and part not in found:
+        raise InputError(f"{path}#{part}", "no such recording", ", ".join(found[:5]) or "no #")
+    with h5py.File(path, "r") as file:
+        group = file if not found else file[f"data/{part or found[0]}"]
+        datasets = dict(_datasets(group, "", 0))
+        chosen = {
+            name: each for name, each in datasets.items()
+            if wanted is None or name in wanted or any(w.startswith(f"{name}[") for w in wanted)
+        }  # fmt: skip
+        columns = flat({name: each[()] for name, each in chosen.items()})
+        rate = _control_rate(file)
+        length = next((each.shape[0] for each in datasets.values()), 0)
+    if wanted is not None:
+        columns = {name: values for name, values in columns.items() if name in wanted}
+    rest = [name for name in datasets if name not in chosen]
+    if rate is not None and "t" not in datasets and (wanted is None or "t" in wanted):
+        columns = {"t": np.arange(length) / rate, **columns}
+    return plain_table(f"{path}#{part}" if part else str(path), columns, [*columns, *rest])
+
+
+def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str, h5py.Dataset]]:
+    """Numbers by name, one row a sample; links to other files are not followed."""
+    for name in group:
+        if isinstance(group.get(name, getlink=True), h5py.ExternalLink) or depth > 4:
+            continue
+        entry = group.get(name)
+        if isinstance(entry, h5py.Group):
+            yield from _datasets(entry, f"{prefix}{name}/", depth + 1)
+        elif isinstance(entry, h5py.Dataset) and entry.dtype.kind in "fiu" and entry.ndim:
+            width = int(np.prod(entry.shape[1:]))
+            if (
+                entry.shape[0] <= MAX_ROWS
+                and width <= MAX_WIDTH
+                and not entry.is_virtual
+                and not entry.external
+            ):
+                yield f"{prefix}{name}", entry
+
+
+def _control_rate(file: h5py.File) -> float | None:
+    """Samples a second, from robomimic's `env_args`."""
+    data = file.get("data")
+    text = None if data is None else data.attrs.get("env_args")
+    try:
+        rate = float(json.loads(text)["env_kwargs"]["control_freq"])
+    except (TypeError, ValueError, KeyError):
+        return None
+    return rate if rate > 0 and np.isfinite(rate) else None

@@ -1,0 +1,161 @@
+"""Every kind of file against the recording planted in it; files cut, mislabelled or of no kind."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from file_writers import (
+    FAST,
+    SLOW,
+    START,
+    force,
+    height,
+    joint,
+    write_bag,
+    write_lerobot,
+    write_mcap,
+    write_robomimic,
+)
+
+from hmmseg.errors import InputError
+from hmmseg.io.formats import kind_of, parts_of, read_table, split_part
+from hmmseg.io.formats.messages import interpolated
+from hmmseg.io.rig import parse_rig
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import read_trial
+
+TOPICS = parse_rig({"topics": {
+    "push": {"from": "/wrench.wrench.force.x", "sign": -1},
+    "angle": {"from": "/joints.position.b", "unit": "rad"},
+    "height": "/pose.pose.position.z",
+}})  # fmt: skip
+LOGGED = SequenceTask(("a", "b"), channels=("push", "angle", "height"))
+LOGS = {
+    "mcap": lambda folder: write_mcap(folder / "log.mcap"),
+    "ROS 1 bag": lambda folder: write_bag(folder / "log.bag"),
+    "ROS 2 bag": lambda folder: write_bag(folder / "log"),
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_logs_are_joined_on_the_fastest_wanted_clock(tmp_path, kind):
+    trial = read_trial(LOGS[kind](tmp_path), TOPICS, LOGGED)
+    np.testing.assert_allclose(trial.t, FAST * 1e-9, atol=1e-9)
+    assert trial.origin == START + FAST[0]  # stamps of the headers, not times of logging
+    np.testing.assert_allclose(trial.channels["push"], -force(FAST), rtol=1e-12)
+    inside = SLOW[-1] >= FAST
+    for name, planted in (("angle", joint), ("height", height)):
+        np.testing.assert_allclose(trial.channels[name][inside], planted(FAST[inside]), rtol=1e-9)
+        assert np.isnan(trial.channels[name][~inside]).all()
+        np.testing.assert_array_equal(trial.interpolated[name], inside & ~np.isin(FAST, SLOW))
+    assert "push" not in trial.interpolated
+
+
+def test_without_a_stamp_everywhere_times_of_logging_are_taken(tmp_path):
+    rig = parse_rig(
+        {"topics": {"f": "/wrench.wrench.force.x", "w": "/opening.data", "z": "/pose.pose.position.z"}}
+    )
+    trial = read_trial(write_mcap(tmp_path / "a.mcap"), rig, SequenceTask(("a",), channels=("f", "w", "z")))
+    assert trial.origin == START + 300_000
+    np.testing.assert_allclose(trial.channels["w"], 0.06)
+
+
+def test_a_gap_of_a_topic_stays_a_gap(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", gap=(500_000_000, 900_000_000))
+    trial = read_trial(path, TOPICS, LOGGED)
+    missing = np.isnan(trial.channels["height"])
+    low, high = SLOW[SLOW < 500_000_000][-1], SLOW[SLOW >= 900_000_000][0]
+    np.testing.assert_array_equal(missing, ((low < FAST) & (high > FAST)) | (SLOW[-1] < FAST))
+
+
+def test_interpolation_by_hand():
+    ticks = np.array([0, 5, 10, 15, 20, 100, 110])
+    values, marked = interpolated(ticks, np.array([0, 10, 20, 110]), np.array([0.0, 1.0, 4.0, 5.0]))
+    np.testing.assert_allclose(values, [0.0, 0.5, 1.0, 2.5, 4.0, np.nan, 5.0])
+    assert marked.tolist() == [False, True, False, True, False, False, False]
+
+
+def test_all_columns_of_a_log_have_names(tmp_path):
+    table = read_table(write_mcap(tmp_path / "a.mcap"))
+    assert {"t", "/wrench.wrench.torque.z", "/joints.velocity.a", "/pose.pose.orientation.w",
+            "/opening.data"} <= set(table.names)  # fmt: skip
+
+
+def test_robomimic_demonstrations(tmp_path):
+    path = write_robomimic(tmp_path / "demos.hdf5")
+    assert parts_of(path) == ["demo_0", "demo_1"]
+    rig = parse_rig({"columns": {"z": "obs/robot0_eef_pos[2]", "x": "obs/robot0_eef_pos[0]"}})
+    trial = read_trial(f"{path}#demo_1", rig, SequenceTask(("a",), channels=("x", "z")))
+    assert (trial.rate, trial.stem) == (pytest.approx(20.0), "demos_demo_1")
+    np.testing.assert_allclose(trial.channels["x"], np.arange(50) * 0.01)
+    np.testing.assert_array_equal(trial.channels["z"], 1.0)
+    assert not any("image" in name for name in read_table(f"{path}#demo_0").names)
+    with pytest.raises(
+        InputError, match=r"demos\.hdf5: holds 2 recordings; expected demos.hdf5#demo_0 for one"
+    ):
+        read_table(path)
+    with pytest.raises(InputError, match=r"demos\.hdf5#demo_7: no such recording; expected demo_0, demo_1"):
+        read_table(f"{path}#demo_7")
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_lerobot_episodes(tmp_path, version):
+    folder = write_lerobot(tmp_path / "set", version)
+    assert parts_of(folder) == ["0", "1", "2"]
+    rig = parse_rig({"columns": {"t": "timestamp", "x": "observation.state.right_x"}})
+    trial = read_trial(f"{folder}#2", rig, SequenceTask(("a",), channels=("x", "action.b")))
+    np.testing.assert_allclose(trial.t, np.arange(60) / 50, atol=1e-6)
+    np.testing.assert_array_equal(trial.channels["x"], np.arange(60) * 2 + 3)
+    np.testing.assert_array_equal(trial.channels["action.b"], 1.0)
+
+
+def test_wide_columns_of_parquet_and_npz(tmp_path):
+    wide = np.arange(30.0).reshape(10, 3)
+    np.savez(tmp_path / "a.npz", t=np.arange(10) * 0.1, pose=wide)
+    column = pa.FixedSizeListArray.from_arrays(pa.array(wide.ravel()), 3)
+    pq.write_table(pa.table({"t": np.arange(10) * 0.1, "pose": column}), tmp_path / "a.parquet")
+    for name in ("a.npz", "a.parquet"):
+        table = read_table(tmp_path / name, ["t", "pose[2]"])
+        assert list(table.columns) == ["t", "pose[2]"]
+        np.testing.assert_array_equal(table.columns["pose[2]"], wide[:, 2])
+
+
+def test_a_part_and_a_name_with_the_sign(tmp_path):
+    (tmp_path / "a#b.csv").write_text("t\n")
+    assert split_part(tmp_path / "a#b.csv") == (tmp_path / "a#b.csv", None)
+    assert split_part(tmp_path / "c.hdf5#demo_1") == (tmp_path / "c.hdf5", "demo_1")
+    assert kind_of(tmp_path / "a#b.csv") == "delimited"
+
+
+@pytest.mark.parametrize(("kind", "library", "extra"), [
+    ("a.mcap", "mcap", "mcap"), ("a.bag", "rosbags", "bag"), ("a.h5", "h5py", "hdf5"),
+    ("a.parquet", "pyarrow", "parquet")])  # fmt: skip
+def test_a_missing_extra_says_what_to_install(tmp_path, monkeypatch, kind, library, extra):
+    (tmp_path / kind).write_bytes(b"x")
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(InputError, match=rf"needs {library}, which is not installed; expected pip install "
+                                         rf"'hmmseg\[{extra}\]'"):  # fmt: skip
+        read_table(tmp_path / kind)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ROS 1 bag"])
+def test_a_log_cut_off_is_one_line(tmp_path, kind):
+    path = LOGS[kind](tmp_path)
+    whole = path.read_bytes()
+    for length in (0, 7, 100, len(whole) // 2, len(whole) - 3):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError) as caught:
+            read_trial(path, TOPICS, LOGGED)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_topic_that_is_not_there(tmp_path):
+    rig = parse_rig({"topics": {"f": "/wrench.wrench.force.xx"}})
+    with pytest.raises(
+        InputError, match=r"column /wrench.wrench.force.xx: missing, but the rig maps f to it"
+    ):
+        read_trial(write_mcap(tmp_path / "a.mcap"), rig, SequenceTask(("a",), channels=("f",)))
