@@ -1,0 +1,179 @@
+"""Blocks of samples: read, made into weights, and carried forward. What all sums over paths share.
+
+A block holds so many samples that its tables stay in the processor's cache. Tables of a block have
+PAD unused numbers at either end, as vectors reach over the ends of rows. State 0 of the chain stands
+at FIRST of a row of weights, the others behind it, in whole vectors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.simd import ahead, at, bits_of, double_of, doubles_at, singles_at, value_at
+from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, exponentials, forward_step, logarithms, renormalise
+
+PAD = 8
+FIRST = 7
+RENORMALISE = 16  # samples; mantissas change by less than 2^4 a sample
+CELLS = 1 << 12  # of a block
+
+
+@compiled
+def block_length(num_states):
+    """Samples of a block."""
+    return max(128, min(1024, CELLS // num_states))
+
+
+@compiled
+def row_width(num_states):
+    """Numbers in a row of weights."""
+    return PAD + 8 * ((num_states + 6) // 8)
+
+
+@compiled
+def number(address, single, index):
+    """Number of a table in single or double precision."""
+    if single:
+        return value_at(ahead(singles_at(address), index))
+    return value_at(ahead(doubles_at(address), index))
+
+
+@compiled
+def load(address, single, num_states, start, stop, out):
+    """Rows [start, stop) of a table into `out` from PAD on; rows of NaN alone become zeros, no evidence.
+
+    Returns the first row with NaN beside numbers, -1 where there is none.
+    """
+    missing, begin, size = 0, start * num_states, (stop - start) * num_states
+    if single:
+        ones = singles_at(address)
+        for i in range(size):
+            out[PAD + i] = value_at(ahead(ones, begin + i))
+    else:
+        twos = doubles_at(address)
+        for i in range(size):
+            out[PAD + i] = value_at(ahead(twos, begin + i))
+    for i in range(PAD, PAD + size):
+        missing += out[i] != out[i]
+    if missing:
+        for t in range(stop - start):
+            row, count = PAD + t * num_states, 0
+            for k in range(num_states):
+                count += out[row + k] != out[row + k]
+            if 0 < count < num_states:
+                return start + t
+            if count:
+                for k in range(num_states):
+                    out[row + k] = 0.0
+    return -1
+
+
+@compiled
+def doubles(size, value):
+    """So many doubles of one value (np.full takes seconds to compile)."""
+    out = np.empty(size)
+    for i in range(size):
+        out[i] = value
+    return out
+
+
+@compiled
+def integers(size, value):
+    """So many integers of one value."""
+    out = np.empty(size, np.int64)
+    for i in range(size):
+        out[i] = value
+    return out
+
+
+@compiled
+def copy_row(from_m, from_e, i, to_m, to_e, j):
+    """Row i of one table of weights into row j of another."""
+    for k in range(from_m.shape[1]):
+        to_m[j, k], to_e[j, k] = from_m[i, k], from_e[i, k]
+
+
+@compiled
+def to_weights(logs, size, mantissa, exponent):
+    """exp of `size` numbers from PAD on."""
+    for i in range(PAD, PAD + size, 8):
+        exponentials(at(logs, i), at(mantissa, i), at(exponent, i))
+
+
+@compiled
+def to_logs(mantissa, exponent, size, logs):
+    """Logarithms of `size` weights from PAD on."""
+    for i in range(PAD, PAD + size, 8):
+        logarithms(at(mantissa, i), at(exponent, i), at(logs, i))
+
+
+@compiled
+def weights_of(address, size):
+    """Weights of a small array of doubles, with room at both ends."""
+    x, mantissa = doubles(size + 2 * PAD, 0.0), doubles(size + 2 * PAD, 1.0)
+    exponent = integers(size + 2 * PAD, 0)
+    load(address, False, 1, 0, size, x)
+    to_weights(x, size, mantissa, exponent)
+    return mantissa, exponent
+
+
+@compiled
+def empty_row(num_states):
+    """A row of weights that are all zero."""
+    width = row_width(num_states)
+    return doubles(width, 1.0), integers(width, ZERO_EXPONENT)
+
+
+@compiled
+def renormalise_row(m, e, width):
+    """Mantissas of a row back to [1, 2)."""
+    for i in range(0, width, 8):
+        renormalise(at(m, i), at(e, i))
+
+
+@compiled
+def add(m1, e1, m2, e2):
+    """Sum of two weights."""
+    if e1 < e2:
+        m1, e1, m2, e2 = m2, e2, m1, e1
+    apart = e2 - e1
+    if apart > -1000:
+        m1 += m2 * double_of((apart + 1023) << 52)
+    shift = (bits_of(m1) >> 52) - 1023
+    return m1 * double_of((1023 - shift) << 52), e1 + shift
+
+
+@compiled
+def first_row(am, ae, initial_m, initial_e, pm, pe, num_states):
+    """Row 0 of forward weights: those at the first sample, whose emissions stand from PAD on."""
+    for k in range(am.shape[1]):
+        am[0, k], ae[0, k] = 1.0, ZERO_EXPONENT
+    for k in range(num_states):
+        am[0, FIRST + k] = initial_m[PAD + k] * pm[PAD + k]
+        ae[0, FIRST + k] = initial_e[PAD + k] + pe[PAD + k]
+
+
+@compiled
+def forward_block(am, ae, pm, pe, sm, se, vm, ve, stay_step, advance_step, first, count, num_states):
+    """Rows 1 to `count` of forward weights from row 0; emissions of row r + 1 stand in p's row r.
+
+    `stay_step`, `advance_step`: how far apart the rows of the transitions s and v are; 0 where they do
+    not vary. `first`: number of the first of these samples.
+    """
+    width = am.shape[1]
+    fm, fe = am.reshape(am.size), ae.reshape(ae.size)
+    for r in range(count):
+        old, new, p = r * width, (r + 1) * width, PAD + r * num_states
+        s, v = PAD + r * stay_step, PAD + r * advance_step
+        fm[new + FIRST] = fm[old + FIRST] * sm[s] * pm[p]
+        fe[new + FIRST] = fe[old + FIRST] + se[s] + pe[p]
+        for c in range(0, num_states - 1, 8):
+            forward_step(
+                at(fm, old + PAD + c), at(fe, old + PAD + c), at(pm, p + 1 + c), at(pe, p + 1 + c),
+                at(sm, s + 1 + c), at(se, s + 1 + c), at(vm, v + c), at(ve, v + c),
+                fm[old + FIRST + c], fe[old + FIRST + c], at(fm, new + PAD + c), at(fe, new + PAD + c),
+            )  # fmt: skip
+        if (first + r) % RENORMALISE == 0:
+            for i in range(0, width, 8):
+                renormalise(at(fm, new + i), at(fe, new + i))

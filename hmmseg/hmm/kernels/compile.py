@@ -1,0 +1,40 @@
+"""How kernels are compiled: without the interpreter's lock, and kept on disk where that is possible."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import os
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numba
+
+
+@cache
+def cache_folder() -> str:
+    """Where compiled kernels are kept: one folder for each state of the kernels' sources.
+
+    Numba notices a change of a function's own file alone, not of what the function calls.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    base = numba.config.CACHE_DIR or os.path.join(
+        os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "hmmseg", "numba"
+    )
+    return os.path.join(base, digest.hexdigest()[:16])
+
+
+def compiled(function: Callable) -> Callable:
+    """`function` compiled at its first call; kept on disk, or for this process where no folder is writable."""
+    function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = cache_folder()
+    try:
+        return numba.njit(function, nogil=True, error_model="numpy", cache=True)
+    except (RuntimeError, OSError):  # no folder that could be written to
+        return numba.njit(function, nogil=True, error_model="numpy")
+    finally:
+        numba.config.CACHE_DIR = before
