@@ -12,30 +12,32 @@ docs/hmm.md shows all of it. Nothing heavy is imported before it is used.
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-_HOMES = {
-    "Alignment": "results",
-    "Alignments": "results",
-    "Chain": "chain",
-    "Filtered": "results",
-    "InfeasibleAlignment": "chain",
-    "Posterior": "results",
-    "forward": "inference",
-    "k_best": "inference",
-    "left_to_right": "chain",
-    "log_evidence": "inference",
-    "sample": "inference",
-    "smooth": "inference",
-    "viterbi": "inference",
+if TYPE_CHECKING:
+    from hmmseg.hmm.chain import Chain, InfeasibleAlignment, left_to_right
+    from hmmseg.hmm.inference import forward, k_best, log_evidence, sample, smooth, viterbi
+    from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
+    from hmmseg.hmm.streaming import Step, StreamingFilter, Window
+
+_MODULES = {
+    "chain": ("Chain", "InfeasibleAlignment", "left_to_right"),
+    "inference": ("forward", "k_best", "log_evidence", "sample", "smooth", "viterbi"),
+    "results": ("Alignment", "Alignments", "Filtered", "Posterior"),
+    "streaming": ("Step", "StreamingFilter", "Window"),
 }
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = [  # noqa: F822
+__all__ = [
     "Alignment",
     "Alignments",
     "Chain",
     "Filtered",
     "InfeasibleAlignment",
     "Posterior",
+    "Step",
+    "StreamingFilter",
+    "Window",
     "forward",
     "k_best",
     "left_to_right",

@@ -49,7 +49,9 @@ class Chain:
             skips = (log_skip,) if isinstance(log_skip, np.ndarray) else tuple(log_skip)  # type: ignore[arg-type]
         bands = [np.ascontiguousarray(b, dtype=np.float64) for b in (log_stay, log_advance, *skips)]
         if bands[0].ndim not in (1, 2) or not bands[0].shape[-1]:
-            raise ValueError(f"log_stay: shape {bands[0].shape}, expected (num_states,) or one such row a step")
+            raise ValueError(
+                f"log_stay: shape {bands[0].shape}, expected (num_states,) or one such row a step"
+            )
         self.num_states: int = bands[0].shape[-1]
         rows = [len(b) for b in bands if b.ndim == 2]
         self.num_samples: int | None = rows[0] + 1 if rows else None
@@ -166,9 +168,8 @@ def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
 def not_numbers(log_likelihoods: np.ndarray, row: int) -> ValueError:
     """What to raise for a row with NaN beside numbers."""
     column = int(np.flatnonzero(np.isnan(np.asarray(log_likelihoods[row], dtype=float)))[0])
-    return ValueError(
-        f"log_likelihoods: NaN or +inf at {[row, column]}, expected numbers or -inf (a missing sample is NaN throughout)"
-    )
+    where = f"log_likelihoods: NaN or +inf at {[row, column]}"
+    return ValueError(f"{where}, expected numbers or -inf (a missing sample is NaN throughout)")
 
 
 def _first_bad(table: np.ndarray) -> str:

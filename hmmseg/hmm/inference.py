@@ -13,6 +13,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +22,7 @@ from numpy.typing import ArrayLike
 from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
 from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
 
-Tables = ArrayLike | Sequence[ArrayLike]
+Tables = Any  # one array, or a sequence of arrays
 _NONE = np.empty((0, 0))
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _CELLS_A_THREAD = 1 << 17  # below, another thread costs more than it saves
@@ -67,8 +69,9 @@ def viterbi(log_likelihoods: Tables, chain: Chain | Sequence[Chain],
     return _viterbi_many(*recordings(log_likelihoods, chain, lengths))
 
 
-def recordings(log_likelihoods: Tables, chain: Chain | Sequence[Chain],
-               lengths: Sequence[int] | np.ndarray | None) -> tuple[list[np.ndarray], list[Chain]]:  # fmt: skip
+def recordings(
+    log_likelihoods: Tables, chain: Chain | Sequence[Chain], lengths: Sequence[int] | np.ndarray | None
+) -> tuple[list[np.ndarray], list[Chain]]:
     """Tables and chains of several recordings."""
     tables = list(log_likelihoods)
     if lengths is not None:
@@ -125,7 +128,16 @@ def _viterbi_many(tables: list[np.ndarray], chains: list[Chain]) -> Alignments:
     else:
         columns = np.array([c.addresses for c in chains], dtype=np.int64).T
         stay, advance, initial, final = (np.ascontiguousarray(columns[i]) for i in (0, 1, 3, 4))
-    fixed = (lengths, tables[0].dtype == _SINGLE, num_states, stay, advance, chains[0].varying, initial, final)
+    fixed = (
+        lengths,
+        tables[0].dtype == _SINGLE,
+        num_states,
+        stay,
+        advance,
+        chains[0].varying,
+        initial,
+        final,
+    )
 
     def run(part: tuple[int, int]) -> tuple[int, int]:
         return best_paths(ll, *fixed, starts, log_prob, *part)
@@ -148,7 +160,7 @@ def in_threads(run, lengths: np.ndarray, num_states: int) -> list:
     cumulative = np.cumsum(lengths)
     cuts = [0, *np.searchsorted(cumulative, cumulative[-1] * np.arange(1, num) / num), len(lengths)]
     with ThreadPoolExecutor(num) as pool:
-        return list(pool.map(run, [(int(a), int(b)) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]))
+        return list(pool.map(run, [(int(a), int(b)) for a, b in pairwise(cuts)]))
 
 
 def tables_of(ll: np.ndarray, chain: Chain, logs: bool, filtered: bool, smoothed: bool) -> tuple:

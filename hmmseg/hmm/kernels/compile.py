@@ -8,8 +8,12 @@ import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numba
+import numba.core.config
+
+_config: Any = numba.core.config
 
 
 @cache
@@ -21,20 +25,20 @@ def cache_folder() -> str:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
-    base = numba.config.CACHE_DIR or os.path.join(
+    base = _config.CACHE_DIR or os.path.join(
         os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "hmmseg", "numba"
     )
     return os.path.join(base, digest.hexdigest()[:16])
 
 
-def compiled(function: Callable) -> Callable:
-    """`function` compiled at its first call; kept on disk, or for this process where no folder is writable."""
+def compiled(function: Callable) -> Any:
+    """`function` compiled at its first call; kept on disk where a folder is writable."""
     function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = cache_folder()
+    before = _config.CACHE_DIR
+    _config.CACHE_DIR = cache_folder()
     try:
         return numba.njit(function, nogil=True, error_model="numpy", cache=True)
     except (RuntimeError, OSError):  # no folder that could be written to
         return numba.njit(function, nogil=True, error_model="numpy")
     finally:
-        numba.config.CACHE_DIR = before
+        _config.CACHE_DIR = before

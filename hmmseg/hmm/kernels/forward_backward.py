@@ -11,8 +11,23 @@ import math
 import numpy as np
 
 from hmmseg.hmm.kernels.blocks import (
-    FIRST, PAD, RENORMALISE, add, block_length, copy_row, doubles, empty_row, first_row, forward_block,
-    integers, load, renormalise_row, row_width, to_logs, to_weights, weights_of,
+    FIRST,
+    PAD,
+    RENORMALISE,
+    add,
+    block_length,
+    copy_row,
+    doubles,
+    empty_row,
+    first_row,
+    forward_block,
+    integers,
+    load,
+    renormalise_row,
+    row_width,
+    to_logs,
+    to_weights,
+    weights_of,
 )  # fmt: skip
 from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import at, bits_of, double_of

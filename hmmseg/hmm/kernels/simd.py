@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import extending, types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 WIDTH = 8
+intrinsic: Any = extending.intrinsic  # what it makes is called without its first argument
 I32, I64, F32, F64 = ir.IntType(32), ir.IntType(64), ir.FloatType(), ir.DoubleType()
 _REVERSED = list(range(WIDTH - 1, -1, -1))
 
@@ -152,7 +153,7 @@ class Lanes:
         return Vec(self.builder, one).shuffled([0] * WIDTH)
 
 
-def vector_function(result) -> Callable:
+def vector_function(result) -> Any:
     """Decorator: a function of Lanes and LLVM values becomes callable from kernels.
 
     `result`: the numba type that it returns.
