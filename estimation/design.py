@@ -1,11 +1,14 @@
 """The linear-Gaussian core of the properties' likelihood, assembled from aligned trials.
 
-Observation o of trial t under its drawn alignment s is a mean over samples,
+Every grip of every trial gives up to three observations (`estimation.observations`), each in its
+channel c:
 
-    mean[t, s, o] = A[t, s, o] . properties + J[t, s, o] . deviations + noise,
+    mean = A . unknowns + J . deviations + unit (common_c + own) + noise,
 
-with noise variance scale_c^2 v_c / n[t, s, o] + tau_c^2 for its channel c: A holds gravity factors
-(force), ones (distance) and height coefficients (rise), J finite differences through the hand.
+A holds gravity factors (force), ones (distance) and coefficients of heights (rise), J finite
+differences through the hand. `unit` is the quantity that the channel's equation is built on: the
+carried force, the pads' give along the grip, their shear deflection. What the equation leaves out is
+stated as a share of it: one that all grips have in common, one that differs from grip to grip.
 """
 
 from __future__ import annotations
@@ -15,8 +18,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation.combinations import Terms, simplest_combinations
 from estimation.nuisance import Nuisance, nuisances
-from estimation.observations import Aligned, Noise, channel_values, gravity_factor
+from estimation.observations import (
+    CHANNELS,
+    Aligned,
+    Noise,
+    channel_values,
+    free_forces,
+    gravity_factor,
+)
 from hmmseg.contact.decompose import height_equations
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -25,129 +36,233 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.features import thin
 
 PROPERTIES = ("weight", "width", "height")
+FORCE, DISTANCE, RISE = range(len(CHANNELS))
+RIGID = 4000.0  # N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What the recording determines: a property, or a combination of one property of several objects."""
+
+    prop: str
+    terms: Terms
+
+    @property
+    def single(self) -> bool:
+        """Whether it is a property of one object."""
+        return len(self.terms) == 1
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """(object, property); objects of a combination joined as in `b + c`."""
+        text = ""
+        for obj, c in self.terms.items():
+            sign = " - " if c < 0 else " + "
+            text += (sign if text else "") + (obj if abs(c) == 1 else f"{abs(c)} {obj}")
+        return text, self.prop
 
 
 @dataclass(frozen=True)
 class Design:
-    """Arrays of the linear-Gaussian core; S alignments, O observations, P properties, N deviations.
+    """Arrays of the linear-Gaussian core; K observations, Q unknowns, N deviations of the hand.
 
-    `mean`, `variance` (num_trials, S, O) with 0 weight where nothing was recorded (`there`);
-    `coefficients` (num_trials, S, O, P), `shifts` (num_trials, S, O, N) per standard deviation of
-    each deviation; `channel` (O,) indexes CHANNELS. `free_mean`, `free_variance` (num_trials, 4)
-    and `free_shifts` (num_trials, 4, N): forces in free motion. `tau` (3,): prior median of the
-    trial-to-trial standard deviation; `common` (3,): standard deviation of what the model leaves
-    out alike in all trials; `scale_count` (3,): samples behind each noise variance; `unexpected`:
-    force biases that free motion shows and the rig does not admit; `level_rises`: by move between
-    equal heights, the mean rise that was recorded [m].
+    `mean`, `variance` (K,) of the observations, drawn alignments combined; `coefficients` (K, Q);
+    `shifts` (K, N) per standard deviation of each deviation; `channel` (K,) indexes CHANNELS;
+    `unit` (K,): what shares of model error are taken of; `trial`, `move` (K,): where it was seen.
+    `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
+    free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
+    that free motion shows and the rig does not admit; `level_rises`: by move between equal heights,
+    the mean rise that was recorded [m].
     """
 
-    names: tuple[tuple[str, str], ...]
+    unknowns: tuple[Unknown, ...]
     nuisances: tuple[Nuisance, ...]
     mean: np.ndarray
     variance: np.ndarray
-    there: np.ndarray
     coefficients: np.ndarray
     shifts: np.ndarray
     channel: np.ndarray
+    unit: np.ndarray
+    trial: np.ndarray
+    move: np.ndarray
     free_mean: np.ndarray
     free_variance: np.ndarray
     free_shifts: np.ndarray
-    tau: np.ndarray
-    common: np.ndarray
     scale_count: np.ndarray
     unexpected: tuple[Nuisance, ...] = ()
     level_rises: dict[int, float] = field(default_factory=dict)
 
+    @property
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """(object, property) of every unknown."""
+        return tuple(u.name for u in self.unknowns)
 
-# Trial-to-trial scatter and what the model leaves out, in units of one sample's noise: how far
-# contact mechanics holds below the sensors' resolution. Measured on recordings and simulations by
-# experiments/calibration.py; docs/model.md says how.
-TAU_SHARE = np.array([0.03, 0.05, 0.15])
-COMMON_SHARE = np.array([0.02, 0.01, 0.25])
+    def repeats(self) -> np.ndarray:
+        """By channel (3,): observations beyond the unknowns they determine, all that tell scatter."""
+        counts = np.bincount(self.channel, minlength=len(CHANNELS))
+        return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
 
 def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
-    """Observed means (num_alignments, num_moves * 3) of one trial, NaN where nothing was recorded."""
+    """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
     values = channel_values(signals, rig)
     out = []
     for move in moves:
         weights, counts = aligned.weights.grips[move], aligned.weights.counts[move]
         means = {k: _mean(w, values[k], counts[k]) for k, w in weights.items()}
-        out += [means["force"], means["distance"], means["place"] - means["pickup"]]
-    return np.stack(out, axis=1)
+        out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
+    return np.moveaxis(np.array(out), 2, 0)
 
 
 def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.where(counts > 0, weights @ np.nan_to_num(values), np.nan)
 
 
-def _free_forces(signals: Signals, aligned: Aligned) -> np.ndarray:
-    force = np.stack([getattr(signals, name) for name in FORCE_CHANNELS])
-    return np.nan_to_num(force) @ aligned.weights.free
-
-
 def build(
-    trials: Sequence[Trial], aligned: Sequence[Aligned], noise: Noise, task: BlockTask, rig: Rig,
-    sd_force: float,
-) -> Design:  # fmt: skip
-    """Design of the given aligned trials. `sd_force`: noise of one force sample [N]."""
+    trials: Sequence[Trial], aligned: Sequence[Aligned], noise: Noise, task: BlockTask, rig: Rig
+) -> Design:
+    """Design of the given aligned trials."""
     moves = list(range(len(task.performed)))
+    objects = [task.performed[m].object for m in moves]
     rises = dict(height_equations(task))
-    raw = np.stack([observe(a.signals, a, rig, moves) for a in aligned])
-    channel = np.tile(np.arange(3), len(moves))
-    columns = [(obj, prop) for obj in task.objects for prop in PROPERTIES]
-    coefficients = np.zeros((*raw.shape, len(columns)))
-    variance = np.full(raw.shape, np.inf)
-    for i, a in enumerate(aligned):
-        factor = gravity_factor(a.signals, rig)
-        for m, move in enumerate(moves):
-            obj, w, n = task.performed[move].object, a.weights.grips[move], a.weights.counts[move]
-            force, distance, rise = 3 * m, 3 * m + 1, 3 * m + 2
-            coefficients[i, :, force, columns.index((obj, "weight"))] = w["force"] @ factor
-            coefficients[i, :, distance, columns.index((obj, "width"))] = 1.0
-            for other, c in rises[move].items():
-                coefficients[i, :, rise, columns.index((other, "height"))] = c
-            with np.errstate(divide="ignore"):
-                variance[i, :, force] = noise.variance["force"] / n["force"]
-                variance[i, :, distance] = noise.variance["distance"] / n["distance"]
-                v_pickup = noise.variance["pickup"] / n["pickup"]
-                variance[i, :, rise] = v_pickup + noise.variance["place"] / n["place"]
+    raw = np.stack([observe(a.signals, a, rig, moves) for a in aligned])  # T, S, M, 3
+    variance = np.stack([_variance(a, noise, moves) for a in aligned])
+    factor = np.stack(
+        [[a.weights.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in aligned]
+    )
+    valid = np.isfinite(raw) & np.isfinite(variance)
+    there = valid.mean(axis=1) > 0.5  # of the alignments
     # A move between equal heights has a rise that no property enters: it says nothing of them.
-    there = np.isfinite(raw) & np.isfinite(variance) & coefficients.any(axis=-1)
-    free_mean = np.stack([_free_forces(a.signals, a) for a in aligned])
-    free_count = np.array([max(a.weights.free_count, 1.0) for a in aligned])
-    free_variance = np.repeat((sd_force**2 / free_count)[:, None], 4, axis=1)
+    there[:, :, RISE] &= np.array([bool(rises[m]) for m in moves])
+    unknowns = _unknowns(task, objects, rises, there.any(axis=0))
+    columns = _columns(unknowns, objects, rises)  # M, 3, Q
+    coefficients = np.repeat(np.repeat(columns[None, None], raw.shape[1], axis=1), len(trials), axis=0)
+    coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
+    free_mean, free_variance = _free(aligned, noise)
     surprise = unexpected_bias(free_mean, free_variance, rig)
     deviations = nuisances(rig, surprise)
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}
-    shifts = np.zeros((*raw.shape, len(deviations)))
+    shifts = np.zeros((*there.shape, len(deviations)))
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))
     for j, deviation in enumerate(deviations):
         for i, (trial, a) in enumerate(zip(trials, aligned, strict=True)):
             read = thin(deviation.read(trial, rig, deviation.step), _rate(a.signals))
-            slope = (raw[i] - observe(read, a, rig, moves)) / deviation.step
-            shifts[i, :, :, j] = np.nan_to_num(slope) * deviation.sd
-            slope = (free_mean[i] - _free_forces(read, a)) / deviation.step
+            slope = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) / deviation.step
+            shifts[i, ..., j] = slope * deviation.sd
+            slope = (free_mean[i] - free_forces(read, a)) / deviation.step
             free_shifts[i, :, j] = slope * deviation.sd
-    determined = _determined(coefficients, there)
-    sample = np.sqrt([noise.variance["force"], noise.variance["distance"], noise.variance["place"]])
+    where = np.nonzero(there)
+    mean, spread, rows = _combined(raw, variance, valid, coefficients, where)
     counts = [noise.count["force"], noise.count["distance"], noise.count["pickup"] + noise.count["place"]]
     return Design(
-        names=tuple(c for c, known in zip(columns, determined, strict=True) if known),
-        nuisances=deviations, mean=np.where(there, raw, 0.0), variance=np.where(there, variance, 1.0),
-        there=there, coefficients=coefficients[..., determined], shifts=shifts, channel=channel,
-        free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
-        tau=TAU_SHARE * sample, common=COMMON_SHARE * sample, scale_count=np.array(counts),
-        unexpected=tuple(d for d in deviations if d.name in surprising),
+        unknowns=unknowns, nuisances=deviations, mean=mean, variance=spread, coefficients=rows,
+        shifts=shifts[where], channel=where[2], unit=_units(aligned, raw, rig)[where], trial=where[0],
+        move=where[1], free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
+        scale_count=np.array(counts), unexpected=tuple(d for d in deviations if d.name in surprising),
         level_rises=_level_rises(raw, rises),
     )  # fmt: skip
 
 
-def _level_rises(raw: np.ndarray, rises: dict[int, dict[str, int]]) -> dict[int, float]:
+def _variance(aligned: Aligned, noise: Noise, moves: Sequence[int]) -> np.ndarray:
+    """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
+    out = []
+    with np.errstate(divide="ignore"):
+        for move in moves:
+            part = {k: noise.variance[k] / n for k, n in aligned.weights.counts[move].items()}
+            out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
+    return np.moveaxis(np.array(out), 2, 0)
+
+
+def _unknowns(
+    task: BlockTask, objects: Sequence[str], rises: dict[int, Terms], there: np.ndarray
+) -> tuple[Unknown, ...]:
+    """What the moves recorded in `there` (num_moves, 3) determine, objects in the task's order."""
+    names = list(task.objects)
+    held = {
+        c: {obj for obj, seen in zip(objects, there[:, c], strict=True) if seen} for c in (FORCE, DISTANCE)
+    }
+    out = []
+    recorded = [rises[m] for m, seen in enumerate(there[:, RISE]) if seen]
+    heights = simplest_combinations(recorded, names)
+    for name in names:
+        out += [Unknown("weight", {name: 1})] * (name in held[FORCE])
+        out += [Unknown("width", {name: 1})] * (name in held[DISTANCE])
+        out += [Unknown("height", {name: 1})] * ({name: 1} in heights)
+    return (*out, *(Unknown("height", terms) for terms in heights if len(terms) > 1))
+
+
+def _columns(unknowns: Sequence[Unknown], objects: Sequence[str], rises: dict[int, Terms]) -> np.ndarray:
+    """Coefficients (num_moves, 3, Q) of the unknowns in each observation of a move."""
+    out = np.zeros((len(objects), len(CHANNELS), len(unknowns)))
+    heights = [i for i, u in enumerate(unknowns) if u.prop == "height"]
+    names = list(dict.fromkeys(name for i in heights for name in unknowns[i].terms))
+    basis = np.array([[unknowns[i].terms.get(name, 0) for name in names] for i in heights], float)
+    for m, obj in enumerate(objects):
+        for i, u in enumerate(unknowns):
+            if u.single and obj in u.terms and u.prop != "height":
+                out[m, PROPERTIES.index(u.prop), i] = 1.0
+        if heights and rises[m] and set(rises[m]) <= set(names):
+            rise = np.array([rises[m].get(name, 0) for name in names], float)
+            solved, *_ = np.linalg.lstsq(basis.T, rise, rcond=None)
+            if np.abs(solved @ basis - rise).max() < 1e-9:
+                out[m, RISE, heights] = np.where(np.abs(solved) > 1e-9, solved, 0.0)
+    return out
+
+
+def _combined(
+    raw: np.ndarray, variance: np.ndarray, valid: np.ndarray, coefficients: np.ndarray, where: tuple
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, variances (K,) and coefficients (K, Q) of the observations, drawn alignments combined.
+
+    Alignments are draws of what is missing, so the variance is that within one alignment plus
+    1 + 1 / S times that between them (Rubin 1987, Multiple Imputation, equation 3.1.5). What a
+    longer or shorter span changes in the coefficients is no difference between alignments.
+    """
+    used = np.moveaxis(valid, 1, -1)[where]  # K, S
+    num = used.sum(axis=1)
+
+    def average(values: np.ndarray) -> np.ndarray:
+        return np.where(used, values, 0.0).sum(axis=1) / num
+
+    values, rows = np.moveaxis(raw, 1, -1)[where], np.moveaxis(coefficients, 1, -2)[where]
+    mean, within = average(values), average(np.moveaxis(variance, 1, -1)[where])
+    row = np.where(used[..., None], rows, 0.0).sum(axis=1) / num[:, None]
+    sd = np.sqrt(within)
+    found, *_ = np.linalg.lstsq(row / sd[:, None], mean / sd, rcond=None)
+    predicted = rows @ found
+    shift = values - predicted - average(values - predicted)[:, None]
+    between = average(shift**2) * num / np.maximum(num - 1, 1)
+    return mean, within + (1 + 1 / num) * between, row
+
+
+def _units(aligned: Sequence[Aligned], raw: np.ndarray, rig: Rig) -> np.ndarray:
+    """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m]."""
+    tip = rig.fingertip
+    normal = tip.normal_stiffness if np.isfinite(tip.normal_stiffness) else RIGID
+    shear = tip.shear_stiffness if np.isfinite(tip.shear_stiffness) else RIGID
+    force = np.abs(raw[..., FORCE]).mean(axis=1)
+    force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
+    squeeze = [np.nan_to_num(a.signals.fx1 - a.signals.fx2) for a in aligned]
+    grip = np.array([
+        [np.mean(w["distance"] @ s) for w in a.weights.grips.values()]
+        for a, s in zip(aligned, squeeze, strict=True)
+    ])  # fmt: skip
+    return np.stack([force, np.maximum(grip, 1e-3) / normal, np.maximum(force, 1e-3) / (2 * shear)], axis=-1)
+
+
+def _free(aligned: Sequence[Aligned], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Mean forces in free motion (num_trials, 4) and their variances."""
+    mean = np.stack([free_forces(a.signals, a) for a in aligned])
+    count = np.array([max(a.weights.free_count, 1.0) for a in aligned])
+    variance = np.array([noise.variance[name] for name in FORCE_CHANNELS])
+    return mean, variance[None, :] / count[:, None]
+
+
+def _level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
     """Mean recorded rise [m] of the moves that should have none, where they were recorded."""
     out = {}
     for move, rise in rises.items():
-        recorded = raw[:, :, 3 * move + 2]
+        recorded = raw[:, :, move, RISE]
         recorded = recorded[np.isfinite(recorded)]
         if not rise and recorded.size:
             out[move] = float(recorded.mean())
@@ -169,11 +284,3 @@ def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndar
     pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
     allowed = np.hypot(1.0 / np.sqrt(precision.sum(axis=0)), np.asarray(rig.systematic.force_bias))
     return np.where(np.abs(pooled) > 4 * allowed, np.abs(pooled), 0.0)
-
-
-def _determined(coefficients: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Which properties (P,) the recorded observations fix, by the rank of the linear system."""
-    rows = (coefficients * there[..., None]).reshape(-1, coefficients.shape[-1])
-    _, singular, vt = np.linalg.svd(rows, full_matrices=True)
-    rank = int((singular > 1e-9).sum())
-    return np.abs(vt[rank:]).max(axis=0, initial=0.0) < 1e-9

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.design import Design, build
+from estimation.design import Design, Unknown, build
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.mode import find_mode, start
-from estimation.observations import Aligned, Noise, aligned_weights
-from estimation.posterior import pack
+from estimation.observations import CHANNELS, Aligned, Noise, aligned_weights
+from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.sampler import Draws, sample
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
@@ -31,7 +30,9 @@ class Identification:
     """Everything `identify` found.
 
     `draws` (num_draws, num_properties) of the properties named by `names` (object, property) in
-    N and m; `sampled` is None where no property could be determined.
+    N and m, `combined` (num_draws, num_combinations) of the `combinations` that alone are determined
+    of some; `sampled` is None where nothing could be determined. `notes` say what a reader should
+    know though nothing is wrong.
     """
 
     task: BlockTask
@@ -41,11 +42,14 @@ class Identification:
     noise: Noise
     names: tuple[tuple[str, str], ...]
     draws: np.ndarray
+    combinations: tuple[Unknown, ...]
+    combined: np.ndarray
     sampled: Draws | None
     friction: dict[str, FrictionPosterior]
     reasons: dict[str, str]
     predictive: PredictiveCheck | None
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def segmentations(self) -> list[Segmentation]:
@@ -76,17 +80,22 @@ class Identification:
             "method": "bayes",
             "sampler": self._sampler(),
             "properties": properties,
+            "combinations": [
+                {"of": {f"{obj}.{u.prop}": c for obj, c in u.terms.items()}} | summary(column, UNITS[u.prop])
+                for u, column in zip(self.combinations, self.combined.T, strict=True)
+            ],
             "reasons": self.reasons,
             "predictive": None if self.predictive is None else self.predictive.to_json(),
+            "notes": list(self.notes),
         }
 
     def _sampler(self) -> dict | None:
         if self.sampled is None:
             return None
-        walkers, steps, _ = self.sampled.chain.shape
+        found = self.sampled
         return {
-            "walkers": walkers, "steps": steps, "ess": self.sampled.ess, "rhat": self.sampled.rhat,
-            "acceptance": self.sampled.acceptance, "converged": self.sampled.converged,
+            "method": found.method, "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess,
+            "rhat": found.rhat, "acceptance": found.acceptance, "converged": found.converged,
         }  # fmt: skip
 
     def to_arviz(self):
@@ -95,9 +104,9 @@ class Identification:
 
         if self.sampled is None:
             raise ValueError("no property was determined, so there is no posterior")
-        chain = np.exp(self.sampled.chain[..., : len(self.names)])
-        posterior = {f"{obj}.{prop}": chain[..., i] for i, (obj, prop) in enumerate(self.names)}
-        return arviz.from_dict(posterior=posterior)
+        chain = self.sampled.chain
+        names = [f"{obj}.{prop}" for obj, prop in (*self.names, *(u.name for u in self.combinations))]
+        return arviz.from_dict(posterior={name: chain[..., i] for i, name in enumerate(names)})
 
 
 def identify(
@@ -120,26 +129,38 @@ def identify_aligned(
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
-    design = build(trials, weighed, noise, aligned.task, rig, sd_force)
+    design = build(trials, weighed, noise, aligned.task, rig)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
-    warnings = _misfits(aligned)
-    draws, sampled, predictive = np.zeros((0, 0)), None, None
-    if design.names:
-        mode = find_mode(start(design), pack(design))
-        sampled = sample(mode, seed, progress)
-        draws = np.exp(sampled.flat[:, : len(design.names)])
-        predictive = check(design, mode.data, sampled, rng)
-        warnings += [*_unconverged(mode.converged, sampled), *predictive.warnings]
+    warnings, notes = _misfits(aligned), []
+    sampled, predictive = None, None
+    reasons = _reasons(aligned, design, friction)
+    if design.unknowns:
+        found = posterior(design)
+        sampled = sample(found, seed, progress)
+        if sampled.converged:
+            predictive = check(found, sampled, rng)
+            warnings += predictive.warnings
+            notes += _unrepeated(design)
+        if sampled.method != "emcee":
+            warnings.append("the chain did not converge: intervals are of the weighted Laplace approximation")
+        if not sampled.converged:
+            why = f"the sampler has not converged: ESS {sampled.ess:.0f}, R-hat {sampled.rhat:.3f}"
+            warnings.append(why)
+            reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
+    kept = design.unknowns if sampled is not None and sampled.converged else ()
+    single = [u.single for u in kept]
+    draws = np.zeros((0, 0)) if sampled is None or not kept else sampled.flat
+    num = sum(single)  # singles come first
     warnings += [
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
     ]
     warnings += _unnamed(aligned.task, design)
-    reasons = _reasons(aligned, design, friction)
     return Identification(
-        aligned.task, rig, aligned, tuple(weighed), noise, design.names, draws, sampled,
+        aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in kept[:num]),
+        draws[:, :num], tuple(kept[num:]), draws[:, num:], sampled if kept else None,
         {k: f for k, f in friction.items() if f.lower_bound is not None}, reasons, predictive,
-        tuple(warnings),
+        tuple(warnings), tuple(notes),
     )  # fmt: skip
 
 
@@ -203,8 +224,13 @@ def _misfits(aligned: AlignedTrials) -> list[str]:
     return [f"{s.file}: {failure}" for s in found for failure in s.failures]
 
 
-def _unconverged(found: bool, sampled: Draws) -> list[str]:
-    out = [] if found else ["the search for the posterior mode ran out of steps"]
-    if not sampled.converged:
-        out.append(f"the sampler has not converged: ESS {sampled.ess:.0f}, R-hat {sampled.rhat:.3f}")
-    return out
+def _unrepeated(design: Design) -> list[str]:
+    """Where no grip repeats another, the prior alone says how far off the contact equations may be."""
+    seen = np.bincount(design.channel, minlength=len(CHANNELS)) > 0
+    alone = [name for name, n, s in zip(CHANNELS, design.repeats(), seen, strict=True) if s and n == 0]
+    if not alone:
+        return []
+    return [
+        f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
+        "from its prior; a second trial would show it"
+    ]

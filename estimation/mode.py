@@ -1,62 +1,49 @@
-"""The posterior mode by BFGS (optimistix), and the Laplace approximation around it."""
+"""The posterior mode of the scales, and the Laplace approximation around it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+from scipy.optimize import minimize
 
-from estimation.design import Design
-from estimation.posterior import Data, log_likelihoods, mean_log_prob
+from estimation.posterior import Posterior
 
-MAX_STEPS = 512
+STEP = 1e-3  # of the scales, all logarithms, for derivatives by central differences
 
 
 @dataclass(frozen=True)
 class Mode:
-    """Mode (dim,), Laplace covariance (dim, dim), and the data with alignments referred to it."""
+    """Mode (6,) of the scales and their covariance (6, 6); unknowns (Q,) there and theirs (Q, Q).
 
-    x: np.ndarray
+    The covariance of the unknowns holds at the scales' mode.
+    """
+
+    scales: np.ndarray
     covariance: np.ndarray
-    data: Data
+    unknowns: np.ndarray
+    unknowns_covariance: np.ndarray
     converged: bool
 
 
-def start(design: Design) -> np.ndarray:
-    """Start of the search for the mode: the paper's Table 3 on the spans' means, nothing else known."""
-    rows = design.coefficients[design.there]
-    scale = np.sqrt(design.variance[design.there])
-    found, *_ = np.linalg.lstsq(rows / scale[:, None], design.mean[design.there] / scale, rcond=None)
-    floor = 1e-3 * np.abs(found).max() + 1e-6
-    return np.concatenate([np.log(np.maximum(found, floor)), np.zeros(9 + len(design.nuisances))])
+def find_mode(post: Posterior) -> Mode:
+    """Mode by BFGS from the priors' medians, with derivatives by central differences."""
+    size = 6
+    steps = STEP * np.eye(size)
 
+    def loss(x: np.ndarray) -> float:
+        return -float(post.log_prob(x[None])[0])
 
-@jax.jit
-def _find(start: jax.Array, data: Data) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Newton-whitened BFGS: curvatures of log properties exceed the priors' 1e8-fold."""
-    hessian = jax.hessian(lambda x: -mean_log_prob(x, data))
-    values, vectors = jnp.linalg.eigh(hessian(start))
-    whiten = vectors / jnp.sqrt(jnp.maximum(jnp.abs(values), 1e-3))[None, :]
+    def gradient(x: np.ndarray) -> np.ndarray:
+        both = post.log_prob(np.concatenate([x + steps, x - steps]))
+        return -(both[:size] - both[size:]) / (2 * STEP)
 
-    def loss(y: jax.Array, _: None) -> jax.Array:
-        return -mean_log_prob(start + whiten @ y, data)
-
-    solver = optx.BFGS(rtol=1e-8, atol=1e-8)
-    found = optx.minimise(loss, solver, jnp.zeros_like(start), max_steps=MAX_STEPS, throw=False)
-    x = start + whiten @ found.value
-    done = found.result == optx.RESULTS.successful
-    return x, hessian(x), log_likelihoods(x, data), done
-
-
-def find_mode(start: np.ndarray, data: Data) -> Mode:
-    """Mode from `start` (dim,), its Laplace covariance, and alignments referred to it.
-
-    `converged` is False where BFGS ran out of steps; the sampler then starts from the best point.
-    """
-    x, hessian, reference, done = _find(jnp.asarray(start), data)
-    values, vectors = np.linalg.eigh(np.asarray(hessian))
-    covariance = (vectors / np.maximum(values, 1e-6)) @ vectors.T
-    return Mode(np.asarray(x), covariance, data._replace(reference=reference), bool(done))
+    found = minimize(loss, np.zeros(size), jac=gradient, method="BFGS", options={"gtol": 1e-4})
+    hessian = np.array([(gradient(found.x + h) - gradient(found.x - h)) / (2 * STEP) for h in steps])
+    values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
+    covariance = (vectors / np.maximum(values, 0.1)) @ vectors.T
+    mean, chol = post.given(found.x[None])
+    num = len(post.design.unknowns)
+    spread = np.linalg.inv(chol[0])[:, :num]
+    slope = float(np.abs(gradient(found.x)).max())
+    return Mode(found.x, covariance, post.reference + mean[0, :num], spread.T @ spread, slope < 1e-2)

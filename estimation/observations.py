@@ -21,7 +21,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.emissions import TAIL
 from hmmseg.segmentation.features import acceleration, thin
@@ -30,6 +30,7 @@ CHANNELS = ("force", "distance", "rise")
 MAX_RATE = 50.0  # Hz; noise of finer samples is averaged before it is weighed
 NUM_ALIGNMENTS = 16
 MIN_STRETCH = 0.5
+MIN_FREE = 8  # samples of free motion that tell the scale of the forces there
 
 
 @dataclass(frozen=True)
@@ -38,18 +39,24 @@ class Weights:
 
     `grips[m]` maps "force", "distance", "pickup" and "place" to weights that sum to 1 over the
     samples (0 everywhere: nothing recorded), `counts[m]` to effective sample numbers
-    (num_alignments,); `free` are weights (num_timesteps,) over free motion.
+    (num_alignments,); `free` are weights (num_timesteps,) over free motion, `free_robust`
+    (4, num_timesteps) those of each force, which a finger that touches early does not sway.
     """
 
     grips: dict[int, dict[str, np.ndarray]]
     counts: dict[int, dict[str, np.ndarray]]
     free: np.ndarray
+    free_robust: np.ndarray
     free_count: float
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Of each channel: variance of one effective sample and the number it was learned from."""
+    """Variance of one effective sample and the number it was learned from.
+
+    Of each kind of mean of a grip ("force", "distance", "pickup", "place"), and of each force in
+    free motion by its name.
+    """
 
     variance: dict[str, float]
     count: dict[str, float]
@@ -157,9 +164,31 @@ def aligned_weights(
         free &= np.isfinite(thinned.fx1 + thinned.fy1 + thinned.fx2 + thinned.fy2)
         # The samples beside a contact change may be contact already.
         free &= np.convolve(~free, [1, 1, 1], "same") == 0
-        weights = Weights(grips, counts, free / max(free.sum(), 1), float(free.sum()))
+        robust = np.zeros((len(FORCE_CHANNELS), free.size))
+        for row, name in zip(robust, FORCE_CHANNELS, strict=True):
+            values = getattr(thinned, name)
+            scale = _free_scale(thinned, name, free)
+            weight, residual, _ = robust_weights(values, free, scale)
+            row[:] = np.where(free, weight, 0.0) / max(weight[free].sum(), 1e-9)
+            scales[name] = max(scales.get(name, 0.0), scale)
+            pooled.setdefault(name, []).append((residual[free], weight[free]))
+        weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()))
         out.append(Aligned(thinned, masks, weights))
     return out, _noise(pooled, scales)
+
+
+def free_forces(signals: Signals, aligned: Aligned) -> np.ndarray:
+    """Mean forces (4,) in free motion [N], where they ought to vanish."""
+    force = np.stack([getattr(signals, name) for name in FORCE_CHANNELS])
+    return (aligned.weights.free_robust * np.nan_to_num(force)).sum(axis=1)
+
+
+def _free_scale(signals: Signals, name: str, free: np.ndarray) -> float:
+    """Robust scale of a force in free motion [N]; where there is next to none, what the rig states."""
+    values = getattr(signals, name)[free]
+    if values.size < MIN_FREE:
+        return signals.sd_force if np.isfinite(signals.sd_force) else 1.0
+    return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-9)
 
 
 def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: str, rig: Rig) -> float:

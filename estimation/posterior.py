@@ -1,116 +1,185 @@
-"""Log posterior of properties, noise scales and systematic deviations, in JAX.
+"""The posterior, all that enters linearly integrated out: a density of six scales.
 
-Parameters, one vector: log properties (P), log noise scales (3), log tau ratios (3), common
-shifts (3, in prior sd) and deviations of the hand (N, in prior sd). Alignments are marginalised:
-they were drawn from their posterior at the mode, so that by importance sampling
+Given the noise scale s_c and the share k_c of model error that differs from grip to grip, of each
+channel c, all else is jointly Gaussian: properties, deviations of the hand z and the share e_c of
+model error that all grips have alike,
 
-    log p(data | x) = sum over trials of log mean_s exp(l_s(x) - l_s(mode)) + constant.
+    mean = A q + J z + unit e_c + N(0, s_c^2 variance + (k_c unit)^2),
+    z ~ N(0, 1) and as free motion has it,    e_c ~ N(0, COMMON_c^2 + k_c^2).
+
+(What all grips have alike no repeat can show. It is at least what the prior says and at least as
+large as what differs between them.) An unknown q belongs to one channel, so it is eliminated there:
+what remains of a channel is a small quadratic form in (z, e_c) that depends on r_c = (k_c / s_c)^2
+alone, once 1 / s_c^2 is taken out. It is tabulated over r_c, and log_prob takes the same time
+whatever the number of blocks, grips and trials. Unknowns have a flat prior in here; their own is put
+in when they are drawn (`estimation.sampler`).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from estimation import priors
 from estimation.design import Design
-from hmmseg import jaxconfig  # noqa: F401
+from estimation.observations import CHANNELS
 
-NUM_CHANNELS = 3
-
-
-class Data(NamedTuple):
-    """The design as arrays of one compiled program; trials padded to a few sizes."""
-
-    mean: Float[Array, "T S O"]
-    variance: Float[Array, "T S O"]
-    there: Float[Array, "T S O"]
-    coefficients: Float[Array, "T S O P"]
-    shifts: Float[Array, "T S O N"]
-    channel: Float[Array, "O 3"]
-    free_mean: Float[Array, "T 4"]
-    free_precision: Float[Array, "T 4"]
-    free_shifts: Float[Array, "T 4 N"]
-    tau: Float[Array, " 3"]
-    common: Float[Array, " 3"]
-    scale_sd: Float[Array, " 3"]
-    prior_mean: Float[Array, " P"]
-    prior_sd: Float[Array, " P"]
-    reference: Float[Array, "T S"]
+NUM_CHANNELS = len(CHANNELS)
+STEP = 0.25  # of the table, in log r: cubic interpolation is then exact to some 1e-5
+REACH = (-18.0, 26.0)  # of the table about the prior median of log r; priors leave nothing beyond
 
 
-def pack(design: Design) -> Data:
-    """Arrays of the design, trials padded to a power of two with trials that say nothing."""
-    num = design.mean.shape[0]
-    extra = (1 << (num - 1).bit_length()) - num
+@dataclass(frozen=True)
+class Posterior:
+    """Posterior of a design; scales theta are log s_c (3) and log(k_c / its prior median) (3).
 
-    def padded(values: np.ndarray, fill: float = 0.0) -> jax.Array:
-        pad = [(0, extra)] + [(0, 0)] * (values.ndim - 1)
-        return jnp.asarray(np.pad(values.astype(float), pad, constant_values=fill))
+    `reference` (Q,): least squares, about which all else is written to keep its digits.
+    """
 
-    prior_mean, prior_sd = priors.property_priors(design.names)
-    mean = padded(design.mean)
-    return Data(
-        mean=mean, variance=padded(design.variance, 1.0), there=padded(design.there),
-        coefficients=padded(design.coefficients), shifts=padded(design.shifts),
-        channel=jnp.eye(NUM_CHANNELS)[design.channel],
-        free_mean=padded(design.free_mean), free_precision=padded(1 / design.free_variance),
-        free_shifts=padded(design.free_shifts), tau=jnp.asarray(design.tau),
-        common=jnp.asarray(design.common), scale_sd=jnp.asarray(1 / np.sqrt(2 * design.scale_count)),
-        prior_mean=jnp.asarray(prior_mean), prior_sd=jnp.asarray(prior_sd),
-        reference=jnp.zeros(mean.shape[:2]),
-    )  # fmt: skip
+    design: Design
+    reference: np.ndarray
+
+    @cached_property
+    def scale_sd(self) -> np.ndarray:
+        """Prior sd (3,) of log s: the variance was learned from so many samples."""
+        return 1 / np.sqrt(2 * np.maximum(self.design.scale_count, 1.0))
+
+    @cached_property
+    def hand_precision(self) -> np.ndarray:
+        """Precision (N, N) of the deviations: their prior, and free motion."""
+        d, num = self.design, len(self.design.nuisances)
+        free = d.free_shifts.reshape(d.free_variance.size, num)
+        return np.eye(num) + (free.T / d.free_variance.ravel()) @ free
+
+    @cached_property
+    def hand_gradient(self) -> np.ndarray:
+        """Precision times mean (N,) of the deviations as free motion has them."""
+        d = self.design
+        free = d.free_shifts.reshape(d.free_variance.size, len(d.nuisances))
+        return free.T @ (d.free_mean / d.free_variance).ravel()
+
+    @cached_property
+    def _tables(self) -> list[_Table]:
+        return [_tabulate(self, c) for c in range(NUM_CHANNELS)]
+
+    def channel_rows(self, c: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of one channel: rows A (n, Q_c), rows [J, unit] (n, N + 1), residuals (n,), which Q_c."""
+        d, mine = self.design, self.design.channel == c
+        which = np.array([i for i, u in enumerate(d.unknowns) if priors.CHANNEL[u.prop] == c], int)
+        shared = np.concatenate([d.shifts[mine], d.unit[mine, None]], axis=1)
+        rows = d.coefficients[mine][:, which]
+        return rows, shared, d.mean[mine] - rows @ self.reference[which], which
+
+    def shares(self, theta: np.ndarray) -> np.ndarray:
+        """Share (..., 3) of model error that differs from grip to grip."""
+        return priors.SCATTER_MEDIAN * np.exp(theta[..., NUM_CHANNELS:])
+
+    def log_prior(self, theta: np.ndarray) -> np.ndarray:
+        """Log prior (W,) of scales (W, 6), up to a constant."""
+        out = -0.5 * ((theta[:, :NUM_CHANNELS] / self.scale_sd) ** 2).sum(axis=1)
+        return out - 0.5 * ((theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD) ** 2).sum(axis=1)
+
+    def log_prob(self, theta: np.ndarray) -> np.ndarray:
+        """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant."""
+        num = len(self.design.nuisances)
+        size, log_s = num + NUM_CHANNELS, theta[:, :NUM_CHANNELS]
+        common = priors.COMMON**2 + self.shares(theta) ** 2
+        precision, gradient = np.zeros((len(theta), size, size)), np.zeros((len(theta), size))
+        precision[:, :num, :num], gradient[:, :num] = self.hand_precision, self.hand_gradient
+        out = self.log_prior(theta) - 0.5 * np.log(common).sum(axis=1)
+        for c, table in enumerate(self._tables):
+            precision[:, num + c, num + c] += 1 / common[:, c]
+            if not table.count:
+                continue
+            log_r = 2 * (theta[:, NUM_CHANNELS + c] - log_s[:, c])
+            weight = np.exp(-2 * log_s[:, c])
+            squares, log_det, quadratic, linear = table.at(log_r)
+            mine = [*range(num), num + c]
+            precision[:, np.ix_(mine, mine)[0], np.ix_(mine, mine)[1]] += weight[:, None, None] * quadratic
+            gradient[:, mine] += weight[:, None] * linear
+            out -= 0.5 * (2 * table.count * log_s[:, c] + log_det + weight * squares)
+        chol = np.linalg.cholesky(precision)
+        white = np.linalg.solve(chol, gradient[..., None])[..., 0]
+        return out + 0.5 * (white**2).sum(axis=1) - np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
+
+    def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (W, Q + N + 3) and Cholesky factor of the precision of (q, z, e) given scales (W, 6).
+
+        q relative to `reference`. Worked out from all observations, without the table.
+        """
+        d = self.design
+        num_q, num = len(d.unknowns), len(d.nuisances)
+        size = num_q + num + NUM_CHANNELS
+        hand = slice(num_q, num_q + num)
+        precision, gradient = np.zeros((len(theta), size, size)), np.zeros((len(theta), size))
+        precision[:, hand, hand], gradient[:, hand] = self.hand_precision, self.hand_gradient
+        shares = self.shares(theta)
+        for c in range(NUM_CHANNELS):
+            rows, shared, residual, which = self.channel_rows(c)
+            mine = [*which, *range(num_q, num_q + num), num_q + num + c]
+            every = np.concatenate([rows, shared], axis=1)
+            own = d.channel == c
+            variance = np.exp(2 * theta[:, [c]]) * d.variance[own] + (shares[:, [c]] * d.unit[own]) ** 2
+            outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), len(mine) ** 2)
+            block = (1 / variance @ outer).reshape(len(theta), len(mine), len(mine))
+            precision[:, np.array(mine)[:, None], np.array(mine)] += block
+            gradient[:, mine] += (residual / variance) @ every
+            precision[:, mine[-1], mine[-1]] += 1 / (priors.COMMON[c] ** 2 + shares[:, c] ** 2)
+        chol = np.linalg.cholesky(precision)
+        mean = np.linalg.solve(np.swapaxes(chol, 1, 2), np.linalg.solve(chol, gradient[..., None]))
+        return mean[..., 0], chol
 
 
-Vector = Float[Array, "..."] | Float[np.ndarray, "..."]
+def posterior(design: Design) -> Posterior:
+    """The posterior of a design that determines at least one unknown."""
+    sd = np.sqrt(design.variance)
+    found, *_ = np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)
+    return Posterior(design, found)
 
 
-def split(x: Vector, num_properties: int) -> tuple[Vector, Vector, Vector, Vector, Vector]:
-    """Log properties, log scales, log tau ratios, common shifts and deviations, on the last axis."""
-    p = num_properties
-    return x[..., :p], x[..., p : p + 3], x[..., p + 3 : p + 6], x[..., p + 6 : p + 9], x[..., p + 9 :]
+@dataclass(frozen=True)
+class _Table:
+    """One channel's unknowns eliminated, on a grid of log r: rows (G, 2 + (N + 1)^2 + (N + 1)).
+
+    `count`: observations less unknowns. Columns: sum of squares, log determinants, quadratic form
+    and linear term in (z, e), all for s = 1.
+    """
+
+    count: int
+    values: np.ndarray
+
+    def at(self, log_r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The columns at log r (W,), relative to the prior median, by Catmull and Rom's cubic."""
+        place = np.clip((log_r - REACH[0]) / STEP, 1.0, len(self.values) - 3.001)
+        index = place.astype(int)
+        t = place - index
+        weights = 0.5 * np.stack([
+            t * (t * (2 - t) - 1), t**2 * (3 * t - 5) + 2, t * (t * (4 - 3 * t) + 1), t**2 * (t - 1)
+        ])  # fmt: skip
+        found = np.einsum("kw,kwf->wf", weights, self.values[index + np.arange(-1, 3)[:, None]])
+        size = int(np.sqrt(found.shape[1] - 1.75) - 0.5)
+        return found[:, 0], found[:, 1], found[:, 2:-size].reshape(-1, size, size), found[:, -size:]
 
 
-def log_likelihoods(x: Float[Array, " D"], data: Data) -> Float[Array, "T S"]:
-    """Log likelihood of each trial's observations under each of its alignments."""
-    log_properties, log_scale, log_tau, common, deviations = split(x, data.prior_mean.shape[0])
-    predicted = data.coefficients @ jnp.exp(log_properties) + data.shifts @ deviations
-    predicted = predicted + (data.channel @ (data.common * common))[None, None, :]
-    scale2 = data.channel @ jnp.exp(2 * log_scale)
-    tau2 = data.channel @ (data.tau * jnp.exp(log_tau)) ** 2
-    variance = data.variance * scale2[None, None, :] + tau2[None, None, :]
-    residual = data.mean - predicted
-    terms = -0.5 * (residual**2 / variance + jnp.log(2 * jnp.pi * variance))
-    return (terms * data.there).sum(axis=-1)
-
-
-def log_prior(x: Float[Array, " D"], data: Data) -> Float[Array, ""]:
-    """Log prior, free motion's word on the deviations included (no alignment changes it)."""
-    log_properties, log_scale, log_tau, common, deviations = split(x, data.prior_mean.shape[0])
-    out = -0.5 * (((log_properties - data.prior_mean) / data.prior_sd) ** 2).sum()
-    out += -0.5 * ((log_scale / data.scale_sd) ** 2).sum()
-    out += -0.5 * ((log_tau / priors.TAU_LOG_SD) ** 2).sum()
-    out += -0.5 * (common**2).sum() - 0.5 * (deviations**2).sum()
-    if deviations.size == 0:
-        return out
-    free = data.free_mean - data.free_shifts @ deviations
-    return out - 0.5 * (free**2 * data.free_precision).sum()
-
-
-def log_prob(x: Float[Array, " D"], data: Data) -> Float[Array, ""]:
-    """Log posterior density of x up to a constant, alignments marginalised."""
-    relative = log_likelihoods(x, data) - data.reference
-    marginal = jax.nn.logsumexp(relative, axis=1) - jnp.log(relative.shape[1])
-    return marginal.sum() + log_prior(x, data)
-
-
-def mean_log_prob(x: Float[Array, " D"], data: Data) -> Float[Array, ""]:
-    """As `log_prob`, the log likelihood averaged over alignments: what the mode is sought on."""
-    return log_likelihoods(x, data).mean(axis=1).sum() + log_prior(x, data)
-
-
-log_prob_batch = jax.jit(jax.vmap(log_prob, in_axes=(0, None)))
+def _tabulate(post: Posterior, c: int) -> _Table:
+    rows, shared, residual, _ = post.channel_rows(c)
+    if not len(rows):
+        return _Table(0, np.zeros((0, 0)))
+    mine = post.design.channel == c
+    unit2 = (priors.SCATTER_MEDIAN[c] * post.design.unit[mine]) ** 2
+    grid = np.exp(np.arange(REACH[0], REACH[1] + STEP, STEP))
+    variance = post.design.variance[mine] + grid[:, None] * unit2  # G, n
+    every = np.concatenate([rows, shared, residual[:, None]], axis=1)
+    size = every.shape[1]
+    outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), size**2)
+    normal = (1 / variance @ outer).reshape(len(grid), size, size)
+    num_q = rows.shape[1]
+    chol = np.linalg.cholesky(normal[:, :num_q, :num_q])
+    cross = np.linalg.solve(chol, normal[:, :num_q, num_q:])
+    rest = normal[:, num_q:, num_q:] - np.swapaxes(cross, 1, 2) @ cross
+    log_det = np.log(variance).sum(axis=1) + 2 * np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
+    quadratic = rest[:, :-1, :-1].reshape(len(grid), -1)
+    values = np.concatenate([rest[:, -1:, -1], log_det[:, None], quadratic, rest[:, :-1, -1]], axis=1)
+    return _Table(len(rows) - num_q, values)

@@ -1,9 +1,9 @@
 """Posterior-predictive checks: could recordings like these come from the fitted model?
 
-For each channel the discrepancy is the weighted scatter of the grips' means about their
-prediction, with the trial-to-trial scatter at its prior median (it may not absorb what it is
-asked about): its posterior-predictive p-value compares observed with replicated scatter (Gelman,
-Meng, Stern 1996). A small p-value says that grips differ by more than sensors and hand explain.
+For each channel the discrepancy is the weighted scatter of the grips' means about their prediction,
+with the scatter between grips at its prior median (it may not absorb what it is asked about): its
+posterior-predictive p-value compares observed with replicated scatter (Gelman, Meng, Stern 1996). A
+small p-value says that grips differ by more than sensors and hand explain.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.design import Design
+from estimation import priors
 from estimation.observations import CHANNELS
-from estimation.posterior import Data, split
+from estimation.posterior import NUM_CHANNELS, Posterior
 from estimation.sampler import Draws
 
 NUM_REPLICATES = 400
@@ -30,44 +30,48 @@ MEANING = {
 class PredictiveCheck:
     """Posterior-predictive p-value per channel, and warnings for those that are small.
 
-    `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m).
+    `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m);
+    `repeats`: observations that tell it, none where the prior alone decides.
     """
 
     p_values: dict[str, float]
     excess: dict[str, float]
+    repeats: dict[str, int]
     warnings: tuple[str, ...]
 
     def to_json(self) -> dict:
-        """p-values and excess scatter by channel."""
+        """p-values, excess scatter and what it was learned from, by channel."""
         return {
-            name: {"p_value": p, "scatter_between_grips": self.excess[name]}
+            name: {"p_value": p, "scatter_between_grips": self.excess[name], "repeats": self.repeats[name]}
             for name, p in self.p_values.items()
         }
 
 
-def check(design: Design, data: Data, draws: Draws, rng: np.random.Generator) -> PredictiveCheck:
-    """Check every channel that was observed more often than it has parameters."""
-    flat = draws.flat
-    x = flat[rng.integers(len(flat), size=NUM_REPLICATES)]
-    num = len(design.names)
-    there = design.there.all(axis=1)
-    mean, variance = design.mean.mean(axis=1), design.variance.mean(axis=1)
-    coefficients, shifts = design.coefficients.mean(axis=1), design.shifts.mean(axis=1)
-    log_properties, log_scale, log_tau, common, deviations = split(x, num)
-    predicted = np.einsum("top,rp->rto", coefficients, np.exp(log_properties))
-    predicted += np.einsum("ton,rn->rto", shifts, deviations)
-    predicted += (design.common * common)[:, None, design.channel]
-    spread = variance * np.exp(2 * log_scale)[:, None, design.channel] + design.tau[design.channel] ** 2
-    z = (mean - predicted) / np.sqrt(spread)
+def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> PredictiveCheck:
+    """Check every channel that was observed."""
+    d = post.design
+
+    def of(values: np.ndarray) -> np.ndarray:
+        return values.reshape(len(draws.flat), values.shape[-1])[chosen]
+
+    chosen = rng.integers(len(draws.flat), size=NUM_REPLICATES)
+    scales, shares = of(draws.scales), of(draws.shares)
+    predicted = of(draws.chain) @ d.coefficients.T + of(draws.deviations) @ d.shifts.T
+    predicted += shares[:, d.channel] * d.unit
+    spread = d.variance * np.exp(2 * scales[:, d.channel])
+    spread += (priors.SCATTER_MEDIAN[d.channel] * d.unit) ** 2
+    z = (d.mean - predicted) / np.sqrt(spread)
     new = rng.normal(size=z.shape)
-    p_values, excess, warnings = {}, {}, []
+    p_values, excess, repeats, warnings = {}, {}, {}, []
     for c, name in enumerate(CHANNELS):
-        chosen = there & (design.channel == c)
-        if not chosen.any():
+        mine = d.channel == c
+        if not mine.any():
             continue
-        observed, replicated = ((v[:, chosen] ** 2).sum(axis=1) for v in (z, new))
+        observed, replicated = ((v[:, mine] ** 2).sum(axis=1) for v in (z, new))
         p_values[name] = float(np.mean(replicated >= observed))
-        excess[name] = float(np.median(design.tau[c] * np.exp(log_tau[:, c])))
+        share = priors.SCATTER_MEDIAN[c] * np.exp(scales[:, NUM_CHANNELS + c])
+        excess[name] = float(np.median(share) * np.mean(d.unit[mine]))
+        repeats[name] = int(d.repeats()[c])
         if p_values[name] < SMALL:
             warnings.append(f"{MEANING[name]} by more than sensor noise (p {p_values[name]:.3f})")
-    return PredictiveCheck(p_values, excess, tuple(warnings))
+    return PredictiveCheck(p_values, excess, repeats, tuple(warnings))

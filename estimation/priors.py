@@ -1,19 +1,50 @@
-"""Priors of the properties and of the noise model, with their reasons in docs/model.md.
+"""Priors of properties and of what the contact equations leave out, with reasons in docs/model.md.
 
 Properties are log-normal: blocks that a 4 N pinch can carry and a 75 mm workspace holds, a
 factor of e^sd either way. They are wide: the recording decides.
+
+Model error is a share of what each channel's equation is built on (`estimation.design`): the carried
+force, the pads' give along the grip, their shear deflection.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
 PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # N, m, m
 PROPERTY_LOG_SD = {"weight": 1.5, "width": 1.0, "height": 1.0}
-TAU_LOG_SD = 1.0  # normal prior of log(tau / its prior median)
+
+CHANNEL = {"weight": 0, "width": 1, "height": 2}  # by which each property is observed
+SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.04])  # share that differs from grip to grip
+SCATTER_LOG_SD = 1.0  # normal prior of log(share / its prior median)
+COMMON = np.array([5e-4, 1e-3, 0.05])  # standard deviation of the share that all grips have alike
 
 
-def property_priors(names: tuple[tuple[str, str], ...]) -> tuple[np.ndarray, np.ndarray]:
+def property_priors(names: Iterable[tuple[str, str]]) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation (num_properties,) of the log properties."""
-    mean = np.array([np.log(PROPERTY_MEDIAN[prop]) for _, prop in names])
-    return mean, np.array([PROPERTY_LOG_SD[prop] for _, prop in names])
+    props = [prop for _, prop in names]
+    mean = np.log([PROPERTY_MEDIAN[prop] for prop in props])
+    return mean, np.array([PROPERTY_LOG_SD[prop] for prop in props])
+
+
+def log_prior(prop: str, coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Log density (N,), up to a constant, of values (N,) of sum(coefficients * property of an object).
+
+    A sum of independent log-normal variables is taken as the log-normal of the same first two
+    moments (Fenton 1960), one with differences as the normal. -inf where a positive sum is not.
+    """
+    spread = PROPERTY_LOG_SD[prop] ** 2
+    each = PROPERTY_MEDIAN[prop] * np.exp(spread / 2)
+    mean = coefficients.sum() * each
+    variance = (coefficients**2).sum() * each**2 * np.expm1(spread)
+    if (coefficients < 0).any():
+        return -0.5 * (values - mean) ** 2 / variance
+    log_variance = np.log1p(variance / mean**2)
+    log_mean = np.log(mean) - log_variance / 2
+    out = np.full(values.shape, -np.inf)
+    positive = values > 0
+    log_values = np.log(values[positive])
+    out[positive] = -log_values - 0.5 * (log_values - log_mean) ** 2 / log_variance
+    return out

@@ -1,9 +1,8 @@
-"""emcee on the posterior: moves, convergence and draws.
+"""emcee on the scales, the unknowns drawn given them: moves, convergence and draws.
 
-Given the noise scales and the trial-to-trial scatter the posterior is nearly Gaussian, and its
-width follows them. So most proposals are independent draws that know this (estimation.proposal;
-accepted often, so autocorrelation is a few steps), the rest are differential evolution moves (ter
-Braak 2006), which need no such approximation and free walkers that it would hold in a tail.
+All else is integrated out (`estimation.posterior`), so emcee moves in six dimensions whatever the
+task. Most proposals are independent draws about the Laplace approximation (`estimation.proposal`),
+the rest differential evolution (ter Braak 2006), which frees walkers that it would hold in a tail.
 experiments/benchmarks/moves.py compares them with emcee's stretch move.
 """
 
@@ -13,43 +12,57 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import emcee
-import jax.numpy as jnp
 import numpy as np
 
-from estimation.mode import Mode
-from estimation.posterior import log_prob_batch
+from estimation import priors
+from estimation.mode import Mode, find_mode
+from estimation.posterior import Posterior
 from estimation.proposal import proposal
 
 INDEPENDENT = 0.9  # share of independence proposals
 WALKERS = 64
-BURN_IN, CHUNK, MAX_STEPS = 50, 100, 2000
+BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000
 MIN_LENGTH = 50  # steps in units of the autocorrelation time, emcee's own rule
 MIN_ESS, MAX_RHAT = 1000.0, 1.01
 GROUPS = 4  # chains that walkers are joined into for R-hat
+KEPT = 4096  # draws of the unknowns at least, where the chain has so many
+BATCH = 256  # drawn at once
+IMPORTANCE = 20_000  # draws about the Laplace approximation where the chain does not converge
+MIN_EFFICIENCY = 0.05  # of them, for these to stand in
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Posterior draws (num_walkers, num_steps, dim) and how they converged.
+    """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
 
-    `ess`: smallest effective sample size over parameters (emcee's autocorrelation time), `rhat`:
-    largest split R-hat over parameters, walkers as chains (Gelman et al. 2013).
+    `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest
+    split R-hat over scales, walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 3):
+    of model error that all grips have alike; `deviations` (walkers, steps, N) of the hand.
+    `method`: "emcee", or "laplace" for importance-weighted draws about the Laplace approximation,
+    which stand in where the chain did not converge. `prior_ess`: share of draws left effective by
+    the unknowns' priors.
     """
 
+    scales: np.ndarray
     chain: np.ndarray
+    deviations: np.ndarray
+    shares: np.ndarray
     ess: float
     rhat: float
     acceptance: float
+    steps: int
+    method: str
+    prior_ess: float
 
     @property
     def flat(self) -> np.ndarray:
-        """Draws (num_draws, dim)."""
+        """Draws (num_draws, Q) of the unknowns."""
         return self.chain.reshape(-1, self.chain.shape[-1])
 
     @property
     def converged(self) -> bool:
-        """Whether ESS and R-hat reach what this module asks for."""
-        return self.ess >= MIN_ESS and self.rhat <= MAX_RHAT
+        """Whether ESS and R-hat reach what this module asks for, priors taken in."""
+        return self.ess >= MIN_ESS and self.rhat <= MAX_RHAT and self.prior_ess >= MIN_EFFICIENCY
 
 
 def independence_move(mode: Mode) -> emcee.moves.MHMove:
@@ -57,28 +70,25 @@ def independence_move(mode: Mode) -> emcee.moves.MHMove:
     independent = proposal(mode)
 
     def propose(x: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        new, log_density = independent.draw(len(x), random)
-        return new, independent.log_density(x) - log_density
+        new = independent.draw(len(x), random)
+        return new, independent.log_density(x) - independent.log_density(new)
 
     return emcee.moves.MHMove(propose)
 
 
-def sample(mode: Mode, seed: int, progress: Callable[[int, int], None] | None = None) -> Draws:
+def sample(
+    post: Posterior, seed: int, progress: Callable[[int, int], None] | None = None, mode: Mode | None = None
+) -> Draws:
     """Draws from the posterior, until converged or MAX_STEPS; `progress(steps, of)` is called."""
-    dim = mode.x.size
-    walkers = max(WALKERS, 4 * ((dim + 1) // 2))
+    mode = find_mode(post) if mode is None else mode
     random = np.random.RandomState(seed)
-    start, _ = proposal(mode).draw(walkers, random)
-
-    def log_prob(x: np.ndarray) -> np.ndarray:
-        return np.asarray(log_prob_batch(jnp.asarray(x), mode.data))
-
+    start = proposal(mode).draw(WALKERS, random)
     moves = [(independence_move(mode), INDEPENDENT), (emcee.moves.DEMove(), 1 - INDEPENDENT)]
-    sampler = emcee.EnsembleSampler(walkers, dim, log_prob, moves=moves, vectorize=True)
-    state = emcee.State(start, random_state=random.get_state())
-    state = sampler.run_mcmc(state, BURN_IN)
+    sampler = emcee.EnsembleSampler(WALKERS, start.shape[1], post.log_prob, moves=moves, vectorize=True)
+    state = sampler.run_mcmc(emcee.State(start, random_state=random.get_state()), BURN_IN)
     sampler.reset()
-    steps = 0
+    steps, ess, rhat = 0, 0.0, np.inf
+    chain = np.zeros((WALKERS, 0, start.shape[1]))
     while steps < MAX_STEPS:
         state = sampler.run_mcmc(state, CHUNK)
         steps += CHUNK
@@ -86,10 +96,66 @@ def sample(mode: Mode, seed: int, progress: Callable[[int, int], None] | None = 
         ess, rhat = effective_sample_size(chain), split_rhat(chain)
         if progress is not None:
             progress(steps, MAX_STEPS)
-        long = ess >= MIN_LENGTH * walkers
+        long = ess >= MIN_LENGTH * WALKERS
         if steps >= 2 * CHUNK and long and ess >= 1.5 * MIN_ESS and rhat <= MAX_RHAT:
             break
-    return Draws(chain, ess, rhat, float(sampler.acceptance_fraction.mean()))
+    acceptance, method = float(sampler.acceptance_fraction.mean()), "emcee"
+    if ess < MIN_ESS or rhat > MAX_RHAT:
+        drawn, weight = importance(post, mode, random)
+        efficiency = 1 / (weight**2).sum() / len(weight)
+        if efficiency >= MIN_EFFICIENCY:
+            chain = drawn[_resampled(weight, random)[: WALKERS * 64]].reshape(WALKERS, 64, -1)
+            ess, rhat, method = efficiency * IMPORTANCE, 1.0, "laplace"
+    thin = max(chain.shape[0] * chain.shape[1] // KEPT, 1)
+    scales = chain[:, thin - 1 :: thin]
+    rest, prior_ess = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
+    num, deviations = len(post.design.unknowns), len(post.design.nuisances)
+    rest = rest.reshape(*scales.shape[:2], -1)
+    return Draws(
+        scales, rest[..., :num], rest[..., num : num + deviations], rest[..., num + deviations :],
+        ess, rhat, acceptance, steps, method, prior_ess,
+    )  # fmt: skip
+
+
+def importance(post: Posterior, mode: Mode, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    """Draws (num, 6) of the proposal and their normalised importance weights (num,)."""
+    found = proposal(mode)
+    x = found.draw(IMPORTANCE, random)
+    log_weight = post.log_prob(x) - found.log_density(x)
+    weight = np.exp(log_weight - log_weight.max())
+    return x, weight / weight.sum()
+
+
+def draw_unknowns(
+    post: Posterior, theta: np.ndarray, random: np.random.RandomState
+) -> tuple[np.ndarray, float]:
+    """Draws (W, Q + N + 3) of unknowns, deviations and common shares, one for each row of scales.
+
+    They come from the conditional Gaussian, whose prior of the unknowns is flat, and are resampled
+    by the unknowns' own prior (systematically, so order is kept). Also the share of draws that this
+    leaves effective: next to 1 where the recording decides.
+    """
+    parts = []
+    for k in range(0, len(theta), BATCH):
+        mean, chol = post.given(theta[k : k + BATCH])
+        z = random.normal(size=mean.shape)
+        parts.append(mean + np.linalg.solve(np.swapaxes(chol, 1, 2), z[..., None])[..., 0])
+    out = np.concatenate(parts)
+    out[:, : post.reference.size] += post.reference
+    log_weight = np.zeros(len(out))
+    for i, u in enumerate(post.design.unknowns):
+        log_weight += priors.log_prior(u.prop, np.array(list(u.terms.values())), out[:, i])
+    if not np.isfinite(log_weight).any():
+        return out, 0.0
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    return out[_resampled(weight, random)], float(1 / (weight**2).sum() / len(weight))
+
+
+def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:
+    """Indices (num,) of a systematic resample."""
+    points = (random.uniform() + np.arange(weight.size)) / weight.size
+    return np.minimum(np.searchsorted(np.cumsum(weight), points), weight.size - 1)
 
 
 def effective_sample_size(chain: np.ndarray) -> float:

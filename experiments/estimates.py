@@ -9,10 +9,9 @@ import numpy as np
 from scipy.stats import norm
 
 from estimation.design import PROPERTIES, build
-from estimation.identification import start
 from estimation.mode import find_mode
 from estimation.observations import aligned_weights
-from estimation.posterior import pack
+from estimation.posterior import posterior
 from estimation.sampler import sample
 from experiments.recordings import Case
 from experiments.scoring import boundaries_covered, boundary_residuals
@@ -50,21 +49,23 @@ def estimate(case: Case, trials: slice = slice(None), sampled: bool = True, seed
     pairs = list(zip(segmentations, truth, strict=True))
     rng = np.random.default_rng(seed)
     weighed, noise = aligned_weights(aligned, rng)
-    sd_force = case.rig.noise.force or aligned.fit.parameters.scale["force"]
-    design = build(chosen, weighed, noise, case.task, case.rig, sd_force)
-    mode = find_mode(start(design), pack(design))
-    num = len(design.names)
-    true = np.array([case.blocks[obj][prop][0] for obj, prop in design.names])
-    sd = np.sqrt(np.diag(mode.covariance))[:num]
-    means, ranks, rhat, ess = np.exp(mode.x[:num]), np.array([]), np.nan, np.nan
+    design = build(chosen, weighed, noise, case.task, case.rig)
+    post = posterior(design)
+    mode = find_mode(post)
+    single = [i for i, u in enumerate(design.unknowns) if u.single]
+    names = tuple(design.names[i] for i in single)
+    true = np.array([case.blocks[obj][prop][0] for obj, prop in names])
+    means, sd = mode.unknowns[single], np.sqrt(np.diag(mode.unknowns_covariance))[single]
+    z = (means - true) / sd
+    ranks, rhat, ess = np.array([]), np.nan, np.nan
     if sampled:
-        found = sample(mode, seed)
-        draws = np.exp(found.flat[:, :num])
+        found = sample(post, seed, mode=mode)
+        draws = found.flat[:, single]
         means, ranks, rhat, ess = draws.mean(axis=0), (draws < true).mean(axis=0), found.rhat, found.ess
     return Estimates(
         np.array([boundary_residuals(s, t) for s, t in pairs]),
         np.array([boundaries_covered(s, t) for s, t in pairs]),
-        design.names, means / true - 1, (mode.x[:num] - np.log(true)) / sd, ranks, rhat, ess,
+        names, means / true - 1, z, ranks, rhat, ess,
     )  # fmt: skip
 
 

@@ -16,14 +16,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import emcee
-import jax.numpy as jnp
 import numpy as np
 
 from estimation.design import build
-from estimation.identification import start
 from estimation.mode import Mode, find_mode
 from estimation.observations import aligned_weights
-from estimation.posterior import log_prob_batch, pack
+from estimation.posterior import Posterior, posterior
 from estimation.proposal import proposal
 from estimation.sampler import (
     BURN_IN,
@@ -41,14 +39,13 @@ RESULTS = Path(__file__).parents[1] / "results"
 STEPS = 600
 
 
-def mode_of(case: Case, num_trials: int) -> Mode:
-    """Posterior mode of a case's first trials."""
+def posterior_of(case: Case, num_trials: int) -> tuple[Posterior, Mode]:
+    """Posterior of a case's first trials, and its mode."""
     trials = list(case.trials[:num_trials])
     aligned = align(trials, case.task, case.rig)
     weighed, noise = aligned_weights(aligned, np.random.default_rng(0))
-    sd_force = case.rig.noise.force or aligned.fit.parameters.scale["force"]
-    design = build(trials, weighed, noise, case.task, case.rig, sd_force)
-    return find_mode(start(design), pack(design))
+    post = posterior(build(trials, weighed, noise, case.task, case.rig))
+    return post, find_mode(post)
 
 
 def move_sets(mode: Mode) -> dict[str, list]:
@@ -62,15 +59,11 @@ def move_sets(mode: Mode) -> dict[str, list]:
     }
 
 
-def measure(mode: Mode, moves: list) -> dict[str, float]:
+def measure(post: Posterior, mode: Mode, moves: list) -> dict[str, float]:
     """Efficiency of a set of moves from the same start."""
     random = np.random.RandomState(0)
-    first, _ = proposal(mode).draw(WALKERS, random)
-
-    def log_prob(x: np.ndarray) -> np.ndarray:
-        return np.asarray(log_prob_batch(jnp.asarray(x), mode.data))
-
-    sampler = emcee.EnsembleSampler(WALKERS, mode.x.size, log_prob, moves=moves, vectorize=True)
+    first = proposal(mode).draw(WALKERS, random)
+    sampler = emcee.EnsembleSampler(WALKERS, first.shape[1], post.log_prob, moves=moves, vectorize=True)
     state = sampler.run_mcmc(emcee.State(first, random_state=random.get_state()), BURN_IN)
     sampler.reset()
     began = time.process_time()
@@ -93,11 +86,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cases = simulated_cases(options.cases, seed=SEED + 3000)
     document: dict = {"walkers": WALKERS, "steps": STEPS, "seconds": "processor time", "trials": {}}
     for num_trials in (1, 4):
-        modes = [mode_of(case, num_trials) for case in cases]
+        found = [posterior_of(case, num_trials) for case in cases]
         rows = {}
-        for name in move_sets(modes[0]):
-            found = [measure(mode, move_sets(mode)[name]) for mode in modes]
-            rows[name] = {key: float(np.median([f[key] for f in found])) for key in found[0]}
+        for name in move_sets(found[0][1]):
+            each = [measure(post, mode, move_sets(mode)[name]) for post, mode in found]
+            rows[name] = {key: float(np.median([f[key] for f in each])) for key in each[0]}
             print(f"{num_trials} trials, {name}: tau {rows[name]['autocorrelation_time']:.1f} steps, "
                   f"{rows[name]['ess_per_second']:.0f} effective samples a second", flush=True)  # fmt: skip
         document["trials"][str(num_trials)] = rows

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from estimation.design import build
-from estimation.mode import Mode, find_mode, start
+from estimation.mode import Mode, find_mode
 from estimation.observations import aligned_weights
-from estimation.posterior import pack
+from estimation.posterior import Posterior, posterior
 from estimation.sampler import sample
 from experiments.scoring import state_accuracy
 from experiments.sweeps.cells import THRESHOLDS, Unit
@@ -101,34 +101,34 @@ def _ours(recorded: Recorded, signals: Signals, told: Scene, seed: int | None) -
         return {"residual": lost, "inside_90": lost, "accuracy": 0.0, "property": none, "inside_95": none}
     scores = _scores(aligned.trials[0].segmentation, recorded, signals, told)
     weighed, noise = aligned_weights(aligned, np.random.default_rng(recorded.number))
-    sd_force = told.rig.noise.force or aligned.fit.parameters.scale["force"]
-    design = build([recorded.trial], weighed, noise, told.task, told.rig, sd_force)
+    design = build([recorded.trial], weighed, noise, told.task, told.rig)
     columns = [(name, key) for name in told.task.objects for key in PROPERTIES]
-    truth = np.log([getattr(recorded.blocks[name], key) for name, key in columns])
-    where = [columns.index(name) for name in design.names]
+    truth = np.array([getattr(recorded.blocks[name], key) for name, key in columns])
+    where = [columns.index(u.name) for u in design.unknowns if u.single]  # these come first
     location, sd = np.full(count, np.nan), np.full(count, np.nan)
     if not where:
         return scores | {"property": location, "inside_95": location}
-    mode = find_mode(start(design), pack(design))
-    location[where] = mode.x[: len(where)]
-    sd[where] = np.sqrt(np.diag(mode.covariance)[: len(where)])
+    post = posterior(design)
+    mode = find_mode(post)
+    location[where] = mode.unknowns[: len(where)]
+    sd[where] = np.sqrt(np.diag(mode.unknowns_covariance)[: len(where)])
     z = (location - truth) / sd
-    scores |= {"property": np.expm1(location - truth), "inside_95": _where(np.abs(z) < Z95, z)}
+    scores |= {"property": location / truth - 1, "inside_95": _where(np.abs(z) < Z95, z)}
     if seed is not None:
-        scores["sampled"] = _sampled(mode, truth[where], seed)
+        scores["sampled"] = _sampled(post, mode, truth[where], seed)
     return scores
 
 
-def _sampled(mode: Mode, truth: np.ndarray, seed: int) -> dict[str, Any]:
+def _sampled(post: Posterior, mode: Mode, truth: np.ndarray, seed: int) -> dict[str, Any]:
     """The sampler's posterior against the Laplace one, per property determined."""
-    drawn = sample(mode, seed)
-    draws = drawn.flat[:, : truth.size]
-    laplace = np.sqrt(np.diag(mode.covariance)[: truth.size])
+    drawn = sample(post, seed, mode=mode)
+    draws, found = drawn.flat[:, : truth.size], mode.unknowns[: truth.size]
+    laplace = np.sqrt(np.diag(mode.unknowns_covariance)[: truth.size])
     low, high = np.percentile(draws, (2.5, 97.5), axis=0)
     return {
         "inside_95": ((low <= truth) & (truth <= high)).astype(float),
-        "laplace_inside_95": (np.abs(mode.x[: truth.size] - truth) < Z95 * laplace).astype(float),
-        "shift": (np.median(draws, axis=0) - mode.x[: truth.size]) / laplace,
+        "laplace_inside_95": (np.abs(found - truth) < Z95 * laplace).astype(float),
+        "shift": (np.median(draws, axis=0) - found) / laplace,
         "width_ratio": (high - low) / (2 * Z95 * laplace),
         "ess": drawn.ess, "rhat": drawn.rhat,
     }  # fmt: skip

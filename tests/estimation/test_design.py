@@ -8,7 +8,7 @@ import pytest
 from estimation.design import build, unexpected_bias
 from estimation.mode import find_mode
 from estimation.observations import aligned_weights
-from estimation.posterior import pack
+from estimation.posterior import posterior
 from experiments.bank import simulated_cases
 from hmmseg.io.rig import Fingertip, Rig, Systematic
 from hmmseg.segmentation.align import align
@@ -33,7 +33,7 @@ def aligned(case):
 def design_of(case, aligned, systematic):
     rig = case.rig.model_copy(update={"systematic": systematic})
     weighed, noise, _ = aligned
-    return build(list(case.trials), weighed, noise, case.task, rig, rig.noise.force)
+    return build(list(case.trials), weighed, noise, case.task, rig)
 
 
 @pytest.fixture(scope="module")
@@ -41,65 +41,79 @@ def design(case, aligned):
     return design_of(case, aligned, EVERY)
 
 
-def shift(design, name):
-    """What a deviation of one unit shifts, (num_trials, num_alignments, num_moves, 3)."""
+def shift(design, name, channel=None):
+    """What a deviation of one unit shifts, (K,), or in one channel (num_trials, num_moves)."""
     j = [n.name for n in design.nuisances].index(name)
-    per_sd = design.shifts[..., j].reshape(*design.mean.shape[:2], -1, 3)
-    return per_sd / design.nuisances[j].sd
+    found = design.shifts[:, j] / design.nuisances[j].sd
+    return found if channel is None else found[design.channel == channel].reshape(2, 2)
+
+
+def mean_over_grip(aligned, i, move, key, values):
+    """The mean of `values` (num_timesteps,) of trial i that a grip's observation takes."""
+    return float((aligned[0][i].weights.grips[move][key] @ np.nan_to_num(values)).mean())
 
 
 def test_a_force_bias_adds_to_the_net_force_and_through_the_pads_to_lengths(design, case):
     k_n = case.rig.fingertip.normal_stiffness
-    fy = shift(design, "force_bias.fy1")
-    np.testing.assert_allclose(fy[..., 0], 1.0, rtol=1e-6)
-    np.testing.assert_allclose(fy[..., 1], 0.0, atol=1e-9)
-    np.testing.assert_allclose(fy[..., 2], 0.0, atol=1e-9)  # the same on pickup and place
-    fx = shift(design, "force_bias.fx1")
-    np.testing.assert_allclose(fx[..., 0], 0.0, atol=1e-9)
-    np.testing.assert_allclose(fx[..., 1], 1 / k_n, rtol=1e-5)
+    np.testing.assert_allclose(shift(design, "force_bias.fy1", 0), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(shift(design, "force_bias.fy1", 1), 0.0, atol=1e-9)
+    np.testing.assert_allclose(shift(design, "force_bias.fy1", 2), 0.0, atol=1e-9)  # alike on both grounds
+    np.testing.assert_allclose(shift(design, "force_bias.fx1", 0), 0.0, atol=1e-9)
+    np.testing.assert_allclose(shift(design, "force_bias.fx1", 1), 1 / k_n, rtol=1e-5)
 
 
 def test_a_force_gain_scales_what_that_finger_carries(design, case, aligned):
-    gain = shift(design, "force_gain.fy1")[..., 0] + shift(design, "force_gain.fy2")[..., 0]
-    carried = design.mean.reshape(*design.mean.shape[:2], -1, 3)[..., 0]
+    gain = shift(design, "force_gain.fy1", 0) + shift(design, "force_gain.fy2", 0)
+    carried = design.mean[design.channel == 0].reshape(2, 2)
     np.testing.assert_allclose(gain, carried, rtol=2e-3)  # both fingers: the whole weight; steps of 1e-3
-    grip = shift(design, "force_gain.fx1")[..., 1]
-    weighed = aligned[0]
-    for i, a in enumerate(weighed):
-        for m, move in enumerate(sorted(a.weights.grips)):
-            mean = a.weights.grips[move]["distance"] @ np.nan_to_num(a.signals.fx1)
-            np.testing.assert_allclose(grip[i, :, m], mean / case.rig.fingertip.normal_stiffness, rtol=2e-3)
+    grip = shift(design, "force_gain.fx1", 1)
+    for i, a in enumerate(aligned[0]):
+        for m in (0, 1):
+            mean = mean_over_grip(aligned, i, m, "distance", a.signals.fx1)
+            assert grip[i, m] == pytest.approx(mean / case.rig.fingertip.normal_stiffness, rel=2e-3)
 
 
 def test_a_stiffer_pad_gives_less(design, case, aligned):
     """d(distance) = -(N / k) d(give): recorded tips lie N / k further apart for a pad twice as stiff."""
-    pad = shift(design, "pad_stiffness.1")[..., 1]
+    pad = shift(design, "pad_stiffness.1", 1)
     for i, a in enumerate(aligned[0]):
-        for m, move in enumerate(sorted(a.weights.grips)):
-            grip = a.weights.grips[move]["distance"] @ np.nan_to_num(a.signals.fx1)
-            np.testing.assert_allclose(pad[i, :, m], grip / case.rig.fingertip.normal_stiffness, rtol=3e-3)
+        for m in (0, 1):
+            grip = mean_over_grip(aligned, i, m, "distance", a.signals.fx1)
+            assert pad[i, m] == pytest.approx(grip / case.rig.fingertip.normal_stiffness, rel=3e-3)
 
 
 def test_a_joint_offset_moves_the_tip_by_the_jacobian(design, case, aligned):
     """dx1/dq11 = -L1 sin q11; finger 1 further right makes the distance shorter."""
-    offset = shift(design, "joint_offset.q11")[..., 1]
+    offset = shift(design, "joint_offset.q11", 1)
     length = case.rig.finger(1).links[0]
-    for i, a in enumerate(aligned[0]):
+    for i in range(2):
         q = case.trials[i].channels["q11"]
-        for m, move in enumerate(sorted(a.weights.grips)):
-            expected = a.weights.grips[move]["distance"] @ (length * np.sin(q))
-            np.testing.assert_allclose(offset[i, :, m], expected, rtol=1e-3)
+        for m in (0, 1):
+            expected = mean_over_grip(aligned, i, m, "distance", length * np.sin(q))
+            assert offset[i, m] == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_longer_link_moves_the_tip_in_proportion(design, case, aligned):
     """The true link is (1 + e) of the nominal: the nominal hand reads what is e L cos q less."""
-    link = shift(design, "link_length.11")[..., 1]
+    link = shift(design, "link_length.11", 1)
     length = case.rig.finger(1).links[0]
-    for i, a in enumerate(aligned[0]):
+    for i in range(2):
         q = case.trials[i].channels["q11"]
-        for m, move in enumerate(sorted(a.weights.grips)):
-            expected = a.weights.grips[move]["distance"] @ (length * np.cos(q))
-            np.testing.assert_allclose(link[i, :, m], expected, rtol=1e-3)
+        for m in (0, 1):
+            expected = mean_over_grip(aligned, i, m, "distance", length * np.cos(q))
+            assert link[i, m] == pytest.approx(expected, rel=1e-3)
+
+
+def test_shares_of_model_error_are_taken_of_the_pads_give(design, case):
+    """Of the grip, 2 N / k_n; of the carried weight, W / (2 k_s); of a force, the force itself."""
+    tip = case.rig.fingertip
+    weight = design.unit[design.channel == 0]
+    np.testing.assert_allclose(weight, design.mean[design.channel == 0], rtol=1e-12)
+    np.testing.assert_allclose(
+        design.unit[design.channel == 2], weight / (2 * tip.shear_stiffness), rtol=1e-12
+    )
+    give = design.unit[design.channel == 1] * tip.normal_stiffness / 2
+    assert ((give > 1.0) & (give < 5.0)).all()  # N, a pinch
 
 
 def test_free_motion_shows_biases_and_nothing_else(design):
@@ -124,10 +138,8 @@ def test_a_bias_that_free_motion_sees_hardly_widens_weight(case, aligned):
 
     def sd_of_weight(systematic):
         design = design_of(case, aligned, systematic)
-        start = np.array([np.log(case.blocks[obj][prop][0]) for obj, prop in design.names])
-        mode = find_mode(np.concatenate([start, np.zeros(9 + len(design.nuisances))]), pack(design))
         i = design.names.index(("block1", "weight"))
-        return np.sqrt(mode.covariance[i, i]) * np.exp(mode.x[i])
+        return np.sqrt(find_mode(posterior(design)).unknowns_covariance[i, i])
 
     none, bias = sd_of_weight(Systematic()), sd_of_weight(Systematic(force_bias=(0.1,) * 4))
     gain = sd_of_weight(Systematic(force_gain=(0.1,) * 4))
@@ -146,7 +158,7 @@ def test_what_a_failed_trial_does_not_show_is_left_out(case, aligned):
         grips[1] = {k: np.zeros_like(v) for k, v in grips[1].items()}
         counts[1] = {k: np.zeros_like(v) for k, v in counts[1].items()}
         cut.append(replace(a, weights=replace(a.weights, grips=grips, counts=counts)))
-    design = build(list(case.trials), cut, noise, case.task, case.rig, 0.012)
+    design = build(list(case.trials), cut, noise, case.task, case.rig)
     # Block 1 moved down from block 2 onto the ground: its rise tells block 2's height.
     assert set(design.names) == {("block1", "weight"), ("block1", "width"), ("block2", "height")}
     assert np.isfinite(design.mean).all() and np.isfinite(design.variance).all()
@@ -164,5 +176,5 @@ def test_unexpected_biases_are_those_beyond_noise_and_the_rig():
 def test_rigid_pads_have_no_stiffness_to_be_uncertain_of(case, aligned):
     rig = case.rig.model_copy(update={"systematic": EVERY, "fingertip": Fingertip()})
     weighed, noise, _ = aligned
-    design = build(list(case.trials), weighed, noise, case.task, rig, 0.012)
+    design = build(list(case.trials), weighed, noise, case.task, rig)
     assert not [n for n in design.nuisances if n.name.startswith("pad")]

@@ -39,7 +39,9 @@ def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> Aligne
             inside = masks[:, s.index].astype(float)
             grips[s.move] = {"force": inside / np.maximum(inside.sum(axis=1, keepdims=True), 1)}
             counts[s.move] = {"force": inside.sum(axis=1)}
-    return Aligned(signals, masks, Weights(grips, counts, free / max(free.sum(), 1), float(free.sum())))
+    uniform = free / max(free.sum(), 1)
+    weights = Weights(grips, counts, uniform, np.tile(uniform, (4, 1)), float(free.sum()))
+    return Aligned(signals, masks, weights)
 
 
 def planted(

@@ -1,40 +1,52 @@
-"""The mode is found from wrong starts, and is a mode."""
+"""The mode of the scales is a mode, and finds the scatter that was planted."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from estimation_scene import SD, TRUE, make_design, start_of
+from estimation_scene import SD, UNIT, drawn, make_design
 
+from estimation import priors
 from estimation.mode import find_mode
-from estimation.posterior import log_likelihoods, mean_log_prob, pack
-
-
-@pytest.mark.parametrize("offset", [-1.0, -0.1, 0.7])
-def test_planted_properties_are_recovered_from_wrong_starts(offset):
-    design = make_design(spread=0.2)
-    mode = find_mode(start_of(design, offset), pack(design))
-    assert mode.converged
-    z = (np.exp(mode.x[:3]) - TRUE) / (SD / np.sqrt(4))
-    assert np.abs(z).max() < 4
-    best = find_mode(start_of(design), pack(design))
-    np.testing.assert_allclose(mode.x[:3], best.x[:3], atol=2e-5)
+from estimation.posterior import posterior
 
 
 def test_the_mode_is_stationary_and_its_covariance_the_inverse_curvature():
-    design = make_design(spread=0.2)
-    data = pack(design)
-    mode = find_mode(start_of(design, 0.1), data)
-    x = jnp.asarray(mode.x)
-    gradient = np.asarray(jax.grad(mean_log_prob)(x, data))
-    sd = np.sqrt(np.diag(mode.covariance))
-    assert np.abs(gradient * sd).max() < 1e-2  # per posterior standard deviation
-    hessian = np.asarray(jax.hessian(mean_log_prob)(x, data))
-    product = -hessian @ mode.covariance
-    np.testing.assert_allclose(product * sd[None, :] ** -1 * sd[:, None], np.eye(sd.size), atol=1e-5)
+    design, *_ = drawn(make_design(deviations=2), 1)
+    post = posterior(design)
+    mode = find_mode(post)
+    assert mode.converged
+    h, eye = 3e-3, np.eye(6)
+
+    def at(*steps):
+        return float(post.log_prob((mode.scales + h * sum(steps))[None])[0])
+
+    slope = [(at(e) - at(-e)) / (2 * h) for e in eye]
+    np.testing.assert_allclose(slope, 0.0, atol=2e-2)
+    curvature = [[(at(a, b) - at(a, -b) - at(-a, b) + at(-a, -b)) / (4 * h * h) for b in eye] for a in eye]
+    np.testing.assert_allclose(-np.array(curvature) @ mode.covariance, np.eye(6), atol=0.02)
 
 
-def test_alignments_are_referred_to_the_mode():
-    design = make_design(spread=0.5)
-    mode = find_mode(start_of(design), pack(design))
-    np.testing.assert_allclose(mode.data.reference, log_likelihoods(jnp.asarray(mode.x), mode.data))
+@pytest.mark.parametrize("share", [0.02, 0.2])
+def test_planted_scatter_is_found_and_widens_what_it_touches(share):
+    """Pads that differ by 2 % or 20 % from grip to grip, where the prior has 0.1 %."""
+    plain, true, *_ = drawn(make_design(num_trials=12), 2, scales=np.zeros(6))
+    scales = np.zeros(6)
+    scales[4] = np.log(share / priors.SCATTER_MEDIAN[1])
+    scattered, *_ = drawn(make_design(num_trials=12), 2, scales=scales)
+    mode, before = find_mode(posterior(scattered)), find_mode(posterior(plain))
+    found = priors.SCATTER_MEDIAN[1] * np.exp(mode.scales[4])
+    assert found == pytest.approx(share, rel=0.4)
+    sd, sd_before = (np.sqrt(np.diag(m.unknowns_covariance)) for m in (mode, before))
+    width, weight = 1, 0
+    # What all grips have alike may be as large as what differs between them.
+    assert sd[width] == pytest.approx(np.hypot(found, found / np.sqrt(12)) * UNIT[1], rel=0.15)
+    assert sd[weight] == pytest.approx(sd_before[weight], rel=0.2)
+    assert np.abs((mode.unknowns - true) / sd).max() < 4
+
+
+def test_without_scatter_the_means_error_is_that_of_the_sensors():
+    design, *_ = drawn(make_design(num_trials=12, count=1e6), 3, scales=np.array([0.0] * 3 + [-6.0] * 3))
+    mode = find_mode(posterior(design))
+    own = design.variance[(design.channel == 0) & (design.move == 0)]
+    sensors = 1 / np.sqrt((1 / own).sum())
+    assert sensors < np.sqrt(mode.unknowns_covariance[0, 0]) < 1.3 * sensors
+    assert sensors == pytest.approx(SD[0] / np.sqrt(12), rel=0.3)
