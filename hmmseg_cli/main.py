@@ -14,7 +14,7 @@ import typer
 
 import hmmseg
 from hmmseg.errors import InputError
-from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, segment, simulate
+from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, inspect, new, segment, simulate
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -30,6 +30,8 @@ for _command in (
     identify.identify,
     simulate.simulate,
     diagnose.diagnose,
+    inspect.inspect,
+    new.new,
     effects.effects,
     demo.demo,
 ):

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hmmseg.errors import InputError
 from hmmseg.hand.signs import check_signs
-from hmmseg.io.plausibility import check_angles, check_clock, check_lengths, check_velocities
+from hmmseg.io.plausibility import Finding, check_angles, check_clock, check_lengths, check_velocities
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
 
-def check(trial: Trial, rig: Rig) -> tuple[str, ...]:
-    """Warnings about a trial; InputError for what cannot be.
+def findings(trial: Trial, rig: Rig) -> list[Finding]:
+    """What is amiss with a trial, up to and with the first thing that cannot be.
 
     Units come first: what moves 120 m has no sides.
     """
-    warnings = []
+    out: list[Finding] = []
     for look in (check_clock, check_lengths, check_angles, check_velocities, check_signs):
         for finding in look(trial, rig):
-            where = f"{trial.file}: column {finding.channel}"
+            mapped = "topics" if any(name in rig.topics for name in finding.changes) else "columns"
+            out.append(replace(finding, table=mapped))
             if finding.certain:
-                raise InputError(where, finding.problem, finding.remedy)
-            warnings.append(f"{where} {finding.problem}; {finding.remedy}")
+                return out
+    return out
+
+
+def check(trial: Trial, rig: Rig) -> tuple[str, ...]:
+    """Warnings about a trial; InputError for what cannot be."""
+    warnings = []
+    for finding in findings(trial, rig):
+        where = f"{trial.file}: column {finding.channel}"
+        if finding.certain:
+            raise InputError(where, finding.problem, finding.remedy)
+        warnings.append(f"{where} {finding.problem}; expected {finding.remedy}")
     return tuple(warnings)

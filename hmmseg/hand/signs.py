@@ -8,18 +8,20 @@ fx2 < 0, and a carry fy1 + fy2 > 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from hmmseg.hand.signals import task_space
-from hmmseg.io.plausibility import Finding, entry, written
+from hmmseg.io.plausibility import Finding, all_changed, changed
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
 ALL = 0.95  # share of the samples that must agree
 MOST = 0.75  # the same where a hold goes on after its block has been put down
 LIFTED = 0.005  # [m]
-FINGERS = (("x", "y", "vx", "vy", "fx", "fy"), ("q{}1", "q{}2", "dq{}1", "dq{}2", "fx{}", "fy{}"))
+CARTESIAN_STEMS = ("x{}", "y{}", "vx{}", "vy{}", "fx{}", "fy{}")
+JOINT_STEMS = ("q{}1", "q{}2", "dq{}1", "dq{}2", "fx{}", "fy{}")
 BRIEF = 5  # samples: a shorter touch holds nothing
 
 
@@ -53,7 +55,7 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     if same is not None:
         finger = 2 if same > 0 else 1
         problem = "fx1 and fx2 push the same way all along, a grip pushes from both sides"
-        return [Finding(f"fx{finger}", problem, written(entry(f"fx{finger}", rig, sign=-1)))]
+        return [Finding(f"fx{finger}", problem, changed(f"fx{finger}", rig, sign=-1))]
     holds = find_holds(squeeze[there], signals.y[there])
     if holds is None:
         return []
@@ -62,49 +64,69 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     lifts = holds.pressed & (holds.height > LIFTED)
     idle = float(np.median(load[holds.before])) if holds.before.sum() >= BRIEF else 0.0
     carried = _agreed(load[lifts] - idle, MOST) if lifts.sum() >= BRIEF else 0
-    found = _sides(apart, towards, carried, trial, rig)
-    found = found or _downwards(holds, load, rig)
+    both = (
+        lifts.sum() >= BRIEF
+        and np.median(signals.fy1[there][lifts]) * np.median(signals.fy2[there][lifts]) > 0
+    )
+    found = _sides(apart, towards, carried, bool(both), trial, rig)
+    if not found and lifts.sum() >= BRIEF:
+        found = _one_bears(
+            *(float(np.median(f[there][lifts])) for f in (signals.fy1, signals.fy2)), idle, rig
+        )
+    found = found or _downwards(holds, load, trial, rig)
     if found or lifts.sum() < BRIEF:
         return found
     grip = float(np.median(np.abs(squeeze[there][holds.pressed])))
     return _own_weight(idle, float(np.median(load[lifts])) - idle, grip, rig)
 
 
-def _sides(apart: int, towards: int, carried: int, trial: Trial, rig: Rig) -> list[Finding]:
-    """From the signs of x2 - x1 and fx1 - fx2 in a hold and of the load in a lift (0: unclear)."""
+def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial, rig: Rig) -> list[Finding]:
+    """From the signs of x2 - x1 and fx1 - fx2 in a hold and of the load in a lift (0: unclear).
+
+    `both_bear` says whether fy1 and fy2 have the same sign in a lift.
+    """
     if apart < 0 and towards < 0:
         problem = "finger 1 holds from the right, finger 2 from the left: the fingers are swapped"
-        return [Finding("x1", problem, written(*_exchanged(rig)))]
+        return [Finding("x1", problem, _exchanged(trial, rig))]
     if apart > 0 and towards < 0:
         if carried < 0:
             problem = "is negative in a grip and fy1 + fy2 in a lift: forces on the finger, not by it"
-            entries = [entry(name, rig, sign=-1) for name in ("fx1", "fy1", "fx2", "fy2")]
+            changes = all_changed(("fx1", "fy1", "fx2", "fy2"), rig, sign=-1)
         else:
             problem = "is negative and fx2 positive in a grip: their signs are flipped"
-            entries = [entry(name, rig, sign=-1) for name in ("fx1", "fx2")]
-        return [Finding("fx1", problem, written(*entries))]
+            changes = all_changed(("fx1", "fx2"), rig, sign=-1)
+        return [Finding("fx1", problem, changes)]
     if apart < 0 and towards > 0 and not rig.jointed:
         problem = "is right of x2 in a grip, but fx1 pushes to the right: positions swapped or x flipped"
-        entries = [entry(name, rig, sign=-1) for name in ("x1", "vx1", "x2", "vx2") if name in trial.channels]
-        return [Finding("x1", problem, written(*entries))]
-    if apart > 0 and towards > 0 and carried < 0:
+        moved = [name for name in ("x1", "vx1", "x2", "vx2") if name in trial.channels]
+        changes = all_changed(moved, rig, sign=-1)
+        return [Finding("x1", problem, changes)]
+    if apart > 0 and towards > 0 and carried < 0 and both_bear:
         problem = "and fy2 are negative in sum while a block is lifted: their signs are flipped"
-        return [Finding("fy1", problem, written(*(entry(name, rig, sign=-1) for name in ("fy1", "fy2"))))]
+        return [Finding("fy1", problem, all_changed(("fy1", "fy2"), rig, sign=-1))]
     return []
 
 
-def _downwards(holds: Holds, load: np.ndarray, rig: Rig) -> list[Finding]:
+def _one_bears(first: float, second: float, idle: float, rig: Rig) -> list[Finding]:
+    """A finger [N] that pulls down in lifts as strongly as the other bears: one sign is flipped."""
+    if first * second >= 0 or abs(first + second - idle) > 0.2 * abs(first - second):
+        return []
+    name = "fy1" if first < 0 else "fy2"
+    problem = f"pulls down with {abs(min(first, second)):.3g} N in lifts while the other finger bears as much"
+    return [Finding(name, problem, changed(name, rig, sign=-1), certain=False)]
+
+
+def _downwards(holds: Holds, load: np.ndarray, trial: Trial, rig: Rig) -> list[Finding]:
     """Holds that all go down first, through what the block stands on: y points down."""
     if any(holds.rises) or not holds.rises or rig.jointed:
         return []
     low = holds.pressed & (holds.height < -LIFTED)
-    changes = [entry(name, rig, sign=-1) for name in ("y1", "y2", "fy1", "fy2")]
-    if float(np.median(load[low])) > 0:
-        changes = changes[:2]
+    axes = ["y1", "y2"] if float(np.median(load[low])) > 0 else ["y1", "y2", "fy1", "fy2"]
+    axes += [name for name in ("vy1", "vy2") if name in trial.channels]
     problem = (
         "every hold first goes down from where it began, through what the block stands on: y points down"
     )
-    return [Finding("y1", problem, written(*changes), certain=False)]
+    return [Finding("y1", problem, all_changed(axes, rig, sign=-1), certain=False)]
 
 
 def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Finding]:
@@ -118,8 +140,8 @@ def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Findi
         f"and fy2 sum to {idle:.3g} N before the first touch, a lift adds {lifted:.3g} N: gravity or "
         "an offset is still in the forces"
     )
-    entries = [entry(name, rig, offset=round(-idle / 2, 4)) for name in ("fy1", "fy2")]
-    return [Finding("fy1", problem, written(*entries), certain=False)]
+    changes = all_changed(("fy1", "fy2"), rig, offset=round(-idle / 2, 4))
+    return [Finding("fy1", problem, changes, certain=False)]
 
 
 def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
@@ -162,13 +184,13 @@ def _agreed(values: np.ndarray, share: float = ALL) -> int:
     return 1 if positive >= share else -1 if positive <= 1 - share else 0
 
 
-def _exchanged(rig: Rig) -> list[str]:
-    stems = FINGERS[1] if rig.jointed else tuple(f"{stem}{{}}" for stem in FINGERS[0])
-    out = []
+def _exchanged(trial: Trial, rig: Rig) -> dict[str, dict[str, Any]]:
+    """Each finger's channels from where the other's come from now."""
+    stems = JOINT_STEMS if rig.jointed else CARTESIAN_STEMS
+    out: dict[str, dict[str, Any]] = {}
     for stem in stems:
         for ours, theirs in (("1", "2"), ("2", "1")):
             name, other = stem.format(ours), stem.format(theirs)
-            mapped = rig.columns.get(other)
-            source = other if mapped is None or mapped.source is None else mapped.source
-            out.append(f'{name} = "{source}"')
+            if name in trial.channels and other in trial.channels:
+                out[name] = changed(other, rig)[other]
     return out

@@ -7,10 +7,14 @@ Nothing is guessed: a finding says in one line what to write into `rig.toml`.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from hmmseg.io.columns import Column
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
@@ -24,26 +28,45 @@ SAME = 0.15  # relative: a factor of 1000 or 57.3 is told apart from 1 by far mo
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that cannot be, or is unlikely: where, what, and what to write; `certain` refuses."""
+    """Something that cannot be (`certain`, refused) or is unlikely, and the mapping that mends it.
+
+    `changes` holds by channel the fields of its entry in `[columns]` (or `[topics]`).
+    """
 
     channel: str
     problem: str
-    remedy: str
+    changes: dict[str, dict[str, Any]]
     certain: bool = True
+    table: str = "columns"
+
+    @property
+    def remedy(self) -> str:
+        """What to write where, in a line."""
+        entries = ", ".join(entry_text(name, fields) for name, fields in self.changes.items())
+        return f"{entries} under [{self.table}] in rig.toml"
 
 
-def entry(channel: str, rig: Rig | None, **change: object) -> str:
-    """The `[columns]` entry of rig.toml that reads a channel so."""
-    mapped = None if rig is None else rig.columns.get(channel)
-    source = channel if mapped is None or mapped.source is None else mapped.source
-    said = {"from": source, **change}
-    inner = ", ".join(f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in said.items())
-    return f"{channel} = {{{inner}}}"
+def entry_text(channel: str, fields: dict[str, Any]) -> str:
+    """An entry of `[columns]` as TOML."""
+    quoted = (f"{key} = {json.dumps(value)}" for key, value in fields.items())
+    return f"{json.dumps(channel) if not channel.isidentifier() else channel} = {{{', '.join(quoted)}}}"
 
 
-def written(*entries: str) -> str:
-    """What to write where."""
-    return f"{', '.join(entries)} under [columns] in rig.toml"
+def changed(channel: str, rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
+    """The entry of a channel with this change: what the rig already says of it is kept."""
+    now = Column() if rig is None else (rig.columns | rig.topics).get(channel, Column())
+    fields: dict[str, Any] = {"from": now.source or channel}
+    unit, sign = change.get("unit", now.unit), now.sign * change.get("sign", 1)
+    offset = now.offset + change.get("offset", 0.0)
+    fields |= {} if unit is None else {"unit": unit}
+    fields |= {} if sign == 1 else {"sign": int(sign)}
+    fields |= {} if offset == 0 else {"offset": offset}
+    return {channel: fields}
+
+
+def all_changed(channels: Iterable[str], rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
+    """The same change for several channels."""
+    return {name: fields for each in channels for name, fields in changed(each, rig, **change).items()}
 
 
 def check_clock(trial: Trial, rig: Rig | None) -> list[Finding]:
@@ -60,12 +83,11 @@ def check_clock(trial: Trial, rig: Rig | None) -> list[Finding]:
         problem = f"is sampled at {1 / period:.2g} Hz if it is in s"
         if stated is not None:
             problem += f", but rate = {stated:g} in rig.toml"
-        return [Finding("t", f"{problem}: it looks like {unit}", written(entry("t", rig, unit=unit)))]
+        return [Finding("t", f"{problem}: it looks like {unit}", changed("t", rig, unit=unit))]
     if YEAR_1990 < trial.t[0] < YEAR_2100:
         date = np.datetime64(int(trial.t[0]), "s")
         problem = f"counts seconds since 1970 (from {date}), and so will all results"
-        remedy = written(entry("t", rig, offset=-float(np.floor(trial.t[0]))))
-        return [Finding("t", problem, f"for times from 0, {remedy}", certain=False)]
+        return [Finding("t", problem, changed("t", rig, offset=-float(np.floor(trial.t[0]))), certain=False)]
     return []
 
 
@@ -80,12 +102,11 @@ def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
         name, travel = max(far.items(), key=lambda item: item[1])
         unit = "cm" if travel < 30 else "mm" if travel < 5e3 else "um"
         other = ' (or "cm")' if unit == "mm" and travel < 100 else ""
-        entries = [entry(each, rig, unit=unit) for each in travels if each in far]
         problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {unit}{other}"
-        return [Finding(name, problem, written(*entries))]
+        return [Finding(name, problem, all_changed(far, rig, unit=unit))]
     if travels and max(travels.values()) < STILL:
-        problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were not in m"
-        return [Finding("x1", problem, written(entry("x1", rig, unit="...")), certain=False)]
+        problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were in km"
+        return [Finding("x1", problem, all_changed(travels, rig, unit="mm"), certain=False)]
     return []
 
 
@@ -98,13 +119,11 @@ def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
         return []
     name, value = max(wound.items(), key=lambda item: item[1])
     unit = "deg" if value < 3600 else "mrad"
-    entries = [entry(each, rig, unit=unit) for each in joints]
-    entries += [
-        entry(f"d{each}", rig, unit=f"{unit}/s")
-        for each in joints if abs(_slope(trial, each, f"d{each}") - 1) < SAME
-    ]  # fmt: skip
+    changes = all_changed(joints, rig, unit=unit)
+    as_they = [f"d{each}" for each in joints if abs(_slope(trial, each, f"d{each}") - 1) < SAME]
+    changes |= all_changed(as_they, rig, unit=f"{unit}/s")
     problem = f"reaches {value:.4g} rad, {value / 2 / np.pi:.0f} turns of a link: it looks like {unit}"
-    return [Finding(name, problem, written(*entries))]
+    return [Finding(name, problem, changes)]
 
 
 def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
@@ -121,9 +140,9 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
     if not found:
         return []
     name, (slope, _) = next(iter(found.items()))
-    entries = [entry(each, rig, **what) for each, (_, what) in found.items()]
+    changes = {k: v for each, (_, what) in found.items() for k, v in changed(each, rig, **what).items()}
     told = f"is {slope:.3g} times what {name.removeprefix('d').removeprefix('v')} changes by"
-    return [Finding(name, told, written(*entries))]
+    return [Finding(name, told, changes)]
 
 
 def _pairs(trial: Trial) -> list[tuple[str, str]]:

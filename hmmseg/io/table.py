@@ -18,7 +18,8 @@ class Table:
 
     `names` are all that the file has; `rows` (num_rows,) numbers the rows as an editor does;
     `units` are those that the file itself states. `origin` is where t = 0 lies in ns since 1970
-    (logs), and `interpolated` marks by column what lies between two messages.
+    (logs), `interpolated` marks by column what lies between two messages, and `rates` [Hz] are
+    those of the messages.
     """
 
     file: str
@@ -29,6 +30,7 @@ class Table:
     origin: int | None = None
     interpolated: dict[str, np.ndarray] = field(default_factory=dict)
     messages: bool = False
+    rates: dict[str, float] = field(default_factory=dict)
 
 
 def plain_table(file: str, columns: dict[str, np.ndarray], names: Sequence[str] | None = None) -> Table:

@@ -67,12 +67,24 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     """
     if task is None and rig is None:
         raise ValueError("a block task's trial needs its rig")
-    names, optional = _channels(rig, task)
+    names, _ = _channels(rig, task)
     log = isinstance(source, str | Path) and kind_of(split_part(source)[0]) in LOGS
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if log else rig.columns)
     theirs = None if names is None else [source_of(name, columns) for name in ("t", *names)]
     read = read_table if isinstance(source, str | Path) else frame_table
     table = read(source, theirs)
+    trial = trial_of(table, rig, task)
+    if task is not None or rig is None or rig.gripper is not None:
+        return trial
+    from hmmseg.hand.plausibility import check  # which reads trials itself
+
+    return replace(trial, warnings=check(trial, rig))
+
+
+def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
+    """Trial from a table as it was read, whether or not it can be; InputError as `read_trial`."""
+    names, optional = _channels(rig, task)
+    columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
     _check_names(table, columns, names, optional, task is not None)
     stamps, origin = times(table, source_of("t", columns))
     t = _mapped(stamps, "t", columns, table)
@@ -91,12 +103,7 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
-    trial = Trial(table.file, t, channels, origin, between)
-    if task is not None or rig is None or rig.gripper is not None:
-        return trial
-    from hmmseg.hand.plausibility import check  # which reads trials itself
-
-    return replace(trial, warnings=check(trial, rig))
+    return Trial(table.file, t, channels, origin, between)
 
 
 def _channels(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:

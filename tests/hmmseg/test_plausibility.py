@@ -133,7 +133,7 @@ def test_the_hands_own_weight_is_told():
 
 def test_y_that_points_down_is_told():
     (line,) = read_trial(changed(CARTESIAN, y=-1, vy=-1, fy=-1), FREE).warnings
-    assert re.search("column y1 every hold first goes down .*y points down; y1 = ", line)
+    assert re.search("column y1 every hold first goes down .*y points down; expected y1 = ", line)
 
 
 @pytest.mark.parametrize("case", ["none_1", "none_2", "paper_blocks", "force_bias_1", "grip_slip_1"])

@@ -25,7 +25,7 @@ def parts(path: Path) -> list[str]:
         data = file.get("data")
         if not isinstance(data, h5py.Group):
             return []
-        names = [name for name in data if isinstance(data.get(name), h5py.Group)]
+        names = [str(name) for name in data if isinstance(data.get(name), h5py.Group)]
     return sorted(names, key=lambda name: (len(name), name))
 
 
@@ -39,7 +39,9 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     if part is not None and part not in found:
         raise InputError(f"{path}#{part}", "no such recording", ", ".join(found[:5]) or "no #")
     with h5py.File(path, "r") as file:
-        group = file if not found else file[f"data/{part or found[0]}"]
+        group = file.get(f"data/{part or found[0]}") if found else file
+        if not isinstance(group, h5py.Group):
+            raise InputError(str(path), "is no group of columns", "an HDF5 file")
         datasets = dict(_datasets(group, "", 0))
         chosen = {
             name: each for name, each in datasets.items()
@@ -78,9 +80,9 @@ def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str,
 def _control_rate(file: h5py.File) -> float | None:
     """Samples a second, from robomimic's `env_args`."""
     data = file.get("data")
-    text = None if data is None else data.attrs.get("env_args")
+    text = data.attrs.get("env_args") if isinstance(data, h5py.Group) else None
     try:
-        rate = float(json.loads(text)["env_kwargs"]["control_freq"])
+        rate = float(json.loads(str(text))["env_kwargs"]["control_freq"])
     except (TypeError, ValueError, KeyError):
         return None
     return rate if rate > 0 and np.isfinite(rate) else None

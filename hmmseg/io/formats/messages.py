@@ -86,16 +86,18 @@ def joined(file: str, streams: Sequence[Stream], wanted: Sequence[str] | None) -
     ticks = read[clock][0]
     columns: dict[str, np.ndarray] = {"t": (ticks - ticks[0]) * 1e-9}
     marks: dict[str, np.ndarray] = {}
+    rates: dict[str, float] = {}
     for topic, (times, found) in read.items():
         for name, values in found.items():
             if wanted is not None and name not in wanted:
                 continue
+            rates[name] = 1e9 / _period(times)
             if topic == clock:
                 columns[name] = values
             else:
                 columns[name], marks[name] = interpolated(ticks, times, values)
     return Table(file, names, columns, np.arange(1, ticks.size + 1), origin=int(ticks[0]),
-                 interpolated=marks, messages=True)  # fmt: skip
+                 interpolated=marks, messages=True, rates=rates)  # fmt: skip
 
 
 def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -143,8 +145,6 @@ def _members(message: Any) -> Iterator[tuple[str, Any]] | None:
         return ((f.name, getattr(message, f.name)) for f in dataclasses.fields(message))
     if hasattr(type(message), "__slots__") and not isinstance(message, str | bytes | np.generic | np.ndarray):
         return ((name, getattr(message, name)) for name in type(message).__slots__ if name[0] != "_")
-    if hasattr(message, "DESCRIPTOR"):  # protobuf
-        return ((f.name, getattr(message, f.name)) for f in message.DESCRIPTOR.fields)
     return None
 
 

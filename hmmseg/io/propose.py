@@ -1,0 +1,148 @@
+"""A mapping proposed from the names in another lab's file, mended by what can be seen in it.
+
+Names are taken apart into words: which finger (left, right, 1, 2), which quantity (position,
+velocity, force, joint), which axis. It is a proposal: units and signs follow from physics where
+they can, and a person looks at the rest.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hmmseg.errors import InputError
+from hmmseg.io.columns import Column
+from hmmseg.io.plausibility import entry_text
+from hmmseg.io.rig import Rig
+from hmmseg.io.table import Table
+from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, trial_of
+from hmmseg.io.units import UNITS, known_unit, measures, unit_in_name
+
+TIME = ("t", "time", "timestamp", "stamp", "timestamps", "sec", "seconds", "clock", "times")
+LEFT = {"left", "l", "lf", "finger1", "f1", "thumb", "1", "lh"}
+RIGHT = {"right", "r", "rf", "finger2", "f2", "index", "2", "rh"}
+QUANTITIES = {
+    "v": {"v", "vel", "velocity", "velocities", "speed", "twist", "vx", "vy", "vz"},
+    "f": {"f", "force", "forces", "wrench", "load", "fx", "fy", "fz"},
+    "dq": {"dq", "qd", "qdot", "jointvel", "dtheta"},
+    "q": {"q", "joint", "joints", "angle", "theta", "qpos"},
+    "p": {"pos", "position", "positions", "pose", "tip", "xyz", "x", "y", "z", "point"},
+}
+AXES = {"x": {"x", "fx", "vx"}, "y": {"y", "fy", "vy"}, "z": {"z", "fz", "vz"}}
+TURNING = {"torque", "moment", "mx", "my", "mz", "tx", "ty", "tz", "orientation", "quaternion", "rot"}
+
+
+def propose(table: Table) -> dict[str, dict[str, Any]]:
+    """Entries of `[columns]` (`[topics]` for a log) by our channel; empty where none is needed or found.
+
+    Channels come with their unit where the file or the name states one that is not SI.
+    """
+    names = [name for name in table.names if name != "t" or not table.messages]
+    sources: dict[str, str] = {} if table.messages else _clock(names)
+    for channels in (CARTESIAN_CHANNELS, JOINT_CHANNELS):
+        found = {channel: channel for channel in channels if channel in names}
+        found |= {channel: name for channel, name in _matched(names).items()
+                  if channel in channels and channel not in found}  # fmt: skip
+        if len(found) > len(channels) / 2:
+            sources |= found
+            break
+    out: dict[str, dict[str, Any]] = {}
+    for channel, source in sources.items():
+        unit = table.units.get(source) or unit_in_name(source)
+        wanted = measures(channel)
+        fits = unit is not None and (wanted is None or UNITS[known_unit(unit) or ""][0] == wanted)
+        fields = {"from": source} | ({"unit": unit} if fits and UNITS[unit or ""][1] != 1 else {})
+        if fields != {"from": channel}:
+            out[channel] = fields
+    return out
+
+
+def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = None
+           ) -> tuple[dict[str, dict[str, Any]], list[str]]:  # fmt: skip
+    """The proposal after what physics says of the recording, and what it said, line by line.
+
+    Where the hand is not told, links of a length of their own cannot be known: a jointed hand is
+    judged only with its rig.
+    """
+    from hmmseg.hand.plausibility import findings  # which reads trials itself
+
+    rig = rig or Rig()
+    said: list[str] = []
+    for _ in range(8):
+        mapping = {name: Column.model_validate(fields) for name, fields in entries.items()}
+        where = "topics" if table.messages else "columns"
+        hand = rig.model_copy(update={where: {**getattr(rig, where), **mapping}})
+        try:
+            trial = trial_of(table, hand, None)
+        except InputError:
+            return entries, said  # not a hand's recording, or not all of it
+        found = findings(trial, hand)
+        said += [line for f in found if (line := f"{f.channel} {f.problem}") not in said]
+        fresh = {k: v for f in found if f.certain or f.channel == "t" for k, v in f.changes.items()}
+        if not fresh or all(entries.get(name) == fields for name, fields in fresh.items()):
+            return entries, said
+        entries = {**entries, **fresh}
+    return entries, said
+
+
+def as_toml(entries: Mapping[str, Mapping[str, Any]], table: Table) -> str:
+    """The proposal as a table of rig.toml."""
+    head = "[topics]" if table.messages else "[columns]"
+    return "\n".join([head, *(entry_text(name, dict(fields)) for name, fields in entries.items())]) + "\n"
+
+
+def _clock(names: Sequence[str]) -> dict[str, str]:
+    if "t" in names:
+        return {}
+    for wanted in TIME:
+        for name in names:
+            if re.sub(r"[\[(].*", "", name).strip().lower() == wanted or _words(name)[:1] == [wanted]:
+                return {"t": name}
+    return {}
+
+
+def _matched(names: Sequence[str]) -> dict[str, str]:
+    """The first column that fits each of our channels; z is up where a finger has no y."""
+    found: dict[str, str] = {}
+    for name in names:
+        channel = _channel(_words(name))
+        if channel is not None:
+            found.setdefault(channel, name)
+    out = {name: source for name, source in found.items() if "z" not in name}
+    for name, source in found.items():
+        if "z" in name and name.replace("z", "y") not in found:
+            out[name.replace("z", "y")] = source
+    return out
+
+
+def _channel(words: list[str]) -> str | None:
+    """Our channel (with z for a third axis) that a name's words mean."""
+    known = set(words)
+    finger = "1" if known & LEFT else "2" if known & RIGHT else None
+    if finger is None or known & TURNING:
+        return None
+    quantity = next((name for name, words_ in QUANTITIES.items() if known & words_), None)
+    if quantity == "q" and known & QUANTITIES["v"]:
+        quantity = "dq"
+    if quantity in ("q", "dq"):
+        numbers = [word for word in words if word in ("1", "2")]
+        return f"{quantity}{finger}{numbers[-1]}" if numbers else None
+    axis = next((name for name, words_ in AXES.items() if known & words_), None)
+    if quantity is None or axis is None:
+        return None
+    return f"{'' if quantity == 'p' else quantity}{axis}{finger}"
+
+
+def _words(name: str) -> list[str]:
+    """Words of a name: `finger_left_x_mm` and `LeftForceX1` taken apart, its unit left out."""
+    name = re.sub(r"[\[(]\s*[^\d\])][^\])]*[\])]", "", name)
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    words = [word for word in re.split(r"[^A-Za-z0-9]+", name.lower()) if word]
+    return [part for word in words for part in (re.findall(r"[a-z]+|\d+", word) or [word])]
+
+
+def without_table(text: str, table: Table) -> bool:
+    """Whether a rig's text has no such table yet."""
+    head = "topics" if table.messages else "columns"
+    return re.search(rf"^\s*\[{head}[\].]", text, flags=re.MULTILINE) is None

@@ -1,0 +1,122 @@
+"""`hmmseg inspect`: what is in a recording, and the mapping that would read it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hmmseg.errors import InputError
+from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, check_file
+
+FilesArgument = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of any kind.")]
+RigFile = Annotated[Path | None, typer.Option(
+    "--rig", metavar="R", help="Judge the recording with this hand and its mapping.")]  # fmt: skip
+WriteOption = Annotated[Path | None, typer.Option(
+    "--write", metavar="RIG.toml", help="Add the proposed mapping to this rig, or make it.")]  # fmt: skip
+BARS = "▁▂▃▄▅▆▇█"
+
+
+def inspect(
+    files: FilesArgument, rig: RigFile = None, write: WriteOption = None, json: JsonOption = None,
+    seed: SeedOption = 0, quiet: QuietOption = False,
+) -> None:  # fmt: skip
+    """What is in a recording, and the [columns] or [topics] that would read it."""
+    from hmmseg.io.inspect import inspect as look
+
+    with Output("inspect", json=json, seed=seed, quiet=quiet) as out:
+        if write is not None:
+            check_file("--write", write, suffixes=(".toml",))
+        hand = None if rig is None else read_rig(rig)
+        found = [look(path, hand) for path in files]
+        for each in found:
+            _show(out, each)
+        if write is not None:
+            out.stage(write).write_text(_extended(write, found), encoding="utf-8")
+        out.finish({"files": [_document(each) for each in found]})
+
+
+def _extended(rig_file: Path, found: list[Any]) -> str:
+    """The rig's text with the mapping added; InputError where there is one, or none to add."""
+    proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
+    if not proposed:
+        raise InputError(
+            f"--write {rig_file}", "no mapping was found to propose", "columns named after what they hold"
+        )
+    if len(proposed) > 1:
+        raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
+    text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""
+    now = parse_rig(_toml(text, rig_file), str(rig_file))
+    table = proposed[0].split("\n", 1)[0]
+    if (table == "[columns]" and now.columns) or (table == "[topics]" and now.topics):
+        raise InputError(f"--write {rig_file}", f"already has {table}", "a rig without it")
+    text = f"{text.rstrip()}\n\n{proposed[0]}".lstrip()
+    parse_rig(_toml(text, rig_file), str(rig_file))
+    return text
+
+
+def _toml(text: str, path: Path) -> dict[str, Any]:
+    import tomllib
+
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise InputError(str(path), f"not valid TOML: {error}") from None
+
+
+def _show(out: Output, found: Any) -> None:
+    head = f"{found.file}: {found.samples} samples"
+    if found.rate is not None:
+        head += f" at {found.rate:.4g} Hz, {found.end - found.start:.4g} s"
+    if found.parts:
+        head += f"; the first of {len(found.parts)} recordings ({found.parts[0]} ... {found.parts[-1]})"
+    if found.gaps:
+        longest = max(end - start for start, end in found.gaps)
+        head += f"; {len(found.gaps)} gaps, the longest {longest:.3g} s"
+    table = Table(title=head, title_justify="left")
+    for name, justify in (("column", "left"), ("unit", "left"), ("rate [Hz]", "right"), ("missing", "right"),
+                          ("least", "right"), ("most", "right"), ("course", "left")):  # fmt: skip
+        table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
+    for channel in found.channels:
+        told = "text" if channel.text else channel.unit or ""
+        rate = "" if channel.rate is None else f"{channel.rate:.4g}"
+        table.add_row(channel.name, told, rate, str(channel.missing or ""), _number(channel.minimum),
+                      _number(channel.maximum), sparkline(channel.course))  # fmt: skip
+    out.print(table)
+    for line in found.said:
+        out.warn(f"{found.file}: column {line}")
+    if found.toml:
+        out.print("proposed for rig.toml:", found.toml)
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def sparkline(course: tuple[float, ...]) -> str:
+    """A course in bars, a blank where nothing is."""
+    there = [value for value in course if value == value]
+    if not there:
+        return ""
+    low, span = min(there), max(there) - min(there)
+    return "".join(
+        " " if value != value else BARS[0 if span == 0 else min(7, int(8 * (value - low) / span))]
+        for value in course
+    )
+
+
+def _document(found: Any) -> dict[str, Any]:
+    channels = [
+        {"name": c.name, "unit": c.unit, "rate": c.rate, "samples": c.samples, "missing": c.missing,
+         "interpolated": c.interpolated, "minimum": c.minimum, "maximum": c.maximum, "text": c.text}
+        for c in found.channels
+    ]  # fmt: skip
+    return {
+        "file": found.file, "recordings": found.parts, "samples": found.samples, "start": found.start,
+        "end": found.end, "rate": found.rate, "origin_ns": found.origin,
+        "gaps": [{"start": start, "end": end} for start, end in found.gaps], "channels": channels,
+        "mapping": found.mapping, "toml": found.toml or None, "findings": found.said,
+    }  # fmt: skip

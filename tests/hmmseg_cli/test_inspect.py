@@ -1,0 +1,165 @@
+"""`hmmseg inspect` and `hmmseg new`: what is found, proposed, laid out; every refusal with its line."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from file_writers import write_mcap, write_robomimic
+
+from hmmseg.io.inspect import inspect
+from hmmseg.io.propose import propose
+from hmmseg.io.rig import read_rig
+from hmmseg.io.table import plain_table
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg_cli.inspect import sparkline
+from hmmseg_cli.main import main
+
+NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
+
+
+def cartesian() -> dict[str, np.ndarray]:
+    from hmmseg.hand.signals import task_space
+
+    rig = read_rig(NONE / "rig.toml")
+    signals = task_space(read_trial(NONE / "trial_01.csv", rig), rig)
+    names = ("t", "x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
+    return {name: getattr(signals, name) for name in names}
+
+
+OTHERS = {
+    "t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
+    "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
+    "fy1": ("LeftForceZ [mN]", 1e3), "x2": ("finger_right_x", 1e3), "y2": ("finger_right_z", 1e3),
+    "vx2": ("finger_right_vx", 1.0), "vy2": ("finger_right_vz", 1.0), "fx2": ("RightForceX [mN]", -1e3),
+    "fy2": ("RightForceZ [mN]", -1e3),
+}  # fmt: skip
+
+
+def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
+    """Foreign names, units partly told, finger 2's forces with the other sign, times in ns."""
+    ours = cartesian()
+    frame = pd.DataFrame({name: ours[channel] * factor for channel, (name, factor) in OTHERS.items()})
+    frame["stamp"] = frame["stamp"].round().astype(np.int64)
+    frame.to_csv(tmp_path / "a.csv", index=False, sep=";", decimal=",")
+    (tmp_path / "rig.toml").write_text("gravity = 9.81\n")
+    assert (
+        main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--json", "-"]) == 0
+    )
+    document = json.loads(capsys.readouterr().out)
+    (file,) = document["files"]
+    assert file["mapping"]["t"] == {"from": "stamp", "unit": "ns"}
+    assert file["mapping"]["x1"] == {"from": "finger_left_x_mm", "unit": "mm"}
+    assert file["mapping"]["x2"] == {"from": "finger_right_x", "unit": "mm"}  # by how far it travels
+    assert file["mapping"]["fx2"] == {"from": "RightForceX [mN]", "unit": "mN", "sign": -1}
+    assert any("push the same way" in line for line in file["findings"])
+    assert any("fy2 pulls down" in line for line in file["findings"])  # told, and left to a person
+    rig = read_rig(tmp_path / "rig.toml")
+    assert rig.gravity == 9.81
+    rig = rig.model_copy(update={"columns": {
+        **rig.columns, "fy2": rig.columns["fy2"].model_copy(update={"sign": -1.0})}})  # fmt: skip
+    trial = read_trial(tmp_path / "a.csv", rig)
+    for name, values in trial.channels.items():
+        np.testing.assert_allclose(values, ours[name], atol=1e-9, err_msg=name)
+
+
+def test_what_is_in_a_file(tmp_path):
+    t = np.delete(np.arange(100) * 0.02, [40, 41, 42, 43, 44])
+    force = np.sin(t)
+    force[3] = np.nan
+    pd.DataFrame({"t": t, "force [N]": force, "note": "x"}).to_csv(tmp_path / "a.csv", index=False)
+    found = inspect(tmp_path / "a.csv")
+    assert (found.samples, found.rate, found.end) == (95, pytest.approx(50.0), pytest.approx(1.98))
+    assert found.gaps == ((pytest.approx(0.78), pytest.approx(0.9)),)
+    _, channel, note = found.channels
+    assert (channel.unit, channel.missing, note.text, found.mapping) == ("N", 1, True, {})
+    assert channel.maximum == pytest.approx(np.nanmax(force))
+
+
+def test_a_log_and_a_file_of_several(tmp_path, capsys):
+    log = inspect(write_mcap(tmp_path / "a.mcap"))
+    rates = {channel.name: channel.rate for channel in log.channels}
+    assert rates["/wrench.wrench.force.x"] == pytest.approx(100.0)
+    assert rates["/pose.pose.position.z"] == pytest.approx(20.0)
+    path = write_robomimic(tmp_path / "demos.hdf5")
+    assert main(["inspect", str(path)]) == 0
+    assert "the first of 2 recordings (demo_0 ... demo_1)" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("case", ["none_1", "paper_blocks"])
+def test_nothing_is_proposed_where_nothing_is_needed(case):
+    found = inspect(NONE.parent / case / "trial_01.csv")
+    assert (found.mapping, found.said) == ({}, ())
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["time", "L_pos_x", "L_pos_y", "L_fx", "L_fy", "R_pos_x", "R_pos_y", "R_fx", "R_fy"],
+         {"t": "time", "x1": "L_pos_x", "y1": "L_pos_y", "fx1": "L_fx", "fy1": "L_fy", "x2": "R_pos_x",
+          "y2": "R_pos_y", "fx2": "R_fx", "fy2": "R_fy"}),
+        (["timestamp", "finger1.tip.x", "finger1.tip.z", "finger1.force.x", "finger1.force.z",
+          "finger2.tip.x", "finger2.tip.z", "finger2.force.x", "finger2.force.z", "finger1.torque.x"],
+         {"t": "timestamp", "x1": "finger1.tip.x", "y1": "finger1.tip.z", "fx1": "finger1.force.x",
+          "fy1": "finger1.force.z", "x2": "finger2.tip.x", "y2": "finger2.tip.z", "fx2": "finger2.force.x",
+          "fy2": "finger2.force.z"}),
+        (["t", "temperature", "pressure"], {}),
+    ],
+)  # fmt: skip
+def test_names_taken_apart(names, expected):
+    table = plain_table("a", {name: np.zeros(9) for name in names})
+    assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
+
+
+def test_sparkline():
+    assert sparkline((0.0, 7.0, float("nan"), 3.5)) == "▁█ ▅"
+    assert sparkline((1.0, 1.0)) == "▁▁"
+    assert sparkline((float("nan"),)) == ""
+
+
+@pytest.mark.parametrize(
+    ("rig", "line"),
+    [
+        ("[columns]\nx1 = 'a'\n", "--write .*rig.toml: already has .columns.; expected a rig without it"),
+        ("rate = -1", "rig.toml: key rate: "),
+        ("rate = ", "rig.toml: not valid TOML"),
+    ],
+)
+def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, rig, line):
+    ours = cartesian()
+    pd.DataFrame({"time": ours.pop("t"), **ours}).to_csv(tmp_path / "a.csv", index=False)
+    (tmp_path / "rig.toml").write_text(rig)
+    assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert re.search(line, error)
+    assert (tmp_path / "rig.toml").read_text() == rig
+
+
+@pytest.mark.parametrize("hand", ["cartesian", "jointed", "gripper", "none"])
+def test_new_lays_out_files_that_read(tmp_path, hand):
+    assert main(["new", str(tmp_path / "lab"), "--hand", hand, "--quiet"]) == 0
+    rig, task = read_rig(tmp_path / "lab/rig.toml"), read_task(tmp_path / "lab/task.toml")
+    assert (rig.jointed, rig.gripper is not None) == (hand == "jointed", hand == "gripper")
+    assert hasattr(task, "sequence") == (hand == "none")
+
+
+def test_new_never_hangs_and_never_writes_over(tmp_path):
+    command = [Path(sys.executable).with_name("hmmseg"), "new", "lab"]
+    for stdin in (subprocess.DEVNULL, subprocess.PIPE):
+        done = subprocess.run(
+            command, cwd=tmp_path, stdin=stdin, capture_output=True, timeout=60, check=False
+        )
+        text = done.stderr.decode()
+        if stdin == subprocess.DEVNULL:
+            assert (done.returncode, sorted(os.listdir(tmp_path / "lab"))) == (0, ["rig.toml", "task.toml"])
+    assert done.returncode == 2
+    assert text == "lab/rig.toml: is there already and would be written over; expected another folder\n"
