@@ -11,6 +11,7 @@ from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask, read_task
+from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg_cli.console import (
     FiguresOption,
@@ -23,6 +24,7 @@ from hmmseg_cli.console import (
     distinct_trials,
     read_trials,
 )
+from hmmseg_cli.labels import WriteOption, check_destination, write_labels
 
 
 class Method(StrEnum):
@@ -46,30 +48,34 @@ def segment(
     trials: TrialsArgument, task: TaskOption, rig: RigFile = None, model: ModelFile = None,
     method: Annotated[Method, typer.Option(help="hmm, or the paper's thresholds.")] = Method.HMM,
     force_threshold: ForceThreshold = 0.05, velocity_threshold: VelocityThreshold = 0.05,
-    json: JsonOption = None, figures: FiguresOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+    write: WriteOption = None, json: JsonOption = None, figures: FiguresOption = None, seed: SeedOption = 0,
+    quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Segment recordings into the task's subtasks, with the uncertainty of every boundary."""
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
+        check_destination(write, paths)
         description = read_task(task)
         if isinstance(description, SequenceTask):
-            found = _segment_sequence(out, paths, description, rig, model, method, seed)
+            recordings, found = _segment_sequence(out, paths, description, rig, model, method, seed)
         else:
             if rig is None:
                 raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
             if model is not None:
                 raise InputError(f"--model {model}", "goes only with a plain ordered task")
             thresholds = (force_threshold, velocity_threshold)
-            found = _segment_blocks(out, paths, description, rig, method, thresholds)
+            recordings, found = _segment_blocks(out, paths, description, rig, method, thresholds)
         for segmentation in found:
             out.print(spans_table(segmentation))
             warn_of_misfit(out, segmentation)
+        if write is not None:
+            write_labels(out, write, paths, recordings, found)
         out.finish({"method": method.value, "trials": [s.to_json() for s in found]})
 
 
 def _segment_blocks(
     out: Output, paths, task, rig_file: Path, method: Method, thresholds
-) -> list[Segmentation]:
+) -> tuple[list[Trial], list[Segmentation]]:
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
     from hmmseg.segmentation.thresholds import segment_qualitative
@@ -89,12 +95,12 @@ def _segment_blocks(
 
         for trial, s, segmentation in zip(recordings, signals, found, strict=True):
             draw_signals(s, segmentation, out.figure(f"{trial.stem}_segments.png"))
-    return found
+    return recordings, found
 
 
 def _segment_sequence(
     out: Output, paths, task: SequenceTask, rig_file, model_file, method: Method, seed: int
-) -> list[Segmentation]:
+) -> tuple[list[Trial], list[Segmentation]]:
     from hmmseg.io.rig import read_rig
     from hmmseg.sequence.model import load_model
     from hmmseg.sequence.segment import segment_sequence
@@ -109,7 +115,7 @@ def _segment_sequence(
 
         for trial, segmentation in zip(recordings, found, strict=True):
             draw_channels(trial, segmentation, out.figure(f"{trial.stem}_segments.png"))
-    return found
+    return recordings, found
 
 
 def warn_of_misfit(out: Output, segmentation: Segmentation) -> None:

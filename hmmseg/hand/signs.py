@@ -64,15 +64,10 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     lifts = holds.pressed & (holds.height > LIFTED)
     idle = float(np.median(load[holds.before])) if holds.before.sum() >= BRIEF else 0.0
     carried = _agreed(load[lifts] - idle, MOST) if lifts.sum() >= BRIEF else 0
-    both = (
-        lifts.sum() >= BRIEF
-        and np.median(signals.fy1[there][lifts]) * np.median(signals.fy2[there][lifts]) > 0
-    )
-    found = _sides(apart, towards, carried, bool(both), trial, rig)
-    if not found and lifts.sum() >= BRIEF:
-        found = _one_bears(
-            *(float(np.median(f[there][lifts])) for f in (signals.fy1, signals.fy2)), idle, rig
-        )
+    bearing = signals.fy1[there][lifts], signals.fy2[there][lifts]
+    first, second = (float(np.median(f)) if f.size >= BRIEF else 0.0 for f in bearing)
+    found = _sides(apart, towards, carried, first * second > 0, trial, rig)
+    found = found or _one_bears(first, second, idle, rig)
     found = found or _downwards(holds, load, trial, rig)
     if found or lifts.sum() < BRIEF:
         return found

@@ -1,0 +1,180 @@
+"""A segmentation written back beside its recording, for training pipelines and viewers.
+
+Tables (CSV, Parquet) get columns: `subtask_index` (from 0), `subtask`, `object`, `state`, and
+`boundary_sd`, the standard deviation [s] of the nearer boundary of the sample's span. An MCAP
+gets the topic `/hmmseg/subtask`, one JSON message a boundary. A LeRobot data set gets the feature
+`subtask_index` and `meta/subtasks.parquet`, as its own tools have them.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmmseg.errors import InputError
+from hmmseg.io.formats import kind_of, read_table, split_part
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.spans import Span
+
+TABLES = (".csv", ".parquet")
+TOPIC = "/hmmseg/subtask"
+ADDED = ("subtask_index", "subtask", "object", "state", "boundary_sd")
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Of every sample (num_timesteps,): index of its span (-1 outside all), and boundary sd [s]."""
+
+    index: np.ndarray
+    boundary_sd: np.ndarray
+    spans: tuple[Span, ...]
+
+    def names(self, field: str) -> np.ndarray:
+        """A field of each sample's span, empty where it has none."""
+        entries = [getattr(span, field) or "" for span in self.spans]
+        return np.array([*entries, ""], dtype=object)[self.index]
+
+
+def label(t: np.ndarray, spans: Sequence[Span]) -> Labels:
+    """Labels of samples at t (num_timesteps,) [s]; spans are half-open, the last keeps its end."""
+    if not spans:
+        return Labels(np.full(t.size, -1), np.full(t.size, np.nan), ())
+    starts, ends = np.array([s.start for s in spans]), np.array([s.end for s in spans])
+    index = np.searchsorted(starts, t, side="right") - 1
+    last = (index == len(spans) - 1) & (t == ends[-1])
+    index = np.where((index >= 0) & ((t < ends[index]) | last), index, -1)
+    start_sd, end_sd = np.array([s.start_sd for s in spans]), np.array([s.end_sd for s in spans])
+    sd = np.where(t - starts[index] < ends[index] - t, start_sd[index], end_sd[index])
+    return Labels(index, np.where(index < 0, np.nan, sd), tuple(spans))
+
+
+def write_table(path: Path, source: str | Path, trial: Trial, spans: Sequence[Span]) -> None:
+    """The source's own columns with the labels added, as CSV or Parquet by the path's ending."""
+    import pandas as pd
+
+    table = read_table(source)
+    labels = label(trial.t, spans)
+    for name in ADDED:
+        if name in table.names:
+            raise InputError(f"{source}: column {name}", "is there already", "a recording without labels")
+    columns = {"t": trial.t, **trial.channels} if table.messages else table.columns
+    frame = pd.DataFrame(columns).assign(
+        subtask_index=labels.index, subtask=labels.names("subtask"), object=labels.names("object"),
+        state=labels.names("state"), boundary_sd=labels.boundary_sd,
+    )  # fmt: skip
+    if path.suffix.lower() == ".parquet":
+        frame.to_parquet(path, index=False)
+    else:
+        frame.to_csv(path, index=False)
+
+
+SCHEMA = {
+    "title": "hmmseg.Subtask", "type": "object",
+    "properties": {
+        "subtask_index": {"type": "integer"}, "subtask": {"type": "string"}, "object": {"type": "string"},
+        "state": {"type": "string"}, "start": {"type": "number"}, "end": {"type": "number"},
+        "start_sd": {"type": "number"}, "end_sd": {"type": "number"},
+    },
+}  # fmt: skip
+
+
+def write_mcap(path: Path, source: str | Path, trial: Trial, spans: Sequence[Span]) -> None:
+    """A new MCAP with the topic of subtasks, and all messages of the source if it is one."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    origin = trial.origin or 0
+    with path.open("wb") as out:
+        writer = Writer(out)
+        writer.start(profile="", library="hmmseg")
+        file, _ = split_part(source)
+        if kind_of(file) == "mcap":
+            with file.open("rb") as original:
+                _copy(make_reader(original), writer)
+        schema = writer.register_schema("hmmseg.Subtask", "jsonschema", json.dumps(SCHEMA).encode())
+        channel = writer.register_channel(TOPIC, "json", schema)
+        for number, span in enumerate(spans):
+            body = {"subtask_index": number, "subtask": span.subtask, "object": span.object or "",
+                    "state": span.state, "start": span.start, "end": span.end,
+                    "start_sd": span.start_sd, "end_sd": span.end_sd}  # fmt: skip
+            when = origin + round(span.start * 1e9)
+            writer.add_message(channel, when, json.dumps(body).encode(), when, number)
+        writer.finish()
+
+
+def _copy(reader: Any, writer: Any) -> None:
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    for schema, channel, message in reader.iter_messages():
+        if schema is not None and schema.id not in schemas:
+            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        if channel.id not in channels:
+            channels[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
+            )
+        writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time,
+                           message.sequence)  # fmt: skip
+
+
+def lerobot_files(folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]]) -> dict[Path, Any]:
+    """Files of an annotated copy by their place below its folder, each a function that writes it to a path.
+
+    Episodes that are not labelled have `subtask_index` -1. Videos are not copied.
+    """
+    from hmmseg.io.formats.lerobot import data_files, read_info
+
+    info = read_info(folder)
+    names = list(dict.fromkeys(_name(s) for _, spans in labelled.values() for s in spans))
+    indices = {name: i for i, name in enumerate(names)}
+    feature = {"dtype": "int64", "shape": [1], "names": None}
+    if "subtask_index" in info["features"]:
+        raise InputError(f"{folder}/meta/info.json", "has a feature subtask_index already", "no labels yet")
+    info["features"]["subtask_index"] = feature
+    info["features"]["boundary_sd"] = {"dtype": "float32", "shape": [1], "names": None}
+    out: dict[Path, Any] = {}
+    for file in sorted((folder / "meta").rglob("*")):
+        if file.is_file() and file.name != "info.json":
+            out[file.relative_to(folder)] = lambda path, file=file: shutil.copyfile(file, path)
+    text = json.dumps(info, indent=4)
+    out[Path("meta/info.json")] = lambda path: path.write_text(text, encoding="utf-8")
+    out[Path("meta/subtasks.parquet")] = lambda path: _write_names(path, names)
+    for file in data_files(folder):
+        out[file.relative_to(folder)] = lambda path, file=file: _write_episodes(path, file, labelled, indices)
+    return out
+
+
+def _name(span: Span) -> str:
+    return f"{span.subtask} {span.object or ''}".strip()
+
+
+def _write_names(path: Path, names: Sequence[str]) -> None:
+    import pandas as pd
+
+    frame = pd.DataFrame({"subtask_index": np.arange(len(names))}, index=pd.Index(names, name="subtask"))
+    frame.to_parquet(path)
+
+
+def _write_episodes(path: Path, file: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]],
+                    indices: Mapping[str, int]) -> None:  # fmt: skip
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(file)
+    episodes = table.column("episode_index").to_numpy()
+    index = np.full(len(episodes), -1, dtype=np.int64)
+    sd = np.full(len(episodes), np.nan, dtype=np.float32)
+    for number, (trial, spans) in labelled.items():
+        rows = episodes == number
+        if rows.sum() != trial.t.size:
+            continue
+        labels = label(trial.t, spans)
+        codes = np.array([*(indices[_name(span)] for span in labels.spans), -1])
+        index[rows], sd[rows] = codes[labels.index], labels.boundary_sd
+    table = table.append_column("subtask_index", pa.array(index)).append_column("boundary_sd", pa.array(sd))
+    pq.write_table(table, path)
