@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from estimation.actual import Actual
 from estimation.design import Design, Unknown, build
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.observations import CHANNELS, Aligned, Noise, aligned_weights
 from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.sampler import Draws, sample
+from estimation.tables import properties_table
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
+from hmmseg.errors import nearest
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import Trial
-from hmmseg.segmentation.align import AlignedTrials, align
+from hmmseg.jaxconfig import double_precision
+from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.tables import as_html, as_text
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 NOT_LEVEL = 2e-3  # m; more than a tilted table or a slip in the grip make of a move on a level
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identification:
     """Everything `identify` found.
 
@@ -57,7 +62,13 @@ class Identification:
         return self.aligned.segmentations
 
     def of(self, obj: str, prop: str) -> np.ndarray:
-        """Posterior draws (num_draws,) of one property; KeyError where it is undetermined."""
+        """Posterior draws (num_draws,) of one property [N, m].
+
+        KeyError where it is undetermined, saying why, or where there is none of that name, with the nearest.
+        """
+        for name, known in ((obj, self.task.objects), (prop, tuple(UNITS))):
+            if name not in known:
+                raise KeyError(f"no {name!r}; expected {nearest(name, known)}")
         if (obj, prop) not in self.names:
             raise KeyError(f"{obj}.{prop} is undetermined: {self.reasons.get(f'{obj}.{prop}', '')}")
         return self.draws[:, self.names.index((obj, prop))]
@@ -98,6 +109,30 @@ class Identification:
             "rhat": found.rhat, "acceptance": found.acceptance, "converged": found.converged,
         }  # fmt: skip
 
+    def __repr__(self) -> str:
+        return as_text(properties_table(self.to_json()))
+
+    def _repr_html_(self) -> str:
+        return as_html(properties_table(self.to_json()))
+
+    def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None):
+        """Every property with its 68 and 95 % interval, against measured values where given; the axes."""
+        from estimation.plot.estimates import draw_estimates
+
+        return draw_estimates(self.to_json()["properties"], actual, None if path is None else Path(path))
+
+    def plot_posterior(self, actual: Actual | None = None, path: str | Path | None = None):
+        """Corner plot of the joint posterior; its axes (num_properties, num_properties)."""
+        from estimation.plot.corner import draw_corner
+
+        return draw_corner(self.draws, self.names, None if path is None else Path(path), actual)
+
+    def plot_check(self, trial: int = 0, path: str | Path | None = None):
+        """One trial's recorded samples in the band that the posterior predicts; the axes."""
+        from estimation.plot.predictive import draw_check
+
+        return draw_check(self, trial, None if path is None else Path(path))
+
     def to_arviz(self):
         """ArviZ InferenceData of the properties' posterior, dimensions (chain, draw)."""
         import arviz
@@ -109,22 +144,11 @@ class Identification:
         return arviz.from_dict(posterior={name: chain[..., i] for i, name in enumerate(names)})
 
 
-def identify(
-    trials: Sequence[Trial], task: BlockTask, rig: Rig, seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> Identification:  # fmt: skip
-    """Segment the trials and estimate the properties of every block, all trials pooled.
-
-    `progress(steps_done, steps_at_most)` is called while sampling. Raises InputError for input
-    that cannot be used; trials that do not fit the task are reported, not raised.
-    """
-    return identify_aligned(align(trials, task, rig), seed, progress)
-
-
+@double_precision
 def identify_aligned(
     aligned: AlignedTrials, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Identification:
-    """As `identify`, of trials that are aligned already."""
+    """Properties of every block from aligned trials, pooled; `progress(steps_done, steps_at_most)`."""
     rng, rig = np.random.default_rng(seed), aligned.rig
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)

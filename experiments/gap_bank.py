@@ -15,7 +15,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
 from simgap.gap import bank as store

@@ -22,7 +22,6 @@ import jax
 import numpy as np
 
 from experiments.table_text import RESULTS
-from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
 from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import GROUND, BlockTask, Move, read_task
 from hmmseg.io.trial import Trial

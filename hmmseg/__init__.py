@@ -1,3 +1,56 @@
-"""From a task description and a recording to subtask spans."""
+"""From a task description and a recording to subtask spans with uncertain boundaries.
+
+`Task`, `Rig` and `Trial` read what is given; `align` and `segment` find the subtasks. Packages that begin
+with an underscore, and names that are not listed here, are internal.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hmmseg.api import align, fit, segment
+    from hmmseg.contact.decompose import decompose
+    from hmmseg.errors import InputError
+    from hmmseg.io.rig import Rig
+    from hmmseg.io.task import Task
+    from hmmseg.io.trial import Trial
+    from hmmseg.segmentation.spans import Segmentation
 
 __version__ = "0.1.0"
+__all__ = [
+    "InputError",
+    "Rig",
+    "Segmentation",
+    "Task",
+    "Trial",
+    "__version__",
+    "align",
+    "decompose",
+    "fit",
+    "segment",
+]
+
+# Where each public name lives; imported when it is first asked for, so that `import hmmseg` is quick.
+_HOMES = {
+    "InputError": "hmmseg.errors",
+    "Rig": "hmmseg.io.rig",
+    "Segmentation": "hmmseg.segmentation.spans",
+    "Task": "hmmseg.io.task",
+    "Trial": "hmmseg.io.trial",
+    "align": "hmmseg.api",
+    "decompose": "hmmseg.contact.decompose",
+    "fit": "hmmseg.api",
+    "segment": "hmmseg.api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

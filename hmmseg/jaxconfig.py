@@ -1,18 +1,22 @@
-"""JAX settings of the whole project: double precision and a compilation cache that persists.
+"""JAX settings: double precision, and a compilation cache that persists.
 
-Import this module before building any JAX array. Forces span 1e-3 to 10 N while log-likelihoods
-reach 1e5, so single precision would lose boundaries; compiled programs are kept in the user's
-cache folder because compilation is a cost the user feels.
+Importing this project changes no setting of the process. Forces span 1e-3 to 10 N while log-likelihoods
+reach 1e5, so single precision would lose boundaries: public functions run in double precision whatever the
+caller's JAX is set to (`double_precision`). The project's own programs call `configure`, which also keeps
+compiled programs in the user's cache folder, because compilation is a cost the user feels.
 """
 
 from __future__ import annotations
 
+import functools
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def cache_folder() -> Path:
@@ -21,7 +25,32 @@ def cache_folder() -> Path:
     return Path(base) / "hmmseg"
 
 
-if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+def configure() -> None:
+    """Double precision and the persistent cache for this whole process, JAX imported already or not."""
+    settings: dict[str, Any] = {
+        "jax_enable_x64": True,
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": 0,
+    }
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        settings["jax_compilation_cache_dir"] = str(cache_folder() / "jax")
+    for name, value in settings.items():  # what JAX reads when it is imported
+        os.environ[name.upper()] = str(value)
+    if "jax" in sys.modules:
+        for name, value in settings.items():
+            sys.modules["jax"].config.update(name, value)
+
+
+def double_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """The function with JAX in double precision while it runs, and as it was afterwards."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        import jax
+
+        if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+            return function(*args, **kwargs)
+        with jax.enable_x64(True):
+            return function(*args, **kwargs)
+
+    return wrapped

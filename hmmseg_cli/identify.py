@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
+from estimation.tables import properties_table
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli.console import (
@@ -37,7 +37,6 @@ class Method(StrEnum):
 
 
 MethodOption = Annotated[Method, typer.Option(help="Bayesian, or the paper's thresholds and formulas.")]
-SHOWN = {"weight": (1.0, "N", 4), "width": (100.0, "cm", 4), "height": (100.0, "cm", 4)}
 
 
 def identify(
@@ -133,32 +132,3 @@ def _compared(properties: dict[str, Any], measured) -> dict[str, Any]:
                 row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
             out.setdefault(obj, {})[prop] = row
     return out
-
-
-def properties_table(body: dict[str, Any], measured=None) -> Table:
-    """The properties for people to read, lengths in cm as the paper has them."""
-    table = Table(title=f"properties ({body['method']})", title_justify="left")
-    for head in ("block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())):
-        table.add_column(head, no_wrap=head != "estimate")
-    for obj, entries in body["properties"].items():
-        for prop, entry in entries.items():
-            cells = [obj, prop, *_cells(prop, entry)]
-            if measured:
-                value = measured.get(obj, {}).get(prop)
-                factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
-                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}")
-            table.add_row(*cells)
-    return table
-
-
-def _cells(prop: str, entry: dict[str, Any] | None) -> tuple[str, str]:
-    if entry is None:
-        return "unknown", ""
-    factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
-    if entry.get("mean") is None:
-        return f">= {entry['lower_bound']:.{digits}f}", ""
-    low, high = (f"{v * factor:.{digits}f}" for v in entry["interval_95"])
-    return (
-        f"{entry['mean'] * factor:.{digits}f} +- {entry['sd'] * factor:.{digits}f} {unit}",
-        f"{low} to {high}",
-    )

@@ -14,6 +14,7 @@ import typer
 
 import hmmseg
 from hmmseg.errors import InputError
+from hmmseg.jaxconfig import configure
 from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, inspect, new, segment, simulate
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
@@ -55,6 +56,7 @@ def _hmmseg(
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code (0 or 2; 130 when interrupted)."""
+    configure()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
     args = diagnose.spread_against(args)
     command = typer.main.get_command(app)

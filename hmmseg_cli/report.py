@@ -13,13 +13,13 @@ import jinja2
 import hmmseg
 from estimation.actual import Actual
 from estimation.identification import Identification
+from estimation.plot.corner import draw_corner
+from estimation.plot.estimates import draw_estimates
+from estimation.plot.predictive import draw_check
 from hmmseg.hand.signals import Signals
 from hmmseg.io.trial import Trial
+from hmmseg.plot.signals import draw_signals
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg_cli.figures.corner import draw_corner
-from hmmseg_cli.figures.estimates import draw_estimates
-from hmmseg_cli.figures.identification import draw_check
-from hmmseg_cli.figures.signals import draw_signals
 
 SHOWN = {
     "weight": (1.0, "N", 4),
@@ -58,7 +58,7 @@ def identification_page(
     )  # fmt: skip
 
 
-def picture(draw: Callable[[Path], None], caption: str) -> dict[str, str]:
+def picture(draw: Callable[[Path], Any], caption: str) -> dict[str, str]:
     """A figure as base64 PNG with its caption."""
     with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
         path = Path(folder) / "figure.png"

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask, read_task
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.tables import spans_table
 from hmmseg_cli.console import (
     FiguresOption,
     JsonOption,
@@ -91,7 +91,7 @@ def _segment_blocks(
 
         found = segment(recordings, task, rig)
     if out.figures is not None:
-        from hmmseg_cli.figures.signals import draw_signals
+        from hmmseg.plot.signals import draw_signals
 
         for trial, s, segmentation in zip(recordings, signals, found, strict=True):
             draw_signals(s, segmentation, out.figure(f"{trial.stem}_segments.png"))
@@ -111,7 +111,7 @@ def _segment_sequence(
     learned = None if model_file is None else load_model(model_file, task)
     found = segment_sequence(recordings, task, learned, seed)
     if out.figures is not None:
-        from hmmseg_cli.figures.channels import draw_channels
+        from hmmseg.plot.channels import draw_channels
 
         for trial, segmentation in zip(recordings, found, strict=True):
             draw_channels(trial, segmentation, out.figure(f"{trial.stem}_segments.png"))
@@ -123,17 +123,3 @@ def warn_of_misfit(out: Output, segmentation: Segmentation) -> None:
     failed = () if segmentation.failed is None else (segmentation.failed,)
     for failure in segmentation.failures or failed:
         out.warn(f"{segmentation.file}: {failure}")
-
-
-def spans_table(segmentation: Segmentation) -> Table:
-    """The spans of one trial for people to read."""
-    table = Table(title=f"{Path(segmentation.file).name} ({segmentation.rate:.4g} Hz)", title_justify="left")
-    for head, justify in (("subtask", "left"), ("state", "left"), ("start [s]", "right"),
-                          ("90 % interval", "left"), ("end [s]", "right")):  # fmt: skip
-        table.add_column(head, justify=justify)  # type: ignore[arg-type]
-    for span in segmentation.spans:
-        low, high = span.start_90
-        interval = f"{low:.3f} to {high:.3f}" if high > low else ""
-        name = f"{span.subtask} {span.object or ''}".strip()
-        table.add_row(name, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}")
-    return table

@@ -112,7 +112,7 @@ def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, fi
             out.warn(f"trial_{k:02d}: the task failed (a block was not lifted or was dropped)")
         signals = task_space(simulated.trial, rig)
         if out.figures is not None and np.isfinite(simulated.boundaries).all():
-            from hmmseg_cli.figures.signals import draw_signals
+            from hmmseg.plot.signals import draw_signals
 
             found = _segmentation(f"trial_{k:02d}.csv", signals, task, simulated.boundaries)
             draw_signals(signals, found, out.figure(f"trial_{k:02d}_signals.png"))

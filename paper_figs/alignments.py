@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from hmmseg.drawing import BLUE, INK, RED, canvas
+from hmmseg.plot.style import BLUE, INK, RED, canvas
 from paper_figs.panels import shade, state_handles
 from paper_figs.results import load, target
 

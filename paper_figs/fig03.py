@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import WIDTH, canvas
+from hmmseg.plot.style import WIDTH, canvas
 from paper_figs.panels import scene
 from paper_figs.results import load, target
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import INK, canvas
+from hmmseg.plot.style import INK, canvas
 from paper_figs.panels import name_marks, shade, stacked, state_handles
 from paper_figs.results import load, target
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hmmseg.drawing import canvas
+from hmmseg.plot.style import canvas
 from paper_figs.panels import THRESHOLD_HANDLE, forces, name_marks, shade, state_handles
 from paper_figs.results import load, target
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hmmseg.drawing import BLUE, INK, RED, canvas
+from hmmseg.plot.style import BLUE, INK, RED, canvas
 from paper_figs.panels import stacked
 from paper_figs.results import load, target
 

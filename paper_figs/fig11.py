@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import RED, canvas
+from hmmseg.plot.style import RED, canvas
 from paper_figs.panels import scene
 from paper_figs.results import load, target
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from hmmseg.drawing import GREY, INK, STATE_COLOURS, canvas
+from hmmseg.plot.style import GREY, INK, STATE_COLOURS, canvas
 from paper_figs.panels import THRESHOLD_HANDLE, forces
 from paper_figs.results import load, target
 

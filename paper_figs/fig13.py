@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREY, ORANGE, canvas
+from hmmseg.plot.style import BLUE, GREY, ORANGE, canvas
 from paper_figs.panels import only
 from paper_figs.results import load, target
 

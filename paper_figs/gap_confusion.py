@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, INK, canvas
+from hmmseg.plot.style import BLUE, INK, canvas
 from paper_figs.gap_results import load, words
 from paper_figs.results import target
 

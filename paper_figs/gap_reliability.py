@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREY, canvas
+from hmmseg.plot.style import BLUE, GREY, canvas
 from paper_figs.gap_results import load
 from paper_figs.results import target
 

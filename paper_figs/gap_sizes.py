@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hmmseg.drawing import BLUE, GREEN, ORANGE, RED, SKY, canvas
+from hmmseg.plot.style import BLUE, GREEN, ORANGE, RED, SKY, canvas
 from paper_figs.gap_results import load
 from paper_figs.results import target
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from hmmseg.drawing import GREY, INK, ORANGE, SKY, STATE_COLOURS
+from hmmseg.plot.style import GREY, INK, ORANGE, SKY, STATE_COLOURS
 
 THRESHOLD = 0.05  # N
 BLOCK_COLOURS = {"block1": SKY, "block2": ORANGE}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREY, INK, RED, SKY, canvas
+from hmmseg.plot.style import BLUE, GREY, INK, RED, SKY, canvas
 from paper_figs.panels import shade, state_handles
 from paper_figs.results import load, target
 

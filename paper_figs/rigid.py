@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.drawing import GREY, INK, RED, canvas
+from hmmseg.plot.style import GREY, INK, RED, canvas
 from paper_figs.panels import BLOCK_COLOURS
 from paper_figs.results import load, target
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hmmseg.drawing import BLUE, GREY, INK, PURPLE, RED, canvas
+from hmmseg.plot.style import BLUE, GREY, INK, PURPLE, RED, canvas
 from paper_figs.panels import BLOCK_COLOURS
 from paper_figs.results import load, target
 

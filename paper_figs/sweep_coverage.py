@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hmmseg.drawing import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, canvas
+from hmmseg.plot.style import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, canvas
 from paper_figs.sweep_lines import SWEEPS
 from paper_figs.sweep_results import load, series, target
 

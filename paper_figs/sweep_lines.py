@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hmmseg.drawing import canvas
+from hmmseg.plot.style import canvas
 from paper_figs.sweep_results import METHODS, load, series, target
 
 # Sweep: label of its axis, factor to the printed unit, whether levels are spaced by ratio.

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
-from hmmseg.drawing import GREY, INK, canvas
+from hmmseg.plot.style import GREY, INK, canvas
 from paper_figs.sweep_results import load, target, value
 
 PANELS = (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREEN, ORANGE, RED
+from hmmseg.plot.style import BLUE, GREEN, ORANGE, RED
 from paper_figs.results import FIGURES, ROOT
 
 RESULTS = ROOT / "experiments/results/sweeps/full.json"

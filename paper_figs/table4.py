@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from hmmseg.drawing import BLUE, GREEN, GREY, INK, ORANGE, RED, canvas
+from hmmseg.plot.style import BLUE, GREEN, GREY, INK, ORANGE, RED, canvas
 from paper_figs.results import load, target
 
 KEYS = ("weight", "height", "width")

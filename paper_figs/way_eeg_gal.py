@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREY, ORANGE, RED, canvas
+from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from paper_figs.results import ROOT, target
 
 RESULTS = ROOT / "experiments" / "results" / "way_eeg_gal.json"

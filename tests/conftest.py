@@ -8,7 +8,9 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-jax.config.update("jax_enable_x64", True)
+from hmmseg.jaxconfig import configure
+
+configure()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

@@ -9,7 +9,8 @@ from functools import cache
 
 import numpy as np
 
-from estimation.identification import Identification, identify, source_subtasks
+from estimation import identify
+from estimation.identification import Identification, source_subtasks
 from estimation.observations import draw_boundaries
 from estimation.paper_formulas import FrictionBound, estimate_plugin
 from estimation.priors import property_priors

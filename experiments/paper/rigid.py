@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.identification import identify
+from estimation import identify
 from estimation.paper_formulas import PluginEstimates, estimate_plugin
 from experiments.paper.estimates import identified
 from experiments.paper.sources import BLOCKS, PRINTED, qualitative, recorded, save, simulated

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
-from estimation.identification import identify
+from estimation import identify
 from estimation.paper_formulas import estimate_plugin
 from experiments.paper.rigid import by_formula
 from experiments.paper.sources import BLOCKS, PRINTED, recorded, save

@@ -12,7 +12,6 @@ from functools import partial
 import jax
 import numpy as np
 
-from hmmseg import jaxconfig  # noqa: F401
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.dense import log_evidence, viterbi

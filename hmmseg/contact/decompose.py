@@ -36,7 +36,7 @@ from hmmseg.contact.states import (
     ContactState,
     contact_states,
 )
-from hmmseg.io.task import BlockTask, SequenceTask, Task
+from hmmseg.io.task import AnyTask, BlockTask, SequenceTask
 
 VARYING_LOAD = "the vertical force must vary while the object slides"
 
@@ -110,7 +110,7 @@ class Property:
 class Decomposition:
     """A task's subtasks in order, and for each object's properties what reveals them."""
 
-    task: Task
+    task: AnyTask
     subtasks: tuple[Subtask, ...]
     properties: dict[str, dict[str, Property]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -157,7 +157,7 @@ def _rank(name: str) -> int:
     return order.index(name) if name in order else len(order)
 
 
-def subtasks(task: Task) -> tuple[Subtask, ...]:
+def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
     """The ordered subtasks of a task."""
     if isinstance(task, SequenceTask):
         return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
@@ -193,7 +193,7 @@ def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
     return equations
 
 
-def decompose(task: Task) -> Decomposition:
+def decompose(task: AnyTask) -> Decomposition:
     """Subtasks of a task and what each object's properties can be learned from."""
     if isinstance(task, SequenceTask):
         note = "a plain ordered task has no block physics: no properties"

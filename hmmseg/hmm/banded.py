@@ -33,8 +33,6 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
-from hmmseg import jaxconfig  # noqa: F401
-
 Skip = Shaped[ArrayLike, "*_"] | tuple[Shaped[ArrayLike, "*_"], ...] | None
 
 

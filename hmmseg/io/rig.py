@@ -100,6 +100,13 @@ class Tolerance(StrictTable):
 class Rig(StrictTable):
     """The nominal hand as `rig.toml` describes it, SI units."""
 
+    @classmethod
+    def read(cls, source: str | Path | dict[str, Any] | Rig) -> Rig:
+        """Rig from a `rig.toml`, its table as a dict, or a rig itself; InputError for anything at fault."""
+        if isinstance(source, Rig):
+            return source
+        return parse_rig(source) if isinstance(source, dict) else read_rig(Path(str(source)))
+
     rate: FinitePositive | None = None
     gravity: FinitePositive = 9.80665
     fingers: dict[str, Finger] | None = None

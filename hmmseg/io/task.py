@@ -30,8 +30,19 @@ class Move:
     slide: bool = False
 
 
+class Task:
+    """A task description: `BlockTask` or `SequenceTask`."""
+
+    @staticmethod
+    def read(source: str | Path | dict[str, Any] | Task) -> BlockTask | SequenceTask:
+        """Task from a `task.toml`, its table as a dict, or a task; InputError for anything at fault."""
+        if isinstance(source, BlockTask | SequenceTask):
+            return source
+        return parse_task(source) if isinstance(source, dict) else read_task(Path(str(source)))
+
+
 @dataclass(frozen=True)
-class BlockTask:
+class BlockTask(Task):
     """Blocks, what each stands on at the start, and the moves in order.
 
     `repeat` performs the list of moves that many times; "unknown": as often as recorded.
@@ -53,7 +64,7 @@ class BlockTask:
 
 
 @dataclass(frozen=True)
-class SequenceTask:
+class SequenceTask(Task):
     """A plain ordered task: named states over arbitrary channels, without block physics.
 
     `channels` None means every column but `t`; states in `optional` may be skipped.
@@ -64,15 +75,15 @@ class SequenceTask:
     optional: tuple[str, ...] = ()
 
 
-Task = BlockTask | SequenceTask
+AnyTask = BlockTask | SequenceTask
 
 
-def read_task(path: str | Path) -> Task:
+def read_task(path: str | Path) -> AnyTask:
     """Task from a `task.toml` file; InputError for anything at fault."""
     return parse_task(read_toml(path), str(path))
 
 
-def parse_task(table: dict[str, Any], where: str = "task") -> Task:
+def parse_task(table: dict[str, Any], where: str = "task") -> AnyTask:
     """Task from the table of a `task.toml`; InputError names the key or the move at fault."""
     kinds = {"objects", "moves", "repeat"}, {"sequence", "channels", "optional"}
     for key in table:

@@ -15,7 +15,7 @@ from hmmseg.io.formats import LOGS, kind_of, read_table, split_part
 from hmmseg.io.frames import frame_table
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
-from hmmseg.io.task import SequenceTask
+from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import si_factor
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
@@ -39,6 +39,19 @@ class Trial:
     origin: int | None = None
     interpolated: dict[str, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+    @staticmethod
+    def read(source: Any, rig: Any = None, task: Any = None) -> Trial:
+        """Trial from a file, a DataFrame (pandas, polars), a dict of arrays or a trial itself.
+
+        `rig` (or, for a plain ordered task, `task`) says which channels it has: a path, a dict or
+        what `Rig.read` and `Task.read` give. InputError names file, row or column at fault.
+        """
+        if isinstance(source, Trial):
+            return source
+        hand = None if rig is None else Rig.read(rig)
+        order = None if task is None else Task.read(task)
+        return read_trial(source, hand, order if isinstance(order, SequenceTask) else None)
 
     @property
     def rate(self) -> float:

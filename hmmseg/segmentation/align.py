@@ -12,6 +12,7 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
+from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.boundaries import BoundaryPosterior, combine
 from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
 from hmmseg.segmentation.crossings import NEAREST, Contacts, contacts
@@ -77,6 +78,7 @@ class _Piece:
     last: float
 
 
+@double_precision
 def align(
     trials: Sequence[Trial],
     task: BlockTask,
@@ -202,7 +204,7 @@ def _joined(
     rate = float(1.0 / np.median(np.diff(signals.t)))
     segmentation = Segmentation(
         trial.file, rate, sum(p.evidence for p in pieces), tuple(spans), failures[0] if failures else None,
-        len(pieces) if number > 1 or open_end else None, tuple(failures),
+        len(pieces) if number > 1 or open_end else None, tuple(failures), signals,
     )  # fmt: skip
     table = features(thinned, rig)
     return TrialAlignment(trial, signals, thinned, table, tuple(boundaries), segmentation, present)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -51,12 +53,14 @@ class Failure:
         return document
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Segmentation:
     """Spans of one trial; `failed` where the recording does not fit its task.
 
     `log_evidence` is None from a method that has no likelihood. Of a repeated task, `repetitions` says
     how often the recording shows it and `failures` holds all rounds that do not fit, `failed` the first.
+    `recorded` is what `plot` shows: the signals of a block task's trial, the trial itself of a plain
+    ordered task.
     """
 
     file: str
@@ -66,6 +70,7 @@ class Segmentation:
     failed: Failure | None = None
     repetitions: int | None = None
     failures: tuple[Failure, ...] = ()
+    recorded: Any = field(default=None, compare=False)
 
     @property
     def complete(self) -> bool:
@@ -87,3 +92,26 @@ class Segmentation:
             document["repetitions"] = self.repetitions
             document["failures"] = [failure.to_json() for failure in self.failures]
         return document
+
+    def __repr__(self) -> str:
+        from hmmseg.segmentation.tables import as_text, spans_table
+
+        return as_text(spans_table(self)) + (f"{self.failed}\n" if self.failed else "")
+
+    def _repr_html_(self) -> str:
+        from hmmseg.segmentation.tables import as_html, spans_table
+
+        return as_html(spans_table(self))
+
+    def plot(self, path: str | Path | None = None) -> list[Any]:
+        """Signals over the coloured subtasks; the axes, one a signal. Saved where a path is given.
+
+        ValueError where the segmentation does not keep what was recorded.
+        """
+        if self.recorded is None:
+            raise ValueError("this segmentation keeps no recording to plot")
+        from hmmseg.plot.channels import draw_channels
+        from hmmseg.plot.signals import draw_signals
+
+        draw = draw_signals if hasattr(self.recorded, "grip") else draw_channels
+        return draw(self.recorded, self, None if path is None else Path(path))

@@ -23,7 +23,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import Signals
-from hmmseg.io.task import BlockTask, Task
+from hmmseg.io.task import AnyTask, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
@@ -206,7 +206,7 @@ def first_change_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assig
 def segment_qualitative(
     trial: Trial,
     signals: Signals,
-    task: Task,
+    task: AnyTask,
     force_threshold: float = FORCE_THRESHOLD,
     velocity_threshold: float = VELOCITY_THRESHOLD,
     rule: Rule = "monotone",
@@ -231,7 +231,9 @@ def segment_qualitative(
         failed = Failure(step.index, step.name, step.object,
                          f"no sample at its place in the order shows {step.state} at thresholds "
                          f"{force_threshold:g} N and {velocity_threshold:g} m/s")  # fmt: skip
-    return Segmentation(trial.file, trial.rate, None, _spans(signals.t, steps, assigned), failed)
+    return Segmentation(
+        trial.file, trial.rate, None, _spans(signals.t, steps, assigned), failed, recorded=signals
+    )
 
 
 def _repeated(task: BlockTask, labels: StateLabels, order: Order) -> tuple[tuple[Subtask, ...], Assignment]:

@@ -45,10 +45,10 @@ def _segment(trial: Trial, data: Features, model: SequenceModel) -> Segmentation
     except InfeasibleAlignment as error:
         k = min(error.subtask, len(model.task.sequence) - 1)
         failed = Failure(k, model.task.sequence[k], None, f"has no samples left: {error.reason}")
-        return Segmentation(trial.file, trial.rate, float("-inf"), (), failed)
+        return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
     return Segmentation(
         trial.file, trial.rate, alignment.log_evidence, _spans(trial, data, model, alignment),
-        _failure(data, model, alignment),
+        _failure(data, model, alignment), recorded=trial,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREY, ORANGE, RED, canvas
+from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.effects.base import FORCES
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.frame import CHANNELS

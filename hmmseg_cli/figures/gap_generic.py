@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hmmseg.drawing import BLUE, GREY, RED, canvas
+from hmmseg.plot.style import BLUE, GREY, RED, canvas
 from hmmseg_cli.figures.gap import draw_probabilities
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.generic.features import SLOW, bin_edges

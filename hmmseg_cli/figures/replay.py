@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hmmseg.drawing import BLUE, canvas
+from hmmseg.plot.spans import Panel, stacked_panels
+from hmmseg.plot.style import BLUE, canvas
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg_cli.figures.spans import Panel, stacked_panels
 from simgap.world.replay import Replay
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
+from hmmseg.jaxconfig import double_precision
 from simgap.effects import decoys
 from simgap.gap import judge
 from simgap.gap.adapt import adapted
@@ -50,6 +51,7 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
 
 
+@double_precision
 def diagnose(
     trials: Sequence[Trial],
     task: BlockTask,

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
 from simgap.effects import fitted as known_effects
 from simgap.effects.base import Effect, World, tips
 from simgap.gap.frame import Arrays, Frame

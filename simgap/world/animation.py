@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from hmmseg.drawing import BLUE, GREY, INK, OTHER_COLOURS, STYLE
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
+from hmmseg.plot.style import BLUE, GREY, INK, OTHER_COLOURS, STYLE
 from simgap.world.hand import inverse
 from simgap.world.properties import Block
 

@@ -13,6 +13,7 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
+from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
 from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import Blocks
@@ -56,6 +57,7 @@ class Replay:
         return self.measured - self.force
 
 
+@double_precision
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            infer_grip: bool = False) -> Replay:  # fmt: skip

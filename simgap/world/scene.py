@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jax import Array
 
-from hmmseg import jaxconfig  # noqa: F401  (double precision before any array)
 from hmmseg.io.rig import Rig
 from simgap.world.dynamics import Physics
 from simgap.world.properties import Block

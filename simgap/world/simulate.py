@@ -15,6 +15,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
+from hmmseg.jaxconfig import double_precision
 from simgap.world.dynamics import Physics, State, resting_state
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
 from simgap.world.performance import CONTROL_PERIOD, Impedance, Record, perform
@@ -54,6 +55,7 @@ def simulate_trial(task: BlockTask, rig: Rig, properties: Blocks, seed: int,
     return simulate_trials(task, rig, [properties], [seed], operator, surroundings)[0]
 
 
+@double_precision
 def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], seeds: Sequence[int],
                     operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
                     alter: Callable[[Plan, np.random.Generator], Plan] | None = None,

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
+from hmmseg.jaxconfig import double_precision
 from simgap.world.dynamics import (
     Loads,
     Physics,
@@ -97,6 +98,7 @@ class VirtualModel:
     A program is compiled at the first step, or before it by `prepare`.
     """
 
+    @double_precision
     def __init__(self, rig: Rig, task: BlockTask, blocks: Blocks, x: Mapping[str, float],
                  surroundings: Surroundings | None = None) -> None:  # fmt: skip
         self.physics = physics(rig, [blocks[name] for name in task.objects], surroundings)
@@ -112,10 +114,12 @@ class VirtualModel:
         self._tips: np.ndarray | None = None
         self.energy = 0.0
 
+    @double_precision
     def prepare(self, dt: float) -> None:
         """Compile for a period dt [s], so that no step of a loop has to."""
         jax.block_until_ready(self._advance(np.zeros(8), np.zeros(8), dt))
 
+    @double_precision
     def step(self, finger_positions: ArrayLike, finger_velocities: ArrayLike, dt: float) -> np.ndarray:
         """Forces (2, 2) [N] that fingers 1, 2 exert (x, y) after moving for dt [s] to these positions.
 
@@ -135,10 +139,12 @@ class VirtualModel:
         return values[:4].reshape(2, 2)
 
     @property
+    @double_precision
     def state(self) -> State:
         """Blocks and contacts now."""
         return self._unravel(self._state)
 
+    @double_precision
     def block_positions(self) -> np.ndarray:
         """Centres of the blocks (num_blocks, 2) [m] now."""
         state = self.state

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from experiments.paper import estimates, rigid, slip, sources, states, tables, write_docs
-from hmmseg import drawing
+from hmmseg.plot import style as drawing
 from paper_figs import __main__ as figures
 from paper_figs import results
 

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from hmmseg import drawing
+from estimation.plot import corner, estimates
+from estimation.plot.corner import draw_corner
+from estimation.plot.estimates import draw_estimates
+from estimation.plot.predictive import Prediction, draw_predictive
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
+from hmmseg.plot import style as drawing
+from hmmseg.plot.channels import MOST, draw_channels
+from hmmseg.plot.signals import draw_signals
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
-from hmmseg_cli.figures import corner, estimates
-from hmmseg_cli.figures.channels import MOST, draw_channels
-from hmmseg_cli.figures.corner import draw_corner
-from hmmseg_cli.figures.estimates import draw_estimates
-from hmmseg_cli.figures.predictive import Prediction, draw_predictive
-from hmmseg_cli.figures.signals import draw_signals
 
 T = np.arange(100) * 0.05
 NAMES = [("block1", "weight"), ("block1", "width"), ("block1", "height")]

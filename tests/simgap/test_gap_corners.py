@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, lsim
 
-from hmmseg import jaxconfig  # noqa: F401
 from simgap.effects.base import LATE, SMOOTH, YIELDING
 from simgap.gap.residuals import _between, _sunk, contact, shifted
 from tests.simgap.test_gap_effects import as_jax, performance, world_of

@@ -8,7 +8,6 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
-from hmmseg import jaxconfig  # noqa: F401
 from simgap.effects.backlash import play, side
 from simgap.gap.residuals import ANYWHERE, SLIDE, _driven, _filtered, _followed
 from tests.simgap.test_gap_effects import as_jax, performance, world_of

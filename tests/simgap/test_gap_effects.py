@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hmmseg import jaxconfig  # noqa: F401
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Finger, Fingertip, Rig
 from simgap.effects import catalogue, decoys, effect_named, fitted

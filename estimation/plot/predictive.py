@@ -7,12 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from hmmseg.drawing import BLUE, INK, RED, canvas
+from estimation.identification import Identification
+from estimation.predicted import predicted_signals
+from hmmseg.plot.spans import name_spans, shade_spans
+from hmmseg.plot.style import BLUE, INK, RED, canvas
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg_cli.figures.spans import name_spans, shade_spans
+
+UNITS = {
+    "net vertical force": ("Net fy less\npredicted [N]", 1.0),
+    "finger distance": ("Distance less\npredicted [mm]", 1e3),
+}
 
 
 @dataclass(frozen=True)
@@ -37,8 +45,11 @@ class Prediction:
 
 
 def draw_predictive(
-    t: np.ndarray, predictions: Sequence[Prediction], path: Path, segmentation: Segmentation | None = None
-) -> None:
+    t: np.ndarray,
+    predictions: Sequence[Prediction],
+    path: Path | None = None,
+    segmentation: Segmentation | None = None,
+) -> list[Axes]:
     """Recorded samples at t (num_timesteps,) [s] against predicted 90 % bands, a panel a signal.
 
     Samples outside their band are marked; each panel says which share lies inside.
@@ -67,3 +78,15 @@ def draw_predictive(
                    Patch(color=BLUE, alpha=0.35, lw=0, label="predicted, 90 %"),
                    Line2D([], [], color=RED, marker="x", ls="", label="outside")]  # fmt: skip
         figure.legend(handles=handles, loc="outside lower center", ncols=3)
+        return axes
+
+
+def draw_check(found: Identification, trial: int, path: Path | None = None) -> list[Axes]:
+    """One trial's recorded signals less what the fitted model predicts, in its band."""
+    t, predicted = predicted_signals(found, trial)
+    shown = []
+    for p in predicted:
+        label, factor = UNITS[p.name]
+        around = (factor * (v - p.median) for v in (p.observed, p.low, p.median, p.high))
+        shown.append(Prediction(label, *around))
+    return draw_predictive(t, shown, path, found.segmentations[trial])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,20 +36,26 @@ STYLE: dict[Any, Any] = {
 
 @contextmanager
 def canvas(
-    path: Path,
+    path: Path | None,
     width: float = WIDTH,
     height: float = 3.0,
     layout: Literal["constrained"] | None = "constrained",
 ) -> Iterator[Figure]:
     """An empty figure of this size [in]; saved to `path` (kind by its suffix) when the block ends.
 
-    No pyplot: nothing is left open and no display is asked for.
+    No pyplot: nothing is left open and no display is asked for. Without a path the figure is the
+    caller's to show: pyplot's where a notebook or script has loaded it.
     """
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout=layout)
-        FigureCanvasAgg(figure)
+        pyplot = sys.modules.get("matplotlib.pyplot") if path is None else None
+        if pyplot is not None:
+            figure = pyplot.figure(figsize=(width, height), layout=layout)
+        else:
+            figure = Figure(figsize=(width, height), layout=layout)
+            FigureCanvasAgg(figure)
         yield figure
-        figure.savefig(path, dpi=DPI)
+        if path is not None:
+            figure.savefig(path, dpi=DPI)
 
 
 def state_colours(states: list[str]) -> dict[str, str]:

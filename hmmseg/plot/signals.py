@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hmmseg.drawing import canvas
+from matplotlib.axes import Axes
+
 from hmmseg.hand.signals import Signals
+from hmmseg.plot.spans import Panel, stacked_panels
+from hmmseg.plot.style import canvas
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg_cli.figures.spans import Panel, stacked_panels
 
 
-def draw_signals(signals: Signals, segmentation: Segmentation, path: Path) -> None:
+def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
     """Mean position, finger distance, grip, net and shear forces over coloured subtasks."""
     panels = [
         Panel("Mean $x$\n[cm]", 100 * signals.x),
@@ -22,4 +24,4 @@ def draw_signals(signals: Signals, segmentation: Segmentation, path: Path) -> No
         Panel("Shear\n[N]", signals.shear),
     ]
     with canvas(path, height=8.2) as figure:
-        stacked_panels(figure, signals.t, panels, segmentation)
+        return stacked_panels(figure, signals.t, panels, segmentation)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation.actual import Actual
-from hmmseg.drawing import BLUE, RED, SHOWN, canvas
+from hmmseg.plot.style import BLUE, RED, SHOWN, canvas
 
 SIZE = 1.25  # in, a panel
 LEFT, RIGHT = 0.95, 0.3  # in, margins (below and above alike)
@@ -17,13 +17,17 @@ WIDEST = 0.6  # share of a panel by which a measured value may widen its range
 
 
 def draw_corner(
-    draws: np.ndarray, names: Sequence[tuple[str, str]], path: Path, actual: Actual | None = None
-) -> None:
+    draws: np.ndarray,
+    names: Sequence[tuple[str, str]],
+    path: Path | None = None,
+    actual: Actual | None = None,
+) -> np.ndarray:
     """Posterior draws (num_draws, num_properties) of the (object, property) pairs, SI units.
 
     Contours hold 39, 68 and 95 % of the probability, dashed lines are the quantiles 2.5, 50 and
     97.5 %. Measured values of `actual` are lines; one that lies far outside the draws is left out,
-    its panel saying so. ValueError for draws of another width than names.
+    its panel saying so. Returns the axes (num_properties, num_properties); ValueError for draws of
+    another width than names.
     """
     if draws.ndim != 2 or draws.shape[1] != len(names):
         raise ValueError(f"draws of shape {draws.shape} for {len(names)} names")
@@ -55,6 +59,7 @@ def draw_corner(
                 axes[i, i].set_title(f"measured {truth:.4g}", color=RED, fontsize=7)
         if any(line is not None for line in lines):
             figure.text(1 - RIGHT / size, 0.99, "red: measured", color=RED, ha="right", va="top", fontsize=8)
+        return axes
 
 
 def _corner_function() -> Callable:

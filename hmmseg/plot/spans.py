@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from hmmseg.drawing import INK, state_colours
+from hmmseg.plot.style import INK, state_colours
 from hmmseg.segmentation.spans import Segmentation
 
 LABEL_SLANT = 40  # degrees

@@ -11,14 +11,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from estimation.actual import Actual
-from hmmseg.drawing import BLUE, GREY, INK, SHOWN, canvas
+from hmmseg.plot.style import BLUE, GREY, INK, SHOWN, canvas
 
 ORDER = ("weight", "width", "height", "friction")
 
 
 def draw_estimates(
-    properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path
-) -> None:
+    properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path | None = None
+) -> Axes:
     """One row a property: 68 and 95 % interval in % of the measured value, numbers beside it.
 
     `properties` is the JSON of `identify`. Without a measured value the row is drawn about the
@@ -51,6 +51,7 @@ def draw_estimates(
             handles = [Line2D([], [], color=BLUE, marker="o", ls="", ms=3.5, label="estimate"), *handles]
             handles += [Patch(color=GREY, alpha=0.4, lw=0, label="measured, ± 1 sd")]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        return ax
 
 
 def _draw_row(

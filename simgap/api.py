@@ -1,0 +1,76 @@
+"""The public functions `simulate` and `diagnose`: they take paths and tables as well as what was read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from estimation.actual import parse_actual, read_actual
+from estimation.identification import Identification
+from hmmseg.api import Source, block_task, read_trials
+from hmmseg.io.rig import Rig
+from simgap.gap.diagnose import Diagnosis
+from simgap.gap.diagnose import diagnose as diagnose_blocks
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block, Blocks, paper_blocks, read_properties
+from simgap.world.simulate import SimulatedTrial, simulate_trials
+
+
+def simulate(
+    task: Source,
+    rig: Source,
+    properties: Identification | Mapping[str, Block] | str | Path | None = None,
+    trials: int = 1,
+    seed: int = 0,
+    operator: OperatorSettings | None = None,
+) -> list[SimulatedTrial]:
+    """Trials of the virtual model, performed by its own operator, each with its truth.
+
+    `properties`: an identification, blocks by name, or a file (identify's JSON, an `actual.toml`); the
+    paper's blocks by default. InputError for input at fault or where the hand cannot reach.
+    """
+    order, hand = block_task(task), Rig.read(rig)
+    blocks = _blocks(properties, order)
+    seeds = range(seed, seed + trials)
+    return simulate_trials(order, hand, [blocks] * trials, list(seeds), operator)
+
+
+def diagnose(
+    trials: Source | Sequence[Source],
+    task: Source,
+    rig: Source,
+    actual: str | Path | dict | None = None,
+    effects: Sequence[str] = (),
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Where recordings part from the virtual model, which effect causes it, how far it shrinks the gap.
+
+    `actual`: properties measured apart (a path or a table); `effects` are taken instead of choosing.
+    InputError for input at fault or where no trial fits its task.
+    """
+    order, hand = block_task(task), Rig.read(rig)
+    if isinstance(actual, dict):
+        measured = parse_actual(actual, order.objects)
+    else:
+        measured = None if actual is None else read_actual(actual, order.objects)
+    recorded = read_trials(trials, hand)
+    return diagnose_blocks(recorded, order, hand, measured, tuple(effects), seed, progress)
+
+
+def _blocks(properties: Any, task: Any) -> Blocks:
+    if properties is None:
+        return paper_blocks(task)
+    if isinstance(properties, Identification):
+        return {name: _found(properties, name) for name in task.objects}
+    if isinstance(properties, str | Path):
+        return read_properties(properties, task)
+    return properties
+
+
+def _found(found: Identification, name: str) -> Block:
+    weight, width, height = (float(found.of(name, key).mean()) for key in ("weight", "width", "height"))
+    bound = found.friction.get(name)
+    known = None if bound is None or bound.mu_draws is None else float(bound.mu_draws.mean())
+    return Block(weight, width, height) if known is None else Block(weight, width, height, known)

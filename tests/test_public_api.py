@@ -1,0 +1,116 @@
+"""What `import hmmseg, estimation, simgap` offers, used as a stranger would."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import estimation
+import hmmseg
+import simgap
+from hmmseg import InputError, Rig, Task, Trial, align, segment
+
+STACK = Path(__file__).parents[1] / "recordings" / "none_1"
+PUBLIC = {
+    hmmseg: "InputError Rig Segmentation Task Trial __version__ align decompose fit segment",
+    estimation: "Identification identify read_actual",
+    simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate",
+}
+
+
+@pytest.mark.parametrize("package", PUBLIC, ids=lambda p: p.__name__)
+def test_what_is_public_is_listed_and_there(package):
+    assert sorted(package.__all__) == PUBLIC[package].split()
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+        assert name in dir(package)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = package.nothing
+
+
+def run(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+
+
+def test_importing_loads_nothing_heavy_and_leaves_jax_alone():
+    heavy = run("import sys, hmmseg, estimation, simgap; print([m for m in ('jax', 'pandas', 'scipy', "
+                "'matplotlib', 'arviz') if m in sys.modules])")  # fmt: skip
+    assert heavy.strip() == "[]"
+    code = "import jax; before = dict(jax.config.values); from hmmseg import align; from estimation import " \
+           "identify; from simgap import diagnose; print(before == jax.config.values)"  # fmt: skip
+    assert run(code).strip() == "True"
+
+
+def test_a_process_whose_jax_is_single_precision_gets_the_same_answer():
+    code = (
+        "import os; os.environ.pop('JAX_ENABLE_X64', None); import jax, hmmseg; "
+        "assert not jax.config.jax_enable_x64; "
+        f"s = hmmseg.segment({str(STACK / 'trial_01.csv')!r}, {str(STACK / 'task.toml')!r}, "
+        f"{str(STACK / 'rig.toml')!r})[0]; assert not jax.config.jax_enable_x64; "
+        "assert jax.numpy.ones(1).dtype == 'float32'; print(s.log_evidence)"
+    )
+    here = segment(STACK / "trial_01.csv", STACK / "task.toml", STACK / "rig.toml")[0]
+    assert float(run(code)) == pytest.approx(here.log_evidence, rel=1e-12)
+
+
+def test_readers_take_paths_tables_and_arrays():
+    rig, task = Rig.read(STACK / "rig.toml"), Task.read(STACK / "task.toml")
+    assert Rig.read(rig) is rig and Task.read(task) is task
+    frame = pd.read_csv(STACK / "trial_01.csv")
+    arrays = {name: frame[name].to_numpy() for name in frame.columns}
+    trials = [Trial.read(source, rig) for source in (STACK / "trial_01.csv", frame, arrays)]
+    for trial in trials[1:]:
+        np.testing.assert_array_equal(trial.channels["fx1"], trials[0].channels["fx1"])
+    assert Trial.read(trials[0], rig) is trials[0]
+    spans = [segment(source, task, rig)[0].spans for source in (frame, arrays)]
+    assert spans[0] == spans[1]
+
+
+def test_mistakes_say_what_to_write():
+    with pytest.raises(InputError, match="rig: missing"):
+        segment(STACK / "trial_01.csv", STACK / "task.toml")
+    with pytest.raises(InputError, match="no blocks"):
+        align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
+    with pytest.raises(InputError, match="needs no fit"):
+        hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
+
+
+@pytest.fixture(scope="module")
+def found():
+    aligned = align([STACK / "trial_01.csv", STACK / "trial_02.csv"], STACK / "task.toml", STACK / "rig.toml")
+    return estimation.identify(aligned)
+
+
+def test_results_read_like_the_terminals_table(found):
+    text = repr(found)
+    assert "block1" in text and "weight" in text and "95 % interval" in text
+    assert "<table>" in found._repr_html_() and "<td>block1</td>" in found._repr_html_()
+    segmentation = found.segmentations[0]
+    assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
+
+
+def test_a_wrong_name_names_the_nearest(found):
+    with pytest.raises(KeyError, match=r"blok1.*block1"):
+        found.of("blok1", "weight")
+    with pytest.raises(KeyError, match=r"wieght.*weight"):
+        found.of("block1", "wieght")
+
+
+def test_plots_return_axes_and_save_where_asked(found, tmp_path):
+    assert len(found.segmentations[0].plot()) == 7
+    assert found.plot_estimates() is not None
+    assert len(found.plot_check()) == 2
+    found.plot_posterior(path=tmp_path / "corner.png")
+    assert (tmp_path / "corner.png").stat().st_size > 10_000
+    assert set(found.to_arviz().posterior) == {f"{o}.{p}" for o, p in found.names}
+
+
+def test_an_identification_calibrates_the_virtual_model(found):
+    made = simgap.simulate(STACK / "task.toml", STACK / "rig.toml", found, seed=3)[0]
+    assert made.blocks["block1"].weight == pytest.approx(found.of("block1", "weight").mean())
+    again = segment(made.trial, STACK / "task.toml", STACK / "rig.toml")[0]
+    starts = np.array([span.start for span in again.spans[1:]])
+    assert again.complete and np.abs(starts - made.boundaries).max() < 0.05
