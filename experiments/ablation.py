@@ -4,7 +4,7 @@
 
 Cases of four trials, pooled, are estimated in full and with a part left out. Heavy tails are judged
 on disturbed trials too: one force sample in fifty is off by up to 0.5 N, as a knock or a lost packet
-leaves it. Writes experiments/results/ablation.json; experiments.write_tables puts it in docs/model.md.
+leaves it. Writes experiments/results/ablation.json; experiments.write_tables puts it in docs/calibration.md.
 """
 
 from __future__ import annotations

@@ -7,6 +7,6 @@ from experiments.table_text import load
 
 
 def table() -> str | None:
-    """docs/gap.md: the published figures."""
+    """docs/gap_results.md: the published figures."""
     found = load("blind_check")
     return None if found is None else check_table(found)

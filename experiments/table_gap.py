@@ -14,7 +14,7 @@ BANKS = {
 
 
 def recordings() -> str | None:
-    """docs/gap.md: verdicts on labelled recordings."""
+    """docs/gap_results.md: verdicts on labelled recordings."""
     rows = load("gap_recordings")
     if rows is None:
         return None
@@ -46,7 +46,7 @@ def _verdict(found: dict[str, Any]) -> str:
 
 
 def rigs() -> str | None:
-    """docs/gap.md: false alarms on other rigs by the bank that judges them."""
+    """docs/gap_results.md: false alarms on other rigs by the bank that judges them."""
     found = load("gap_rigs")
     if found is None:
         return None
@@ -98,5 +98,5 @@ def _blind(found: dict[str, Any]) -> str:
         f"names above the detection floor {share('named_right')}, false alarms on healthy recordings "
         f"{false['hits']} of {false['count']}, what is outside the catalogue called unknown "
         f"{share('outside_unknown')}, exact pairs {share('pair_exact')} (goals: 95, 1, 90 and 80 %). All "
-        "figures, and what they show, stand in [docs/gap.md](docs/gap.md)."
+        "figures, and what they show, stand in [docs/gap_results.md](docs/gap_results.md)."
     )

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments import table_blind_check, table_gap
+from experiments import spent_sets, table_blind_check, table_gap
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
@@ -88,7 +88,7 @@ def results_and_rivals() -> str | None:
 
 
 def ablation() -> str | None:
-    """docs/model.md: errors and coverages with one part left out."""
+    """docs/calibration.md: errors and coverages with one part left out."""
     found = load("ablation")
     if found is None:
         return None
@@ -155,14 +155,15 @@ def moves() -> str | None:
 TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("README.md", "results", results_and_rivals),
     ("README.md", "real", real),
-    ("docs/model.md", "ablation", ablation),
+    ("docs/calibration.md", "ablation", ablation),
     ("docs/calibration.md", "calibration", calibration),
     ("docs/calibration.md", "moves", moves),
     ("docs/calibration.md", "misfits", misfits),
     ("README.md", "gap", table_gap.readme),
-    ("docs/gap.md", "recordings", table_gap.recordings),
-    ("docs/gap.md", "rigs", table_gap.rigs),
-    ("docs/gap.md", "blind", table_blind_check.table),
+    ("docs/gap_results.md", "recordings", table_gap.recordings),
+    ("docs/gap_results.md", "rigs", table_gap.rigs),
+    ("docs/gap_results.md", "blind", table_blind_check.table),
+    ("docs/history.md", "blind_sets", spent_sets.table),
 )
 
 

@@ -28,7 +28,8 @@ class Linear:
     """The gap about a point: n whitened rows, by log, channel, window and time.
 
     `residual` (n,) at the point; `jacobian` effect -> (n, k) derivative of the prediction by its
-    parameters; `raw` (n,) the residual in the channel's unit, not whitened; `diverged` are effects whose rollouts were not finite.
+    parameters; `raw` (n,) the residual in the channel's unit, not whitened; `diverged` are effects whose
+    rollouts were not finite.
     """
 
     residual: np.ndarray
