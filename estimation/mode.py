@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from estimation.posterior import Posterior
 
@@ -28,6 +27,8 @@ class Mode:
 
 def find_mode(post: Posterior) -> Mode:
     """Mode by BFGS from the priors' medians, with derivatives by central differences."""
+    from scipy.optimize import minimize  # slow to import
+
     size = 6
     steps = STEP * np.eye(size)
 

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask, decompose, height_equations, subtasks
 from hmmseg.hand.signals import Signals
@@ -47,7 +47,7 @@ class Estimate:
         document: dict = {"unit": self.unit, "mean": self.mean, "sd": self.sd, "median": self.mean}
         document["standard_error"] = self.standard_error
         for percent in (68, 95):
-            half = float(norm.ppf(0.5 + percent / 200)) * self.standard_error
+            half = float(ndtri(0.5 + percent / 200)) * self.standard_error
             document[f"interval_{percent}"] = [self.mean - half, self.mean + half]
         return {**document, "subtasks": list(self.subtasks)}
 

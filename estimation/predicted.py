@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from estimation.identification import Identification
 from estimation.observations import channel_values, gravity_factor
@@ -44,7 +44,7 @@ def predicted_signals(found: Identification, trial: int) -> tuple[np.ndarray, li
             width = found.of(obj, "width")
             distance[0, inside] = width.mean() + given[inside]
             distance[1, inside] = np.hypot(np.sqrt(found.noise.variance["distance"]), width.std())
-    half = norm.ppf(0.95)
+    half = float(ndtri(0.95))
     return signals.t, [
         PredictedSignal(name, observed, mean - half * sd, mean, mean + half * sd)
         for name, observed, (mean, sd) in (

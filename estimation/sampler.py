@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import emcee
 import numpy as np
 
 from estimation import priors
 from estimation.mode import Mode, find_mode
 from estimation.posterior import Posterior
 from estimation.proposal import proposal
+
+if TYPE_CHECKING:
+    import emcee
 
 INDEPENDENT = 0.9  # share of independence proposals
 WALKERS = 64
@@ -67,6 +70,8 @@ class Draws:
 
 def independence_move(mode: Mode) -> emcee.moves.MHMove:
     """Move of every walker to an independent draw of the proposal about the mode."""
+    import emcee  # slow to import: it loads scipy.stats
+
     independent = proposal(mode)
 
     def propose(x: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
@@ -80,6 +85,8 @@ def sample(
     post: Posterior, seed: int, progress: Callable[[int, int], None] | None = None, mode: Mode | None = None
 ) -> Draws:
     """Draws from the posterior, until converged or MAX_STEPS; `progress(steps, of)` is called."""
+    import emcee  # slow to import: it loads scipy.stats
+
     mode = find_mode(post) if mode is None else mode
     random = np.random.RandomState(seed)
     start = proposal(mode).draw(WALKERS, random)
@@ -163,6 +170,8 @@ def effective_sample_size(chain: np.ndarray) -> float:
 
     By emcee's autocorrelation time (Goodman & Weare 2010); 0 where a parameter never moved.
     """
+    import emcee  # slow to import: it loads scipy.stats
+
     with np.errstate(invalid="ignore"):  # 0 / 0 of a walker that never moved
         tau = emcee.autocorr.integrated_time(np.swapaxes(chain, 0, 1), quiet=True, tol=0)
     size = chain.shape[0] * chain.shape[1] / np.max(tau)

@@ -20,7 +20,7 @@ from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, inspec
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
-app = typer.Typer(add_completion=False, context_settings={"help_option_names": ["-h", "--help"]})
+app = typer.Typer(context_settings={"help_option_names": ["-h", "--help"]})
 
 # In the order of `hmmseg --help`. Modules import what is heavy (jax, matplotlib, pandas) inside
 # their command, so that help and light commands start at once.

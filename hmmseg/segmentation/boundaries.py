@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 POINTS = 41  # nodes per sample interval
 BEND = 0.015  # bend that the cubic misses, as a share of interval x change of velocity
@@ -109,6 +109,11 @@ def _single_density(c: Crossing, h: float) -> np.ndarray:
     return density / density.sum()
 
 
+def _log_normal(value, mean, sd) -> np.ndarray:
+    """Log density of a normal distribution."""
+    return -0.5 * ((value - mean) / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi)
+
+
 def _log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     """Rice's formula on the cubic that joins both ends."""
     h00, h10, h01, h11 = _hermite(u)
@@ -120,7 +125,7 @@ def _log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     variance = (h00 * c.sd_left) ** 2 + (h01 * c.sd_right) ** 2
     variance += (h * c.sd_v) ** 2 * (h10**2 + h11**2) + (4 * u * (1 - u) * bend) ** 2
     rise = np.hypot(slope, c.sd_v + bend / h)
-    return norm.logpdf(value, 0.0, np.sqrt(variance)) + np.log(rise * norm.cdf(slope / rise * 2))
+    return _log_normal(value, 0.0, np.sqrt(variance)) + np.log(rise * ndtr(slope / rise * 2))
 
 
 def _last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
@@ -197,8 +202,8 @@ def _log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     creep = np.clip(-c.left / before, 0.0, max(c.v_right, c.sd_v))
     gain = np.hypot(c.v_right - creep, c.sd_v)
     sd = np.sqrt(c.sd_right**2 + (c.sd_v * after / 3) ** 2 + (LAUNCH * gain * after) ** 2)
-    log_after = norm.logpdf(c.right, (creep + (c.v_right - creep) / 3) * after, sd) + np.log(gain)
-    return log_after + norm.logpdf(c.v_left, 0.75 * creep, np.hypot(c.sd_v, 0.25 * creep))
+    log_after = _log_normal(c.right, (creep + (c.v_right - creep) / 3) * after, sd) + np.log(gain)
+    return log_after + _log_normal(c.v_left, 0.75 * creep, np.hypot(c.sd_v, 0.25 * creep))
 
 
 def _hermite(u: np.ndarray) -> tuple[np.ndarray, ...]:

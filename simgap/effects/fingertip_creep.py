@@ -8,7 +8,6 @@ yielding follows the force late, through a low-pass of T (1 + ratio).
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from simgap.effects.base import CONTACT, CREEPING, Effect, Parameter, Performance, World, with_mode
 
@@ -22,6 +21,8 @@ def _correct(world: World, values, on) -> World:
 
 def _apply(performance: Performance, values, rng) -> Performance:
     """Tips of an unchanged grip force go where such a pad lets them."""
+    from scipy.signal import lfilter  # slow to import
+
     pad, ratio = performance.rig.fingertip, values["ratio"]
     late = values["time_constant"] * (1 + ratio)
     keep = np.exp(-float(np.median(np.diff(performance.t))) / late)

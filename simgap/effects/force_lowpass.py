@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from simgap.effects.base import FILTER, SMOOTH, Effect, Parameter, Performance, flat, with_force, with_mode
 
 
 def _apply(performance: Performance, values, rng) -> Performance:
+    from scipy.signal import lfilter  # slow to import
+
     step = float(np.median(np.diff(performance.t)))
     keep = np.exp(-step / max(values["time_constant"], 1e-6))
     force = flat(performance)

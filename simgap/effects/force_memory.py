@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.signal import lfilter
 
 from simgap.effects.base import FILTER, Effect, Parameter, Performance, World, flat, with_force
 from simgap.effects.filters import lowpass
@@ -32,6 +31,8 @@ def _correct(world: World, values, on) -> World:
 
 
 def _apply(performance: Performance, values, rng) -> Performance:
+    from scipy.signal import lfilter  # slow to import
+
     force, step = flat(performance), float(np.median(np.diff(performance.t)))
     late = np.zeros_like(force)
     for name, time in zip(NAMES, TIMES, strict=True):

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter
 
 from simgap.generic.features import (
     DURATION,
@@ -216,6 +215,8 @@ def _simulated(given: Scene, channel: int, subtask: int, shift: int, tau: float)
 
 def smoothed(x: np.ndarray, tau: float) -> np.ndarray:
     """A first-order low pass with its time constant in samples, settled at the start."""
+    from scipy.signal import lfilter  # slow to import
+
     keep = np.exp(-1 / tau)
     return np.asarray(lfilter([1 - keep], [1, -keep], x, zi=[keep * x[0]])[0])
 

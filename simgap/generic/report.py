@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from simgap.generic.effects import Scene
 from simgap.generic.features import Layout
@@ -47,7 +47,7 @@ def effect_entry(
     given: Scene, found: Fitted, ring: Ring | None, temperature: float, score: float, num_trials: int
 ) -> dict[str, Any]:
     """Parameters with 90 % intervals (Student's t of the trials' degrees of freedom) and evidence."""
-    reach = float(student.isf(0.05, max(num_trials - 2, 1)))
+    reach = -float(stdtrit(max(num_trials - 2, 1), 0.05))
     parameters: dict[str, Any] = {}
     rings: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for k, (mine, u, jacobian) in enumerate(zip(found.slots, found.u, found.jacobian, strict=True)):

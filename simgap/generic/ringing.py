@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)
 HEAVIEST = 0.25  # damping beyond which a course is no ring
@@ -91,7 +91,7 @@ def fit_ring(windows: np.ndarray, rate: float, at_least: float = 0.0) -> Ring | 
     each = np.array([_refined(np.delete(windows, i, 0), rate, best, edges) for i in range(n)])
     logs = np.log(each)  # both are positive
     sd = np.sqrt((n - 1) / n * ((logs - logs.mean(0)) ** 2).sum(0))
-    reach = float(student.isf(0.05, n - 1)) * sd
+    reach = -float(stdtrit(n - 1, 0.05)) * sd
     low, high = best * np.exp(-reach), best * np.exp(reach)
     return Ring(
         *best,

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 REACHES = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # samples on a side
 TOLERANCE = 1.2  # standard deviation allowed over the sensors': a held finger still trembles
@@ -107,7 +107,7 @@ def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray]
     solution = np.linalg.solve(normal, right[..., None])[..., 0]
     misfit = np.maximum(square - (solution * right).sum(-1), 0.0)
     freedom = count - 3
-    fits = proper & ((freedom <= 0) | (misfit <= chi2.ppf(1 - LEVEL, np.maximum(freedom, 1))))
+    fits = proper & ((freedom <= 0) | (misfit <= 2 * gammaincinv(np.maximum(freedom, 1) / 2, 1 - LEVEL)))
     if before + after <= 2:
         fits = proper
     variance = np.where(proper, np.linalg.inv(normal)[..., 0, 0], np.inf)
