@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help setup demo test lint typecheck tests slow results paper sweeps check-gap
+.PHONY: help setup demo test lint typecheck tests slow wheel results paper sweeps check-gap
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -33,6 +33,9 @@ tests: $(INSTALLED)  ## tests alone, without those marked slow
 
 slow: $(INSTALLED)  ## the tests marked slow
 	$(BIN)/pytest -n auto --dist loadfile -m slow tests
+
+wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
+	$(BIN)/python .ci/check_wheel.py
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from jinja2 import Environment, PackageLoader
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
@@ -34,6 +33,8 @@ QUESTION = "Which hand: cartesian (fingertip positions), jointed (joint angles),
 def new(folder: FolderArgument, hand: HandOption = None, json: JsonOption = None, seed: SeedOption = 0,
         quiet: QuietOption = False) -> None:  # fmt: skip
     """A rig.toml and task.toml with comments, to fill in; asks what it must on a terminal."""
+    from jinja2 import Environment, PackageLoader
+
     with Output("new", json=json, seed=seed, quiet=quiet) as out:
         check_folder("FOLDER", folder)
         targets = [folder / "rig.toml", folder / "task.toml"]

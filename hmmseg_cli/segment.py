@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask, read_task
-from hmmseg.io.trial import Trial
-from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.tables import spans_table
 from hmmseg_cli.console import (
     FiguresOption,
@@ -25,6 +23,10 @@ from hmmseg_cli.console import (
     read_trials,
 )
 from hmmseg_cli.labels import WriteOption, check_destination, write_labels
+
+if TYPE_CHECKING:
+    from hmmseg.io.trial import Trial
+    from hmmseg.segmentation.spans import Segmentation
 
 
 class Method(StrEnum):

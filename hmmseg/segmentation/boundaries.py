@@ -109,11 +109,6 @@ def _single_density(c: Crossing, h: float) -> np.ndarray:
     return density / density.sum()
 
 
-def _log_normal(value, mean, sd) -> np.ndarray:
-    """Log density of a normal distribution."""
-    return -0.5 * ((value - mean) / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi)
-
-
 def _log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     """Rice's formula on the cubic that joins both ends."""
     h00, h10, h01, h11 = _hermite(u)

@@ -51,7 +51,7 @@ def test_process_at_fault_says_one_line_and_exits_with_2(tmp_path):
 
 
 def test_light_commands_do_not_import_heavy_modules():
-    heavy = ("jax", "pandas", "matplotlib", "scipy", "arviz")
+    heavy = ("jax", "numpy", "numba", "pandas", "matplotlib", "scipy", "arviz", "jinja2")
     code = f"import sys, hmmseg_cli.main; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -11,9 +11,12 @@ import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import Table, shown
+
+if TYPE_CHECKING:
+    from hmmseg.io.table import Table
 
 KINDS = {
     ".csv": "delimited", ".tsv": "delimited", ".txt": "delimited", ".dat": "delimited",
@@ -96,5 +99,7 @@ def _module(kind: str, path: str | Path) -> ModuleType:
 
 
 def _told(error: Exception) -> str:
+    from hmmseg.io.table import shown  # loads NumPy, which `hmmseg --help` does without
+
     text = shown(error)
     return text if text else type(error).__name__

@@ -1,0 +1,95 @@
+"""Build sdist and wheel, install the wheel in an empty environment, and use it outside this repository.
+
+    python .ci/check_wheel.py [--folder DIR] [--no-demo]
+
+In an environment that holds nothing but the wheel and what it declares, the three imports of the README, the
+version beside another project's commands.py, shell completion and the demo must work; JAX must stay as it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+import venv
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {"hmmseg", "estimation", "simgap", "hmmseg_cli"}
+IMPORTS = """
+import jax
+before = dict(jax.config.values)
+from hmmseg import Task, Rig, Trial, align, segment
+from estimation import identify, Identification
+from simgap import VirtualModel, simulate, diagnose, Diagnosis, effects
+assert dict(jax.config.values) == before, "importing changed JAX"
+assert jax.numpy.ones(1).dtype == "float32"
+"""
+
+
+def run(*command: str | Path, cwd: Path, **settings: str) -> str:
+    """Standard output of a command that must succeed, without this repository on the path."""
+    hidden = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "JAX_"))}
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, env=hidden | settings, capture_output=True, text=True
+    )
+    if done.returncode:
+        sys.exit(f"{' '.join(map(str, command))}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def build(folder: Path) -> Path:
+    """The wheel, built from the sdist, whose top level holds our packages and nothing else."""
+    run(sys.executable, "-m", "build", "--outdir", folder, ROOT, cwd=folder)
+    (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    with zipfile.ZipFile(wheel) as file:
+        names = file.namelist()
+        top = {name.split("/")[0] for name in names}
+    extra = {name for name in top - PACKAGES if not name.endswith(".dist-info")}
+    assert PACKAGES <= top and not extra, f"the wheel's top level holds {sorted(top)}"
+    assert all(f"{package}/py.typed" in names for package in PACKAGES), "a package is not marked as typed"
+    with tarfile.open(sdist) as file:
+        assert not any("/tests/" in name or "/recordings/" in name for name in file.getnames())
+    return wheel
+
+
+def check(wheel: Path, folder: Path, demo: bool) -> None:
+    """Everything a stranger does first, in an environment of its own."""
+    home = folder / "environment"
+    venv.create(home, with_pip=True)
+    binaries = home / ("Scripts" if os.name == "nt" else "bin")
+    python, hmmseg = binaries / "python", binaries / "hmmseg"
+    run(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel, cwd=folder)
+    away = folder / "away"
+    away.mkdir()
+    (away / "commands.py").write_text("raise ImportError('a commands.py of another project')\n")
+    print("hmmseg", run(hmmseg, "--version", cwd=away, PYTHONPATH=str(away)).strip())
+    run(python, "-c", IMPORTS, cwd=away)
+    said = run(hmmseg, cwd=away, _HMMSEG_COMPLETE="complete_bash", COMP_WORDS="hmmseg ide", COMP_CWORD="1")
+    assert said.split() == ["identify"], said
+    if demo:
+        run(hmmseg, "demo", "--quiet", "--json", "demo.json", cwd=away)
+        found = json.loads((away / "demo.json").read_text())
+        weights = [entry["weight"]["mean"] for entry in found["properties"].values()]
+        print("demo: weights", ", ".join(f"{w:.3f} N" for w in weights), "verdict", found["diagnosis"]["verdict"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, help="work here and leave everything (default: a temporary one)")
+    parser.add_argument("--no-demo", action="store_true")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (args.folder or Path(temporary)).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        check(build(folder), folder, not args.no_demo)
+    print("the wheel works outside the repository")
+
+
+if __name__ == "__main__":
+    main()
