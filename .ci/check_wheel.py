@@ -2,8 +2,9 @@
 
     python .ci/check_wheel.py [--folder DIR] [--no-demo]
 
-In an environment that holds nothing but the wheel and what it declares, the three imports of the README, the
-version beside another project's commands.py, shell completion and the demo must work; JAX must stay as it was.
+In an environment that holds nothing but the wheel and what it declares, the three imports of the README,
+the version beside another project's commands.py, shell completion and the demo must work; JAX must stay as
+it was.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def build(folder: Path) -> Path:
         names = file.namelist()
         top = {name.split("/")[0] for name in names}
     extra = {name for name in top - PACKAGES if not name.endswith(".dist-info")}
-    assert PACKAGES <= top and not extra, f"the wheel's top level holds {sorted(top)}"
+    assert top >= PACKAGES and not extra, f"the wheel's top level holds {sorted(top)}"
     assert all(f"{package}/py.typed" in names for package in PACKAGES), "a package is not marked as typed"
     with tarfile.open(sdist) as file:
         assert not any("/tests/" in name or "/recordings/" in name for name in file.getnames())
@@ -76,12 +77,14 @@ def check(wheel: Path, folder: Path, demo: bool) -> None:
         run(hmmseg, "demo", "--quiet", "--json", "demo.json", cwd=away)
         found = json.loads((away / "demo.json").read_text())
         weights = [entry["weight"]["mean"] for entry in found["properties"].values()]
-        print("demo: weights", ", ".join(f"{w:.3f} N" for w in weights), "verdict", found["diagnosis"]["verdict"])
+        shown = ", ".join(f"{weight:.3f} N" for weight in weights)
+        print(f"demo: weights {shown}; verdict {found['diagnosis']['verdict']}")
 
 
 def main() -> None:
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, help="work here and leave everything (default: a temporary one)")
+    parser.add_argument("--folder", type=Path, help="work here and leave it (else a temporary one)")
     parser.add_argument("--no-demo", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
