@@ -21,6 +21,17 @@ def identify(
     `trials`, `task`, `rig`: paths, tables or what the readers give; or what `hmmseg.align` gave, alone.
     `progress(steps_done, steps_at_most)` is called while sampling. InputError for input at fault; trials
     that do not fit the task are reported in the result, not raised.
+
+    >>> from estimation import identify
+    >>> from hmmseg import example_folder
+    >>> folder = example_folder()
+    >>> found = identify(folder / "trial_01.csv", folder / "task.toml", folder / "rig.toml")
+    >>> weight = found.of("block1", "weight")  # posterior draws, N
+    >>> f"{weight.mean():.2f} N"
+    '0.34 N'
+    >>> found.of("blok1", "weight")
+    Traceback (most recent call last):
+    KeyError: "no 'blok1'; expected one of block1, block2 (did you mean block1?)"
     """
     if isinstance(trials, AlignedTrials):
         return identify_aligned(trials, seed, progress)

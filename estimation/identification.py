@@ -23,7 +23,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg.segmentation.tables import as_html, as_text
+from hmmseg.tables import as_html, as_text
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 NOT_LEVEL = 2e-3  # m; more than a tilted table or a slip in the grip make of a move on a level
@@ -132,6 +132,12 @@ class Identification:
         from estimation.plot.predictive import draw_check
 
         return draw_check(self, trial, None if path is None else Path(path))
+
+    def to_pandas(self):
+        """Posterior draws as a DataFrame, a column `block.property` each [N, m]."""
+        import pandas as pd
+
+        return pd.DataFrame(self.draws, columns=[".".join(name) for name in self.names])
 
     def to_arviz(self):
         """ArviZ InferenceData of the properties' posterior, dimensions (chain, draw)."""

@@ -10,9 +10,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hmmseg.api import align, fit, segment
-    from hmmseg.contact.decompose import decompose
+    from hmmseg.api import align, decompose, fit, segment
     from hmmseg.errors import InputError
+    from hmmseg.example import example_folder
     from hmmseg.io.rig import Rig
     from hmmseg.io.task import Task
     from hmmseg.io.trial import Trial
@@ -28,6 +28,7 @@ __all__ = [
     "__version__",
     "align",
     "decompose",
+    "example_folder",
     "fit",
     "segment",
 ]
@@ -40,7 +41,8 @@ _HOMES = {
     "Task": "hmmseg.io.task",
     "Trial": "hmmseg.io.trial",
     "align": "hmmseg.api",
-    "decompose": "hmmseg.contact.decompose",
+    "decompose": "hmmseg.api",
+    "example_folder": "hmmseg.example",
     "fit": "hmmseg.api",
     "segment": "hmmseg.api",
 }

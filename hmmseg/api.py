@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hmmseg.contact.decompose import decompose as decompose_task
+from hmmseg.contact.decomposition import Decomposition
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask, Task
@@ -33,11 +35,33 @@ def block_task(task: Source) -> BlockTask:
     return found
 
 
+def decompose(task: Source) -> Decomposition:
+    """Subtasks of a task, and for each object's properties what reveals them.
+
+    `task`: a path, a dict or what `Task.read` gives. InputError for a description at fault.
+
+    >>> from hmmseg import decompose, example_folder
+    >>> found = decompose(example_folder() / "task.toml")
+    >>> [subtask.name for subtask in found.subtasks][:5]
+    ['pregrasp', 'pickup', 'carry', 'place', 'release']
+    >>> found.properties["block1"]["height"].evidence[0].subtasks  # block2's pickup and place
+    (5, 7)
+    """
+    return decompose_task(Task.read(task))
+
+
 def align(trials: Source | Sequence[Source], task: Source, rig: Source) -> AlignedTrials:
     """Fit the switching model to trials of one task of blocks, pooled, and align each of them.
 
     Every argument may be a path, a table or what `Trial.read`, `Task.read` and `Rig.read` give. Trials
     that do not fit their task say so in `segmentations[i].failed`; InputError for input at fault.
+
+    >>> from hmmseg import align, example_folder
+    >>> folder = example_folder()
+    >>> aligned = align(folder / "trial_01.csv", folder / "task.toml", folder / "rig.toml")
+    >>> first = aligned.segmentations[0]
+    >>> first.complete, len(first.spans)
+    (True, 9)
     """
     hand = Rig.read(rig)
     return align_blocks(read_trials(trials, hand), block_task(task), hand)
@@ -54,6 +78,15 @@ def segment(
 
     A task of blocks needs its `rig`; a plain ordered task takes a `model` from `fit`, or learns one from
     these trials. InputError for input at fault.
+
+    >>> import pandas as pd
+    >>> from hmmseg import example_folder, segment
+    >>> folder = example_folder()
+    >>> trial = pd.read_csv(folder / "trial_01.csv")  # a table will do as well as a path
+    >>> found = segment(trial, folder / "task.toml", folder / "rig.toml")[0]
+    >>> carry = found.spans[2]
+    >>> carry.subtask, carry.object, round(carry.start, 1), round(carry.end, 1)
+    ('carry', 'block1', 2.3, 3.8)
     """
     order = Task.read(task)
     if isinstance(order, SequenceTask):
@@ -72,6 +105,16 @@ def fit(
     """Emissions and durations of a plain ordered task, from labels of some trials or none.
 
     `labels`: boundaries [s] by the trial's name. InputError for input at fault.
+
+    >>> import numpy as np
+    >>> from hmmseg import fit, segment
+    >>> t = np.arange(0.0, 6.0, 0.02)
+    >>> noise = np.random.default_rng(0).normal(0.0, 0.05, (4, t.size))
+    >>> trials = [{"t": t, "force": np.where(t < 2.0 + 0.3 * k, 0.0, 3.0) + noise[k]} for k in range(4)]
+    >>> model = fit(trials, {"sequence": ["approach", "press"]})
+    >>> found = segment(trials[0], {"sequence": ["approach", "press"]}, model=model)[0]
+    >>> abs(found.spans[1].start - 2.0) < 0.1  # seconds
+    True
     """
     order = Task.read(task)
     if not isinstance(order, SequenceTask):

@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
+from hmmseg.example import example_folder
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import diagnose, identify
 from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption
-
-DATA = Path(__file__).parent / "demo_data"
 
 DemoFigures = Annotated[Path, typer.Option("--figures", metavar="DIR", help="Folder for the figures.")]
 
@@ -24,9 +23,12 @@ def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: See
     page, finding = figures / "report.html", figures / "diagnosis.html"
     figures.mkdir(parents=True, exist_ok=True)
     with Output("demo", json=json, figures=figures, report=page, seed=seed, quiet=quiet) as out:
-        trials, actual = sorted(DATA.glob("trial_*.csv")), DATA / "actual.toml"
-        body = identify.run(out, trials, DATA / "task.toml", DATA / "rig.toml", identify.Method.BAYES, actual)
-        task, rig = read_task(DATA / "task.toml"), read_rig(DATA / "rig.toml")
+        folder = example_folder()
+        trials, actual = sorted(folder.glob("trial_*.csv")), folder / "actual.toml"
+        task, rig = read_task(folder / "task.toml"), read_rig(folder / "rig.toml")
+        body = identify.run(
+            out, trials, folder / "task.toml", folder / "rig.toml", identify.Method.BAYES, actual
+        )
         assert isinstance(task, BlockTask)
         rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
         out.print("\nThe same recordings, the fingertips thought rigid as the paper has them:")

@@ -29,6 +29,12 @@ def simulate(
 
     `properties`: an identification, blocks by name, or a file (identify's JSON, an `actual.toml`); the
     paper's blocks by default. InputError for input at fault or where the hand cannot reach.
+
+    >>> from hmmseg import example_folder
+    >>> from simgap import simulate
+    >>> made = simulate(example_folder() / "task.toml", example_folder() / "rig.toml", seed=1)[0]
+    >>> made.boundaries.size, made.blocks["block1"].weight
+    (8, 0.343)
     """
     order, hand = block_task(task), Rig.read(rig)
     blocks = _blocks(properties, order)

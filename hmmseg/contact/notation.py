@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from hmmseg.contact.decompose import Decomposition, Evidence, Property
+from hmmseg.contact.decomposition import Decomposition, Evidence, Property
 from hmmseg.contact.states import FREE
 
 

@@ -22,6 +22,8 @@ from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.misfit import Plan, at, explain, plan, spread
 from hmmseg.segmentation.rounds import cut, merge_point, one_round, part, round_tasks, slices
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.tables import trials_table
+from hmmseg.tables import as_html, as_text
 
 INTERVAL = (0.05, 0.95)
 
@@ -43,7 +45,7 @@ class TrialAlignment:
     present: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AlignedTrials:
     """All trials of one task; those that fit it are aligned together by one fit.
 
@@ -61,6 +63,12 @@ class AlignedTrials:
     def segmentations(self) -> list[Segmentation]:
         """One segmentation a trial."""
         return [trial.segmentation for trial in self.trials]
+
+    def __repr__(self) -> str:
+        return as_text(trials_table(self.segmentations))
+
+    def _repr_html_(self) -> str:
+        return as_html(trials_table(self.segmentations))
 
 
 @dataclass(frozen=True)

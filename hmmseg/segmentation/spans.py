@@ -93,13 +93,21 @@ class Segmentation:
             document["failures"] = [failure.to_json() for failure in self.failures]
         return document
 
+    def to_pandas(self) -> Any:
+        """One row a subtask: name, object, state, start and end [s] with their uncertainty."""
+        import pandas as pd
+
+        return pd.DataFrame([asdict(span) for span in self.spans])
+
     def __repr__(self) -> str:
-        from hmmseg.segmentation.tables import as_text, spans_table
+        from hmmseg.segmentation.tables import spans_table
+        from hmmseg.tables import as_text
 
         return as_text(spans_table(self)) + (f"{self.failed}\n" if self.failed else "")
 
     def _repr_html_(self) -> str:
-        from hmmseg.segmentation.tables import as_html, spans_table
+        from hmmseg.segmentation.tables import spans_table
+        from hmmseg.tables import as_html
 
         return as_html(spans_table(self))
 

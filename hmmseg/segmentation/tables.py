@@ -1,39 +1,15 @@
-"""Results as tables, on a terminal, in a notebook and as `repr`."""
+"""Segmentations as tables for people to read."""
 
 from __future__ import annotations
 
-import html
-import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
     from hmmseg.segmentation.spans import Segmentation
-
-WIDTH = 120  # characters of a `repr`
-
-
-def as_text(table: Table) -> str:
-    """The table as the terminal shows it, without colours."""
-    out = io.StringIO()
-    Console(file=out, width=WIDTH, color_system=None).print(table, highlight=False, markup=False)
-    return out.getvalue()
-
-
-def as_html(table: Table) -> str:
-    """The table as HTML, for a notebook."""
-
-    def row(cells: list[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    heads = row([str(column.header) for column in table.columns], "th")
-    columns = [[str(cell) for cell in column.cells] for column in table.columns]
-    rows = "".join(row(list(cells), "td") for cells in zip(*columns, strict=True))
-    caption = f"<caption>{html.escape(str(table.title))}</caption>" if table.title else ""
-    return f"<table>{caption}<thead>{heads}</thead><tbody>{rows}</tbody></table>"
 
 
 def spans_table(segmentation: Segmentation) -> Table:
@@ -47,4 +23,15 @@ def spans_table(segmentation: Segmentation) -> Table:
         interval = f"{low:.3f} to {high:.3f}" if high > low else ""
         name = f"{span.subtask} {span.object or ''}".strip()
         table.add_row(name, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}")
+    return table
+
+
+def trials_table(segmentations: Sequence[Segmentation]) -> Table:
+    """One row a trial: whether it fits its task, or where it does not."""
+    table = Table(title=f"{len(segmentations)} trials", title_justify="left")
+    for head in ("trial", "rate", "subtasks", "fits its task"):
+        table.add_column(head)
+    for s in segmentations:
+        verdict = "yes" if s.failed is None else str(s.failed)
+        table.add_row(Path(s.file).name, f"{s.rate:.4g} Hz", str(len(s.spans)), verdict)
     return table

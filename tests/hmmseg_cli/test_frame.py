@@ -90,7 +90,7 @@ def test_any_other_exception_is_a_bug(monkeypatch, task):
     def broken(found):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("hmmseg_cli.decompose._table", broken)
+    monkeypatch.setattr("hmmseg.contact.tables.decomposition_table", broken)
     with pytest.raises(ZeroDivisionError):
         frame.main(["decompose", str(task)])
 
@@ -98,8 +98,9 @@ def test_any_other_exception_is_a_bug(monkeypatch, task):
 def test_a_process_with_a_bug_shows_its_traceback(task):
     code = """if True:
         import sys
-        from hmmseg_cli import decompose, main
-        decompose.decompose_task = lambda task: 1 / 0
+        import hmmseg.contact.decompose
+        from hmmseg_cli import main
+        hmmseg.contact.decompose.decompose = lambda task: 1 / 0
         sys.exit(main.main(["decompose", sys.argv[1]]))
     """
     done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from scipy.integrate import trapezoid
 from scipy.optimize import lsq_linear
 from scipy.special import logsumexp
 
-import hmmseg_cli
+from hmmseg.example import example_folder
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import Trial, read_trial
@@ -172,7 +171,7 @@ def _ringing(trial: Trial, events: np.ndarray) -> Trial:
 
 def test_a_vibration_is_sought_with_its_amplitudes():
     # Without amplitudes a frequency has no slope: searches ended 2 Hz away.
-    folder = Path(hmmseg_cli.__file__).parent / "demo_data"
+    folder = example_folder()
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     quiet = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2, 3, 4)]
     events = np.asarray(diagnose(quiet, task, rig).problem.frame.world.events)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import hmmseg_cli
+from hmmseg.example import example_folder
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
@@ -24,7 +23,7 @@ from simgap.gap.frame import CHANNELS, build
 from simgap.gap.residuals import HELD, LOOSE, _firm
 from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
 
-DEMO = Path(hmmseg_cli.__file__).parent / "demo_data"
+DEMO = example_folder()
 MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)
 
 

@@ -1,0 +1,40 @@
+"""The documentation site: `make docs` builds it into build/docs, warnings as errors."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import hmmseg  # noqa: E402
+
+project = "hmmseg"
+author = "The hmmseg developers"
+release = version = hmmseg.__version__
+copyright = author
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 4
+default_role = "code"
+exclude_patterns = ["README.md"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_preserve_defaults = True
+
+html_theme = "furo"
+html_title = f"hmmseg {version}"
+html_static_path: list[str] = []
+html_show_copyright = False
+html_theme_options = {"navigation_with_keys": True}
