@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help setup demo test lint typecheck tests slow wheel results paper sweeps check-gap
+.PHONY: help setup demo test lint typecheck tests slow wheel docs results paper sweeps check-gap
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -36,6 +36,9 @@ slow: $(INSTALLED)  ## the tests marked slow
 
 wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
 	$(BIN)/python .ci/check_wheel.py
+
+docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
