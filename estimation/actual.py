@@ -1,4 +1,4 @@
-"""Reader of `actual.toml`: properties measured apart from the trials."""
+"""Properties measured apart from the trials (`actual.toml`): read, and compared with what was identified."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hmmseg.io.schema import read_toml
 
 UNITS = {"weight": "N", "width": "m", "height": "m", "friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
+DISAGREES = 4.0  # sds of both together; by chance in one of 16,000 comparisons
 
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
@@ -37,6 +38,61 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
                 raise InputError(f"{where}: key {name}.{key}", "unknown property", nearest(key, UNITS))
             actual[name][key] = _parse_entry(entry, UNITS[key], f"{where}: key {name}.{key}")
     return actual
+
+
+def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
+    """Identified `properties` (as in identify's JSON) beside measured values, by object and property.
+
+    Each with `relative_deviation`, `z` (in sds of both together), `inside_95` and `disagrees`: beyond
+    DISAGREES sds and beyond `smallest`, the relative deviation that matters. Of a friction that has a
+    lower bound alone it can only be said that the measured one lies below. Null where not identified.
+    """
+    out: dict[str, Any] = {}
+    for obj, entries in measured.items():
+        for prop, (value, sd) in entries.items():
+            row: dict[str, Any] = {"value": value, "sd": sd}
+            found = properties.get(obj, {}).get(prop)
+            if found is not None and found.get("mean") is not None:
+                low, high = found["interval_95"]
+                share = found["mean"] / value - 1
+                row["relative_deviation"] = share
+                row["z"] = (found["mean"] - value) / math.hypot(found["sd"], sd)
+                row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
+                row["disagrees"] = bool(abs(row["z"]) > DISAGREES and abs(share) > smallest)
+            elif found is not None and found.get("lower_bound") is not None:
+                short = 1 - value / found["lower_bound"]
+                row["disagrees"] = bool(short > smallest and value + DISAGREES * sd < found["lower_bound"])
+            out.setdefault(obj, {})[prop] = row
+    return out
+
+
+def disagreements(properties: dict[str, Any], compared: dict[str, Any]) -> list[str]:
+    """A line for each measured value that the recordings contradict."""
+    lines = []
+    for obj, entries in compared.items():
+        for prop, row in entries.items():
+            if not row.get("disagrees"):
+                continue
+            found, unit = properties[obj][prop], UNITS[prop]
+            value = _shown(row["value"], row["sd"], unit)
+            if "z" not in row:
+                bound = f"{found['lower_bound']:.3g}"
+                lines.append(f"{obj}.{prop}: measured as {value}, but it was held at {bound}")
+                continue
+            share, said = 100 * row["relative_deviation"], _shown(found["mean"], found["sd"], unit)
+            side = "above" if share > 0 else "below"
+            lines.append(
+                f"{obj}.{prop}: the recordings say {said}, {abs(share):.2g} % {side} what was measured "
+                f"({value}), {abs(row['z']):.0f} standard deviations away: one of the two is wrong"
+            )
+    return lines
+
+
+def _shown(value: float, sd: float, unit: str) -> str:
+    """As `0.4656 +- 0.0014 N`, lengths in mm, with the digits that the deviation leaves."""
+    factor, name = (1e3, " mm") if unit == "m" else (1.0, "" if unit == "1" else f" {unit}")
+    digits = 4 if sd <= 0 else min(max(1 - math.floor(math.log10(sd * factor)), 0), 6)
+    return f"{value * factor:.{digits}f} +- {sd * factor:.{digits}f}{name}"
 
 
 def _parse_entry(entry: Any, unit: str, where: str) -> tuple[float, float]:

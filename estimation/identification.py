@@ -107,6 +107,7 @@ class Identification:
         return {
             "method": found.method, "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess,
             "rhat": found.rhat, "acceptance": found.acceptance, "converged": found.converged,
+            "apart_from_laplace": found.apart,
         }  # fmt: skip
 
     def __repr__(self) -> str:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.posterior import Posterior
+from estimation.posterior import NUM_CHANNELS, Posterior
 
 STEP = 1e-3  # of the scales, all logarithms, for derivatives by central differences
+STARTS = np.arange(-1.0, 9.0, 1.0)  # of log(share / its prior median): a large share is a mode of its own
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Mode:
 
 
 def find_mode(post: Posterior) -> Mode:
-    """Mode by BFGS from the priors' medians, with derivatives by central differences."""
+    """Mode by BFGS from the best of a few shares a channel, with derivatives by central differences."""
     from scipy.optimize import minimize  # slow to import
 
     size = 6
@@ -39,7 +40,7 @@ def find_mode(post: Posterior) -> Mode:
         both = post.log_prob(np.concatenate([x + steps, x - steps]))
         return -(both[:size] - both[size:]) / (2 * STEP)
 
-    found = minimize(loss, np.zeros(size), jac=gradient, method="BFGS", options={"gtol": 1e-4})
+    found = minimize(loss, _start(post), jac=gradient, method="BFGS", options={"gtol": 1e-4})
     hessian = np.array([(gradient(found.x + h) - gradient(found.x - h)) / (2 * STEP) for h in steps])
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     covariance = (vectors / np.maximum(values, 0.1)) @ vectors.T
@@ -48,3 +49,13 @@ def find_mode(post: Posterior) -> Mode:
     spread = np.linalg.inv(chol[0])[:, :num]
     slope = float(np.abs(gradient(found.x)).max())
     return Mode(found.x, covariance, post.reference + mean[0, :num], spread.T @ spread, slope < 1e-2)
+
+
+def _start(post: Posterior) -> np.ndarray:
+    """Scales (6,) from which to climb: each channel's share the best of STARTS, one after the other."""
+    best = np.zeros(2 * NUM_CHANNELS)
+    for c in range(NUM_CHANNELS):
+        tried = np.repeat(best[None], STARTS.size, axis=0)
+        tried[:, NUM_CHANNELS + c] = STARTS
+        best = tried[int(np.argmax(post.log_prob(tried)))]
+    return best

@@ -79,7 +79,8 @@ class Posterior:
     def log_prior(self, theta: np.ndarray) -> np.ndarray:
         """Log prior (W,) of scales (W, 6), up to a constant."""
         out = -0.5 * ((theta[:, :NUM_CHANNELS] / self.scale_sd) ** 2).sum(axis=1)
-        return out - 0.5 * ((theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD) ** 2).sum(axis=1)
+        z2, tail = (theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD) ** 2, priors.SCATTER_TAIL
+        return out - (tail + 1) / 2 * np.log1p(z2 / tail).sum(axis=1)
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
         """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant."""

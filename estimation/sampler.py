@@ -1,8 +1,9 @@
 """emcee on the scales, the unknowns drawn given them: moves, convergence and draws.
 
 All else is integrated out (`estimation.posterior`), so emcee moves in six dimensions whatever the
-task. Most proposals are independent draws about the Laplace approximation (`estimation.proposal`),
-the rest differential evolution (ter Braak 2006), which frees walkers that it would hold in a tail.
+task. Most proposals are independent draws (`estimation.proposal`), the rest differential evolution
+(ter Braak 2006), which frees walkers that it would hold in a tail. The chain is checked against the
+same proposal's importance-weighted draws, which owe nothing to the chain.
 experiments/benchmarks/moves.py compares them with emcee's stretch move.
 """
 
@@ -17,7 +18,7 @@ import numpy as np
 from estimation import priors
 from estimation.mode import Mode, find_mode
 from estimation.posterior import Posterior
-from estimation.proposal import proposal
+from estimation.proposal import Proposal, proposal
 
 if TYPE_CHECKING:
     import emcee
@@ -27,11 +28,13 @@ WALKERS = 64
 BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000
 MIN_LENGTH = 50  # steps in units of the autocorrelation time, emcee's own rule
 MIN_ESS, MAX_RHAT = 1000.0, 1.01
+ENOUGH = 1.5 * MIN_ESS  # to stop at: an estimate of it is itself uncertain
 GROUPS = 4  # chains that walkers are joined into for R-hat
 KEPT = 4096  # draws of the unknowns at least, where the chain has so many
 BATCH = 256  # drawn at once
-IMPORTANCE = 20_000  # draws about the Laplace approximation where the chain does not converge
-MIN_EFFICIENCY = 0.05  # of them, for these to stand in
+IMPORTANCE = 4000  # independent draws that the chain is checked against
+MIN_EFFICIENCY = 0.05  # of them, for a check, and to stand in where the chain does not converge
+MAX_APART = 0.25  # of a posterior sd, between the chain's means of the scales and those draws'
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,10 @@ class Draws:
     `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest
     split R-hat over scales, walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 3):
     of model error that all grips have alike; `deviations` (walkers, steps, N) of the hand.
-    `method`: "emcee", or "laplace" for importance-weighted draws about the Laplace approximation,
-    which stand in where the chain did not converge. `prior_ess`: share of draws left effective by
-    the unknowns' priors.
+    `apart`: largest distance of the chain's mean scales from those of importance-weighted draws, in
+    posterior sds; None where these are too few. `method`: "emcee", or "laplace" for those draws, which
+    stand in where the chain did not converge. `prior_ess`: share of draws left effective by the
+    unknowns' priors.
     """
 
     scales: np.ndarray
@@ -56,6 +60,7 @@ class Draws:
     steps: int
     method: str
     prior_ess: float
+    apart: float | None
 
     @property
     def flat(self) -> np.ndarray:
@@ -65,14 +70,13 @@ class Draws:
     @property
     def converged(self) -> bool:
         """Whether ESS and R-hat reach what this module asks for, priors taken in."""
-        return self.ess >= MIN_ESS and self.rhat <= MAX_RHAT and self.prior_ess >= MIN_EFFICIENCY
+        agreed = self.apart is None or self.apart <= MAX_APART
+        return agreed and self.ess >= MIN_ESS and self.rhat <= MAX_RHAT and self.prior_ess >= MIN_EFFICIENCY
 
 
-def independence_move(mode: Mode) -> emcee.moves.MHMove:
-    """Move of every walker to an independent draw of the proposal about the mode."""
+def independence_move(independent: Proposal) -> emcee.moves.MHMove:
+    """Move of every walker to an independent draw of the proposal."""
     import emcee  # slow to import: it loads scipy.stats
-
-    independent = proposal(mode)
 
     def propose(x: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         new = independent.draw(len(x), random)
@@ -89,8 +93,9 @@ def sample(
 
     mode = find_mode(post) if mode is None else mode
     random = np.random.RandomState(seed)
-    start = proposal(mode).draw(WALKERS, random)
-    moves = [(independence_move(mode), INDEPENDENT), (emcee.moves.DEMove(), 1 - INDEPENDENT)]
+    independent = proposal(post, mode)
+    start = independent.draw(WALKERS, random)
+    moves = [(independence_move(independent), INDEPENDENT), (emcee.moves.DEMove(), 1 - INDEPENDENT)]
     sampler = emcee.EnsembleSampler(WALKERS, start.shape[1], post.log_prob, moves=moves, vectorize=True)
     state = sampler.run_mcmc(emcee.State(start, random_state=random.get_state()), BURN_IN)
     sampler.reset()
@@ -104,15 +109,19 @@ def sample(
         if progress is not None:
             progress(steps, MAX_STEPS)
         long = ess >= MIN_LENGTH * WALKERS
-        if steps >= 2 * CHUNK and long and ess >= 1.5 * MIN_ESS and rhat <= MAX_RHAT:
+        if steps >= 2 * CHUNK and long and ess >= ENOUGH and rhat <= MAX_RHAT:
             break
     acceptance, method = float(sampler.acceptance_fraction.mean()), "emcee"
-    if ess < MIN_ESS or rhat > MAX_RHAT:
-        drawn, weight = importance(post, mode, random)
-        efficiency = 1 / (weight**2).sum() / len(weight)
-        if efficiency >= MIN_EFFICIENCY:
-            chain = drawn[_resampled(weight, random)[: WALKERS * 64]].reshape(WALKERS, 64, -1)
-            ess, rhat, method = efficiency * IMPORTANCE, 1.0, "laplace"
+    drawn, weight = importance(post, independent, random)
+    efficiency, apart = 1 / (weight**2).sum() / len(weight), None
+    if efficiency >= MIN_EFFICIENCY:
+        apart = _apart(chain, drawn, weight)
+        if ess < MIN_ESS or rhat > MAX_RHAT or apart > MAX_APART:
+            drawn, weight = importance(post, independent, random, int(ENOUGH / efficiency))
+            index = random.permutation(_resampled(weight, random))
+            num = len(index) // WALKERS
+            chain = drawn[index[: WALKERS * num]].reshape(WALKERS, num, -1)
+            ess, rhat, method, apart = float(1 / (weight**2).sum()), 1.0, "laplace", None
     thin = max(chain.shape[0] * chain.shape[1] // KEPT, 1)
     scales = chain[:, thin - 1 :: thin]
     rest, prior_ess = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
@@ -120,17 +129,25 @@ def sample(
     rest = rest.reshape(*scales.shape[:2], -1)
     return Draws(
         scales, rest[..., :num], rest[..., num : num + deviations], rest[..., num + deviations :],
-        ess, rhat, acceptance, steps, method, prior_ess,
+        ess, rhat, acceptance, steps, method, prior_ess, apart,
     )  # fmt: skip
 
 
-def importance(post: Posterior, mode: Mode, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+def importance(
+    post: Posterior, independent: Proposal, random: np.random.RandomState, num: int = IMPORTANCE
+) -> tuple[np.ndarray, np.ndarray]:
     """Draws (num, 6) of the proposal and their normalised importance weights (num,)."""
-    found = proposal(mode)
-    x = found.draw(IMPORTANCE, random)
-    log_weight = post.log_prob(x) - found.log_density(x)
+    x = independent.draw(num, random)
+    log_weight = post.log_prob(x) - independent.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
     return x, weight / weight.sum()
+
+
+def _apart(chain: np.ndarray, drawn: np.ndarray, weight: np.ndarray) -> float:
+    """Largest distance of the means of a chain (walkers, steps, 6) from weighted draws', in their sds."""
+    mean = weight @ drawn
+    sd = np.sqrt(weight @ (drawn - mean) ** 2)
+    return float(np.max(np.abs(chain.mean(axis=(0, 1)) - mean) / sd))
 
 
 def draw_unknowns(

@@ -20,7 +20,9 @@ def properties_table(body: dict[str, Any], measured=None) -> Table:
             if measured:
                 value = measured.get(obj, {}).get(prop)
                 factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
-                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}")
+                against = body.get("actual", {}).get(obj, {}).get(prop, {})
+                mark = "  disagrees" if against.get("disagrees") else ""
+                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}{mark}")
             table.add_row(*cells)
     return table
 

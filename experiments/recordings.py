@@ -18,9 +18,9 @@ from hmmseg.io.trial import Trial, read_trial
 class Case:
     """One folder of recordings that share blocks and rig.
 
-    `truth` holds the boundary times [s] of each trial, None where unknown. `blocks` are the
-    properties by object: (value, sd) in N and m, sd 0 for the simulation's own. `effects` names
-    what was done to the recordings, None where nobody says.
+    `truth` holds the boundary times [s] of each trial (NaN of one that never came), None where
+    unknown. `blocks` are the properties by object: (value, sd) in N and m, sd 0 for the simulation's
+    own. `effects` names what was done to the recordings, None where nobody says.
     """
 
     name: str
@@ -76,7 +76,8 @@ def read_case(folder: Path) -> Case:
 def _read_boundaries(path: Path) -> tuple[float, ...] | None:
     if not path.exists():
         return None
-    return tuple(float(time) for time in json.loads(path.read_text(encoding="utf-8"))["boundaries"])
+    times = json.loads(path.read_text(encoding="utf-8"))["boundaries"]
+    return tuple(float("nan") if time is None else float(time) for time in times)
 
 
 def _label(folder: Path) -> dict | None:

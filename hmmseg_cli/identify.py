@@ -71,7 +71,11 @@ def run(
         found = _bayes(out, recordings, description, hand)
         body, segmentations = found.to_json(), found.segmentations
     if measured is not None:
-        body["actual"] = _compared(body["properties"], measured)
+        from estimation.actual import compare, disagreements
+
+        body["actual"] = compare(body["properties"], measured, hand.tolerance.property or 0.0)
+        for line in disagreements(body["properties"], body["actual"]):
+            out.warn(line)
     out.print(properties_table(body, measured))
     for key, reason in body["reasons"].items():
         out.print(f"{key}: {reason}")
@@ -117,18 +121,3 @@ def _bayes(out: Output, recordings, task: BlockTask, hand):
     for warning in found.warnings:
         out.warn(warning)
     return found
-
-
-def _compared(properties: dict[str, Any], measured) -> dict[str, Any]:
-    """Estimates beside `--actual`: relative deviation, and whether the 95 % interval covers it."""
-    out: dict[str, Any] = {}
-    for obj, entries in measured.items():
-        for prop, (value, sd) in entries.items():
-            found = properties[obj].get(prop)
-            row: dict[str, Any] = {"value": value, "sd": sd}
-            if found is not None and found.get("mean") is not None:
-                low, high = found["interval_95"]
-                row["relative_deviation"] = found["mean"] / value - 1
-                row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
-            out.setdefault(obj, {})[prop] = row
-    return out

@@ -128,6 +128,9 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[dict[str, str]]
                     for key in ("interval_68", "interval_95"):
                         row[key] = " to ".join(_number(prop, v) for v in entry[key])
                     if value is not None:
-                        row["deviation"] = f"{100 * (entry['mean'] / value[0] - 1):+.2f} %"
+                        wrong = body.get("actual", {}).get(obj, {}).get(prop, {}).get("disagrees")
+                        row["deviation"] = f"{100 * (entry['mean'] / value[0] - 1):+.2f} %" + (
+                            ", disagrees" if wrong else ""
+                        )
             rows.append(row)
     return rows

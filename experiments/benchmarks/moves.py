@@ -48,11 +48,11 @@ def posterior_of(case: Case, num_trials: int) -> tuple[Posterior, Mode]:
     return post, find_mode(post)
 
 
-def move_sets(mode: Mode) -> dict[str, list]:
+def move_sets(post: Posterior, mode: Mode) -> dict[str, list]:
     """Sets of moves by name."""
     differential = emcee.moves.DEMove()
     return {
-        "ours": [(independence_move(mode), INDEPENDENT), (differential, 1 - INDEPENDENT)],
+        "ours": [(independence_move(proposal(post, mode)), INDEPENDENT), (differential, 1 - INDEPENDENT)],
         "differential evolution": [(differential, 1.0)],
         "differential evolution with snooker": [(differential, 0.8), (emcee.moves.DESnookerMove(), 0.2)],
         "stretch (emcee's default)": [(emcee.moves.StretchMove(), 1.0)],
@@ -62,7 +62,7 @@ def move_sets(mode: Mode) -> dict[str, list]:
 def measure(post: Posterior, mode: Mode, moves: list) -> dict[str, float]:
     """Efficiency of a set of moves from the same start."""
     random = np.random.RandomState(0)
-    first = proposal(mode).draw(WALKERS, random)
+    first = proposal(post, mode).draw(WALKERS, random)
     sampler = emcee.EnsembleSampler(WALKERS, first.shape[1], post.log_prob, moves=moves, vectorize=True)
     state = sampler.run_mcmc(emcee.State(first, random_state=random.get_state()), BURN_IN)
     sampler.reset()
@@ -88,8 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for num_trials in (1, 4):
         found = [posterior_of(case, num_trials) for case in cases]
         rows = {}
-        for name in move_sets(found[0][1]):
-            each = [measure(post, mode, move_sets(mode)[name]) for post, mode in found]
+        for name in move_sets(*found[0]):
+            each = [measure(post, mode, move_sets(post, mode)[name]) for post, mode in found]
             rows[name] = {key: float(np.median([f[key] for f in each])) for key in each[0]}
             print(f"{num_trials} trials, {name}: tau {rows[name]['autocorrelation_time']:.1f} steps, "
                   f"{rows[name]['ess_per_second']:.0f} effective samples a second", flush=True)  # fmt: skip

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from estimation.actual import parse_actual, read_actual
+from estimation.actual import compare, disagreements, parse_actual, read_actual
 from hmmseg.errors import InputError
 
 GOOD = {"block1": {"weight": {"unit": "N", "value": 0.343, "sd": 0.0005}}}
@@ -53,3 +53,30 @@ def test_refused_tables(table, message):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"absent\.toml: no such file"):
         read_actual(tmp_path / "absent.toml", ["block1"])
+
+
+FOUND = {
+    "block1": {
+        "weight": {"mean": 0.4639, "sd": 0.0015, "interval_95": [0.461, 0.467]},
+        "width": {"mean": 0.036105, "sd": 1.6e-5, "interval_95": [0.03607, 0.03614]},
+        "height": None,
+        "friction": {"lower_bound": 0.5},
+    }
+}
+
+
+def test_a_wrong_measurement_is_remarked_on():
+    """10 % off and 32 sd away, as a mislabelled block is."""
+    measured = {"block1": {"weight": (0.5126, 0.0005), "width": (0.0361, 1e-4), "height": (0.026, 1e-4)}}
+    compared = compare(FOUND, measured)
+    assert compared["block1"]["weight"]["disagrees"] and not compared["block1"]["width"]["disagrees"]
+    assert compared["block1"]["height"] == {"value": 0.026, "sd": 1e-4}
+    (line,) = disagreements(FOUND, compared)
+    assert line.startswith("block1.weight: the recordings say 0.4639 +- 0.0015 N, 9.5 % below")
+    assert not compare(FOUND, measured, smallest=0.2)["block1"]["weight"]["disagrees"]  # [tolerance] property
+
+
+def test_a_friction_below_what_held_is_remarked_on():
+    compared = compare(FOUND, {"block1": {"friction": (0.3, 0.02)}})
+    assert disagreements(FOUND, compared)[0].startswith("block1.friction: measured as 0.300 +- 0.020, but")
+    assert disagreements(FOUND, compare(FOUND, {"block1": {"friction": (0.45, 0.02)}})) == []

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimation_scene import TRUE, drawn, make_design
+from scipy import stats
 
 from estimation import priors
 from estimation.posterior import REACH, STEP, posterior
@@ -115,7 +116,8 @@ def test_a_channel_without_observations_keeps_its_prior():
     theta = np.zeros((3, 6))
     theta[:, 5] = (0.0, 1.0, -2.0)
     found = post.log_prob(theta)
-    np.testing.assert_allclose(found - found[0], -0.5 * theta[:, 5] ** 2, atol=1e-9)
+    expected = stats.t.logpdf(theta[:, 5], priors.SCATTER_TAIL) - stats.t.logpdf(0.0, priors.SCATTER_TAIL)
+    np.testing.assert_allclose(found - found[0], expected, atol=1e-9)
     assert cut.repeats().tolist() == [3, 3, 0]
     mean, _ = post.given(theta)
     np.testing.assert_allclose(mean[:, -1], 0.0)  # the share of a channel that shows nothing
