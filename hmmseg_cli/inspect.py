@@ -24,7 +24,7 @@ def inspect(
     files: FilesArgument, rig: RigFile = None, write: WriteOption = None, json: JsonOption = None,
     seed: SeedOption = 0, quiet: QuietOption = False,
 ) -> None:  # fmt: skip
-    """What is in a recording, and the columns or topics of rig.toml that would read it."""
+    """What is in a recording, and the [columns] or [topics] that would read it."""
     from hmmseg.io.inspect import inspect as look
 
     with Output("inspect", json=json, seed=seed, quiet=quiet) as out:

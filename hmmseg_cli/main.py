@@ -20,7 +20,8 @@ from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, inspec
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
-app = typer.Typer(context_settings={"help_option_names": ["-h", "--help"]})
+# Plain help: markup would swallow what stands in square brackets.
+app = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
 
 # In the order of `hmmseg --help`. Modules import what is heavy (jax, matplotlib, pandas) inside
 # their command, so that help and light commands start at once.
@@ -36,7 +37,7 @@ for _command in (
     effects.effects,
     demo.demo,
 ):
-    app.command()(_command)
+    app.command(short_help=(_command.__doc__ or "").strip())(_command)  # in full, not cut short
 
 
 def _show_version(wanted: bool) -> None:
