@@ -59,8 +59,8 @@ def rigs() -> str | None:
     return markdown(head, rows)
 
 
-def readme() -> str | None:
-    """README: how often the diagnosis is right."""
+def summary() -> str | None:
+    """docs/results.md: how often the diagnosis is right."""
     rows = load("gap_recordings")
     if rows is None:
         return None
@@ -98,5 +98,5 @@ def _blind(found: dict[str, Any]) -> str:
         f"names above the detection floor {share('named_right')}, false alarms on healthy recordings "
         f"{false['hits']} of {false['count']}, what is outside the catalogue called unknown "
         f"{share('outside_unknown')}, exact pairs {share('pair_exact')} (goals: 95, 1, 90 and 80 %). All "
-        "figures, and what they show, stand in [docs/gap_results.md](docs/gap_results.md)."
+        "figures, and what they show, stand in [gap_results.md](gap_results.md)."
     )

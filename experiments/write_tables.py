@@ -63,7 +63,7 @@ def results() -> str | None:
 
 
 def rivals() -> str | None:
-    """README: the switching model beside the paper's method, on every recording of the folder."""
+    """docs/results.md: the switching model beside the paper's method, on every recording of the folder."""
     methods = {"hmm": "this model", "qualitative": "thresholds, best monotone order",
                "first-change": "thresholds, first change (the paper)"}  # fmt: skip
     rows = []
@@ -79,12 +79,6 @@ def rivals() -> str | None:
             rows.append([label, group, f"{s['complete']} of {s['trials']}", *times, *rms])
     head = ["method", "recordings", "trials complete", "boundary, median", "95th percentile", *PROPERTIES]
     return markdown(head, rows)
-
-
-def results_and_rivals() -> str | None:
-    """Both tables of the README."""
-    parts = [part for part in (results(), rivals()) if part is not None]
-    return "\n\n".join(parts) if parts else None
 
 
 def ablation() -> str | None:
@@ -153,13 +147,15 @@ def moves() -> str | None:
 
 
 TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
-    ("README.md", "results", results_and_rivals),
-    ("README.md", "real", real),
+    ("README.md", "results", results),
+    ("docs/results.md", "results", results),
+    ("docs/results.md", "rivals", rivals),
+    ("docs/results.md", "real", real),
     ("docs/calibration.md", "ablation", ablation),
     ("docs/calibration.md", "calibration", calibration),
     ("docs/calibration.md", "moves", moves),
     ("docs/calibration.md", "misfits", misfits),
-    ("README.md", "gap", table_gap.readme),
+    ("docs/results.md", "gap", table_gap.summary),
     ("docs/gap_results.md", "recordings", table_gap.recordings),
     ("docs/gap_results.md", "rigs", table_gap.rigs),
     ("docs/gap_results.md", "blind", table_blind_check.table),
