@@ -1,6 +1,7 @@
 """The blind check of `hmmseg diagnose` on a second simulator's recordings.
 
-    python -m experiments.blind_check generate --cases 550 --seed S --out DIR
+    python -m experiments.blind_check generate --cases 300 --seed S --out DIR [--outside FILE.py]
+    python -m experiments.blind_check untidy --trials 4 --seed S --out DIR
     python -m experiments.blind_check diagnose --cases DIR/cases --out RESULTS
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
 
@@ -30,9 +31,15 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     steps = parser.add_subparsers(dest="step", required=True)
     make = steps.add_parser("generate")
-    make.add_argument("--cases", type=int, default=550)
+    make.add_argument("--cases", type=int, default=300)
+    make.add_argument("--outside", type=Path, help="kinds of effects kept apart until they are scored")
     make.add_argument("--seed", type=int, required=True)
     make.add_argument("--out", type=Path, required=True)
+    make.add_argument("--fastest", type=float, default=float("inf"), help="no world samples faster [Hz]")
+    hands = steps.add_parser("untidy")
+    hands.add_argument("--trials", type=int, default=4)
+    hands.add_argument("--seed", type=int, required=True)
+    hands.add_argument("--out", type=Path, required=True)
     run = steps.add_parser("diagnose")
     run.add_argument("--cases", type=Path, required=True)
     run.add_argument("--out", type=Path, required=True)
@@ -42,7 +49,9 @@ def main(args: Sequence[str] | None = None) -> int:
     judge.add_argument("--json", type=Path, default=RESULTS)
     judge.add_argument("--first", type=int, help="judge this many cases only: a run that was cut short")
     given = parser.parse_args(args)
-    return {"generate": _generate, "diagnose": _diagnose, "score": _score}[given.step](given)
+    return {"generate": _generate, "untidy": _untidy, "diagnose": _diagnose, "score": _score}[given.step](
+        given
+    )
 
 
 def _tell(text: str) -> None:
@@ -50,9 +59,19 @@ def _tell(text: str) -> None:
 
 
 def _generate(given: argparse.Namespace) -> int:
-    from experiments.blind_check.generate import generate
+    from experiments.blind_check.generate import generate, outside_of
 
-    print(generate(given.cases, given.seed, given.out, lambda k, n: _tell(f"{k}/{n}")))
+    tell = lambda k, n: _tell(f"{k}/{n}")  # noqa: E731
+    print(
+        generate(given.cases, given.seed, given.out, tell, outside_of(given.outside), fastest=given.fastest)
+    )
+    return 0
+
+
+def _untidy(given: argparse.Namespace) -> int:
+    from experiments.blind_check.untidy_trials import write_untidy
+
+    print("\n".join(write_untidy(given.out, given.trials, given.seed)))
     return 0
 
 

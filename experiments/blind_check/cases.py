@@ -1,38 +1,58 @@
-"""A sealed set: which cases there are, what was done to each, and its trials with their truth."""
+"""A sealed set: its cases, the world of each, what was done to it, its trials with their truth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments.blind_check.effects import CATALOGUE, SMALLEST, Made, Values
+from experiments.blind_check.effects import CATALOGUE, Change, Made, Values, fitted
 from experiments.blind_check.hand import Rig
 from experiments.blind_check.operator import Style, plan
 from experiments.blind_check.outside import OUTSIDE
 from experiments.blind_check.perform import Motion, perform
 from experiments.blind_check.scene import Block, World
-from experiments.blind_check.signals import Sampling, noise_of_channels, sample, sense, task_space
+from experiments.blind_check.signals import (
+    ENCODER,
+    LINKS,
+    READOUT,
+    SCALE,
+    Signals,
+    Stage,
+    noise_of_channels,
+    sample,
+    sense,
+    task_space,
+)
+from experiments.blind_check.worlds import Circumstances, draw_world
 
 TRIALS = 4
 TRIES = 60
-# Shares of the tiers; effects too small to see come about by themselves among single effects.
-TIERS = {"healthy": 300, "single": 138, "pair": 40, "outside": 36, "withheld": 36}
-SUBTASKS = (
-    "pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1",
-    "pickup block2", "carry block2", "place block2", "release block2",
-)  # fmt: skip
+# Shares of the tiers. `small`: an effect too small to see; `slight`: healthy, with errors that the rig does
+# not state and that are below its [tolerance]; `dense`: four to six effects, one dominant; `withheld`: an
+# effect taken out of the catalogue.
+TIERS = {"healthy": 30, "single": 32, "pair": 10, "dense": 8, "outside": 10, "slight": 4, "withheld": 3,
+         "small": 3}  # fmt: skip
+SIZES = {"single": (0.08, 1.0), "pair": (0.3, 1.0), "outside": (0.3, 1.0), "withheld": (0.3, 1.0),
+         "small": (0.005, 0.02)}  # fmt: skip
+DOMINANT, MINOR = (0.4, 1.0), (0.03, 0.12)  # sizes of a dense case's effects
+# Of a slight case: sizes that stay below the tolerances of its rig.
+SLIGHT = {"force_bias": 0.1, "force_gain": 0.06, "joint_offset": 0.03, "fingertip_compliance": 0.02,
+          "table_tilt": 0.02, "force_crosstalk": 0.05}  # fmt: skip
+TOLERANCE = {"position": 5e-4, "force": 0.06, "property": 0.03}  # m, N, share
+ROUND = (0.02, 0.08)  # N m/rad of fingertips rounded in height
 HOLDS = 2.2  # a block is no heavier than this times the pads' friction, N: or it would be dropped
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a case is: its tier, blocks, and its effects' values by name, each with its size (0 to 1)."""
+    """What a case is: tier, world, blocks, and its effects' values by name, each with its size (0 to 1)."""
 
     name: str
     seed: int
     tier: str
+    world: Circumstances
     blocks: dict[str, Block]
     effects: dict[str, Values]
     sizes: dict[str, float]
@@ -53,9 +73,9 @@ class Recorded:
     spread: dict[str, list[float]]
 
 
-def tiers(count: int) -> list[str]:
-    """The tier of every case: shares of TIERS kept at any number, spread over the whole set."""
-    names, weights = list(TIERS), np.array(list(TIERS.values()), float)
+def tiers(count: int, shares: Mapping[str, int] = TIERS) -> list[str]:
+    """The tier of every case: shares kept at any number, spread over the whole set."""
+    names, weights = list(shares), np.array(list(shares.values()), float)
     given, out = np.zeros(len(names)), []
     for k in range(count):
         due = weights / weights.sum() * (k + 1) - given
@@ -64,22 +84,33 @@ def tiers(count: int) -> list[str]:
     return out
 
 
-def draw_cases(count: int, seed: int) -> list[Case]:
-    """The cases of a set, in an order that tells nothing; names are numbers."""
+def draw_cases(
+    count: int,
+    seed: int,
+    nominal: Rig,
+    outside: Mapping[str, Made] = OUTSIDE,
+    shares: Mapping[str, int] = TIERS,
+    fastest: float = float("inf"),
+) -> list[Case]:
+    """The cases of a set, in an order that tells nothing; names are numbers. `outside` holds the kinds that
+    outside cases are drawn from; no world samples faster than `fastest` [Hz].
+    """
     rng = np.random.default_rng([seed, 0])
-    kinds = tiers(count)
     pools: dict[str, list[str]] = {}
-    out = []
-    for tier in kinds:
-        out.append((tier, _choice(tier, rng, pools)))
+    out = [(tier, _choice(tier, rng, pools, outside)) for tier in tiers(count, shares)]
     order = rng.permutation(count)
-    return [
-        _draw(f"case_{k:04d}", out[int(i)], np.random.default_rng([seed, 1, k]), seed * 100_003 + k)
-        for k, i in enumerate(order)
-    ]
+    made = {**CATALOGUE, **outside}
+    cases = []
+    for k, i in enumerate(order):
+        own = np.random.default_rng([seed, 1, k])
+        lab = draw_world(own, fastest)
+        cases.append(_draw(f"case_{k:04d}", out[int(i)], own, seed * 100_003 + k, lab, nominal, made))
+    return cases
 
 
-def _choice(tier: str, rng: np.random.Generator, pools: dict[str, list[str]]) -> list[str]:
+def _choice(
+    tier: str, rng: np.random.Generator, pools: dict[str, list[str]], outside: Mapping[str, Made]
+) -> list[str]:
     """Names of the effects of a case: every name of its tier once before any comes again."""
 
     def deal(pool: str, names: Sequence[str]) -> str:
@@ -90,27 +121,56 @@ def _choice(tier: str, rng: np.random.Generator, pools: dict[str, list[str]]) ->
     if tier == "healthy":
         return []
     if tier == "outside":
-        return [deal(tier, list(OUTSIDE))]
-    if tier == "pair":
-        first = deal(tier, list(CATALOGUE))
-        return sorted([first, deal("partner", [n for n in CATALOGUE if n != first])])
-    return [deal(tier, list(CATALOGUE))]
+        return [deal(tier, list(outside))]
+    if tier == "slight":
+        return [str(n) for n in rng.permutation(list(SLIGHT))[: rng.integers(2, 4)]]
+    first = deal(tier, list(CATALOGUE))
+    if tier in ("pair", "dense"):
+        more = 1 if tier == "pair" else int(rng.integers(3, 6))
+        return [first, *(str(n) for n in rng.permutation([n for n in CATALOGUE if n != first])[:more])]
+    return [first]
 
 
-def _draw(name: str, kind: tuple[str, list[str]], rng: np.random.Generator, seed: int) -> Case:
+def _draw(
+    name: str,
+    kind: tuple[str, list[str]],
+    rng: np.random.Generator,
+    seed: int,
+    world: Circumstances,
+    nominal: Rig,
+    made: Mapping[str, Made],
+) -> Case:
     tier, effects = kind
-    blocks = {n: _block(rng, *width) for n, width in (("block1", (0.014, 0.02)), ("block2", (0.022, 0.03)))}
-    if len(effects) != len(set(effects)):
-        effects = [effects[0], "force_bias" if effects[0] != "force_bias" else "force_lag"]
-    # Pairs and effects to be recognised as unknown are drawn where they can be seen.
-    smallest = SMALLEST if tier == "single" else 0.3
-    sizes = {e: float(smallest ** rng.uniform(0, 1)) for e in effects}
-    values = {e: {k: float(v) for k, v in _made(e).draw(rng, sizes[e]).items()} for e in effects}
+    rig = world.rig(nominal)
+    blocks = draw_blocks(world, rng)
+    sizes = {e: _size(tier, e, k, rng) for k, e in enumerate(effects)}
+    drawn = {e: {k: float(v) for k, v in made[e].draw(rng, sizes[e]).items()} for e in effects}
+    values = {e: fitted(e, v, rig) for e, v in drawn.items()}
     if "grip_slip" in values:
         most = HOLDS * values["grip_slip"]["mu"]
         blocks = {n: replace(b, weight=min(b.weight, most)) for n, b in blocks.items()}
+    measured = bool(rng.random() < 0.5) or "actual" in values
+    if "offcentre_mass" in values:  # round tips: flat ones would take its moment by themselves
+        world = replace(world, pad_turning=float(rng.uniform(*ROUND)))
+    if "actual" in values:  # drawn as a share of the property
+        values["actual"] = {k: v * getattr(blocks["block1"], k.split(".")[1])
+                            for k, v in values["actual"].items()}  # fmt: skip
     exclude = tuple(effects) if tier == "withheld" else ()
-    return Case(name, seed, tier, blocks, values, sizes, bool(rng.random() < 0.5), exclude)
+    return Case(name, seed, tier, world, blocks, values, sizes, measured, exclude)
+
+
+def _size(tier: str, effect: str, place: int, rng: np.random.Generator) -> float:
+    if tier == "slight":
+        return SLIGHT[effect] * float(rng.uniform(0.3, 1.0))
+    low, high = (DOMINANT if place == 0 else MINOR) if tier == "dense" else SIZES[tier]
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def draw_blocks(world: Circumstances, rng: np.random.Generator) -> dict[str, Block]:
+    """Blocks of the task: what lies below is the wider."""
+    names = sorted(world.work.on)
+    widths = {"block1": (0.014, 0.02), "block2": (0.022, 0.03), "block3": (0.024, 0.032)}
+    return {n: _block(rng, *widths[n]) for n in names}
 
 
 def _block(rng: np.random.Generator, low: float, high: float) -> Block:
@@ -122,54 +182,85 @@ def _block(rng: np.random.Generator, low: float, high: float) -> Block:
     )
 
 
-def _made(name: str) -> Made:
-    return CATALOGUE[name] if name in CATALOGUE else OUTSIDE[name]
-
-
 def record_case(
-    case: Case, rig: Rig, style: dict[str, tuple[float, float]] | None = None, first: int = 0
+    case: Case,
+    nominal: Rig,
+    style: dict[str, tuple[float, float]] | None = None,
+    first: int = 0,
+    outside: Mapping[str, Made] = OUTSIDE,
 ) -> list[Recorded]:
     """The trials of a case, worked in another style if that is given; `first` numbers the first one."""
-    return [_record(case, rig, k, style or {}) for k in range(first, first + TRIALS)]
+    made = {**CATALOGUE, **outside}
+    changes = [made[n].change(v) for n, v in case.effects.items()]
+    return [_record(case, nominal, k, style or {}, changes) for k in range(first, first + TRIALS)]
 
 
-def _record(case: Case, rig: Rig, trial: int, asked: dict[str, tuple[float, float]]) -> Recorded:
-    changes = [_made(n).change(v) for n, v in case.effects.items()]
-    healthy = World(rig.normal_stiffness, rig.shear_stiffness)
-    world, style, sampling = healthy, Style(), Sampling()
+def _record(
+    case: Case, nominal: Rig, trial: int, asked: dict[str, tuple[float, float]], changes: Sequence[Change]
+) -> Recorded:
+    rig, healthy = case.world.rig(nominal), case.world.world()
+    # What an effect asks of the operator for its own sake (a loose grip) is done by the healthy twin too.
+    usual = case.world.style()
+    world, style, sampling = healthy, usual, case.world.sampling()
     for change in changes:
         world = change.world(world) if change.world else world
         style, sampling = replace(style, **change.style), replace(sampling, **change.sampling)
     style = replace(style, **asked)
-    motion, twin = _motions(case, world, healthy, style, trial)
-    stages = [s for c in changes for s in c.stages]
-    signals = sense(motion, rig, stages, np.random.default_rng([case.seed, trial, 1]))
+    motion, twin = _motions(case, (world, style), (healthy, replace(style, roll=0.0)), trial)
+    own = [s for c in changes for s in c.stages]
+    stages = _errors(case.world)
+    signals = sense(motion, rig, [*stages, *own], np.random.default_rng([case.seed, trial, 1]))
     t, columns = sample(signals, sampling, np.random.default_rng([case.seed, trial, 2]))
     _, quiet = sample(signals, sampling, np.random.default_rng([case.seed, trial, 2]), noisy=False)
-    plain = sense(twin, rig, [], np.random.default_rng(0))
-    _, without = sample(plain, Sampling(), np.random.default_rng([case.seed, trial, 2]), noisy=False)
-    shift, spread = _shifts(rig, t, quiet, without, (motion.boundaries, twin.boundaries))
+    plain = sense(twin, rig, stages, np.random.default_rng(0))
+    quietly = np.random.default_rng([case.seed, trial, 2])
+    _, without = sample(plain, case.world.sampling(), quietly, noisy=False)
+    ends = (motion.boundaries, twin.boundaries)
+    shift, spread = _shifts(rig, t, quiet, without, ends, len(case.world.work.subtasks))
     return Recorded(t, columns, motion.boundaries, shift, spread)
 
 
-def _motions(case: Case, world: World, healthy: World, style: Style, trial: int) -> tuple[Motion, Motion]:
+def _errors(world: Circumstances) -> list[tuple[int, Stage]]:
+    """The recording chain's part of the errors that are within the stated systematic ones."""
+    e = {k: np.array(v) for k, v in world.errors.items()}
+    if not e:
+        return []
+
+    def encoders(s: Signals, rng: np.random.Generator) -> Signals:
+        assert s.q is not None
+        return replace(s, q=s.q + e["joint_offset"])
+
+    return [
+        (LINKS, lambda s, rng: replace(s, stretch=s.stretch + e["link_length"].reshape(2, 2))),
+        (ENCODER, encoders),
+        (SCALE, lambda s, rng: replace(s, force=s.force * (1 + e["force_gain"]))),
+        (READOUT, lambda s, rng: replace(s, force=s.force + e["force_bias"])),
+    ]
+
+
+def _motions(
+    case: Case, own: tuple[World, Style], healthy: tuple[World, Style], trial: int
+) -> tuple[Motion, Motion]:
     """The motion and its healthy twin: same operator, same tremor, another world."""
+    task = case.world.work
+
+    def moved(world: World, style: Style, seeds: list[int]) -> Motion:
+        rng = np.random.default_rng(seeds)
+        return perform(plan(task, case.blocks, world, style, rng), case.blocks, world)
+
     for attempt in range(TRIES):
         seeds = [case.seed, trial, 0, attempt]
         try:
-            motion = perform(
-                plan(case.blocks, world, style, np.random.default_rng(seeds)), case.blocks, world
-            )
-            if world == healthy:
-                return motion, motion
-            again = plan(case.blocks, healthy, style, np.random.default_rng(seeds))
-            return motion, perform(again, case.blocks, healthy)
+            motion = moved(*own, seeds)
+            return motion, motion if own == healthy else moved(*healthy, seeds)
         except ValueError:  # dropped: people try again
             continue
-    raise RuntimeError(f"{case.name}: no trial out of {TRIES} came off; effects {case.effects}")
+    raise RuntimeError(f"{case.name}: no trial out of {TRIES} came off; {case.world}, effects {case.effects}")
 
 
-def _shifts(rig: Rig, t: np.ndarray, quiet: dict, without: dict, boundaries: tuple) -> tuple[dict, dict]:
+def _shifts(
+    rig: Rig, t: np.ndarray, quiet: dict, without: dict, boundaries: tuple, subtasks: int
+) -> tuple[dict, dict]:
     n = min(len(next(iter(quiet.values()))), len(next(iter(without.values()))))
     t, a, b = t[:n], *({k: v[:n] for k, v in d.items()} for d in (quiet, without))
     own, other, noise = task_space(rig, a), task_space(rig, b), noise_of_channels(rig, b)
@@ -179,7 +270,7 @@ def _shifts(rig: Rig, t: np.ndarray, quiet: dict, without: dict, boundaries: tup
     spread: dict[str, list[float]] = {}
     for channel in own:
         z = (own[channel] - other[channel]) / noise[channel]
-        rows = [z[same & (subtask == s)] for s in range(len(SUBTASKS))]
+        rows = [z[same & (subtask == s)] for s in range(subtasks)]
         shift[channel] = [float(r.mean()) if r.size else 0.0 for r in rows]
         spread[channel] = [float(np.sqrt((r**2).mean())) if r.size else 0.0 for r in rows]
     return shift, spread

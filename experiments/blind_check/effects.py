@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from experiments.blind_check.hand import Rig
 from experiments.blind_check.scene import World
 from experiments.blind_check.signals import (
     BAND,
@@ -29,7 +30,6 @@ from experiments.blind_check.signals import (
 Values = dict[str, float]
 Rng = np.random.Generator
 FORCES, JOINTS = ("fx1", "fy1", "fx2", "fy2"), ("q11", "q12", "q21", "q22")
-SMALLEST = 0.03  # size of the smallest effects: too small to see
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,34 @@ def _some(rng: Rng, names: tuple[str, ...], unit: float) -> Values:
         x = rng.normal(size=len(names)) * (rng.random(len(names)) < 0.7)
         if np.abs(x).max() > 0.2:
             return dict(zip(names, map(float, unit * x / np.sqrt((x**2).mean())), strict=True))
+
+
+FINGERS = ("finger1", "finger2")
+GROSS = 0.12  # share of biases that are a sensor never tared
+TARE = 1.0  # N
+
+
+def _bias(rng: Rng, size: float) -> Values:
+    """Four channels' zeros, or one sensor that was never tared."""
+    if size > 0.3 and rng.random() < GROSS:
+        return dict.fromkeys(FORCES, 0.0) | {str(rng.choice(FORCES)): TARE * _sign(rng) * rng.uniform(0.5, 2)}
+    return _some(rng, FORCES, 0.16 * size)
+
+
+def _common_or_one(rng: Rng, name: str, value: float, channels: bool = False) -> Values:
+    """Of both fingers alike, as `name`, or of one finger or channel alone."""
+    kind = rng.random()
+    if kind < 0.6:
+        return {name: value}
+    names = FORCES if channels and kind > 0.85 else FINGERS
+    return dict.fromkeys(names, 0.0) | {str(rng.choice(names)): value}
+
+
+def _by_channel(v: Values, name: str) -> np.ndarray:
+    """A value for each of the four force channels."""
+    if name in v:
+        return np.full(4, v[name])
+    return np.repeat(_row(v, FINGERS), 2) if "finger1" in v else _row(v, FORCES)
 
 
 def _force(shift: Callable[[Signals, Rng], np.ndarray]) -> Stage:
@@ -103,17 +131,26 @@ def _crossed(v: Values) -> Stage:
 
 
 def _late(v: Values) -> Stage:
+    delay = _by_channel(v, "delay")
+
     def stage(s: Signals, rng: Rng) -> Signals:
-        return replace(s, force=np.stack([np.interp(s.t - v["delay"], s.t, c) for c in s.force.T], 1))
+        late = [np.interp(s.t - d, s.t, c) for c, d in zip(s.force.T, delay, strict=True)]
+        return replace(s, force=np.stack(late, 1))
 
     return stage
 
 
 def _smooth(v: Values) -> Stage:
+    constant = _by_channel(v, "time_constant")
+
     def stage(s: Signals, rng: Rng) -> Signals:
-        keep = float(np.exp(-(s.t[1] - s.t[0]) / v["time_constant"]))
-        start = keep * s.force[:1]
-        return replace(s, force=lfilter([1 - keep], [1, -keep], s.force, axis=0, zi=start)[0])
+        out = s.force.copy()
+        for c, tau in enumerate(constant):
+            if tau > 0:
+                keep = float(np.exp(-(s.t[1] - s.t[0]) / tau))
+                begin = [keep * s.force[0, c]]
+                out[:, c] = lfilter([1 - keep], [1, -keep], s.force[:, c], zi=begin)[0]
+        return replace(s, force=out)
 
     return stage
 
@@ -192,15 +229,30 @@ def _log(rng: Rng, low: float, high: float) -> float:
 
 
 def _pads(rng: Rng, size: float) -> Values:
-    """Stiffer or softer by up to a factor 3.5; in shear alike, or not at all."""
+    """Stiffer or softer by up to a factor 3.5; in shear alike, or not at all. Shares of the rig's own."""
     way = _sign(rng) if size > 0.3 else -1.0
-    scale = np.exp(way * 1.25 * size)
-    shear = float(rng.choice([1.0, scale]))
+    scale = float(np.exp(way * 1.25 * size))
     return {
-        "normal_stiffness": 4000.0 * scale,
-        "shear_stiffness": 2500.0 * shear,
+        "normal_stiffness": scale,
+        "shear_stiffness": float(rng.choice([1.0, scale])),
         "exponent": float(rng.choice([1.0, 1.08])),
     }
+
+
+def fitted(name: str, values: Values, rig: Rig) -> Values:
+    """Values drawn for the nominal rig, as they are on another: pads as stiffnesses, times by its rate."""
+    out = dict(values)
+    if name == "fingertip_compliance":
+        out["normal_stiffness"] *= rig.normal_stiffness
+        out["shear_stiffness"] *= rig.shear_stiffness
+    if name == "clock_jitter":
+        out["sd"] *= min(1.0, 20.0 / rig.rate)
+    return out
+
+
+def _misjudged(rng: Rng, size: float) -> Values:
+    """A property of block1 that was measured wrong, by a share of it."""
+    return {f"block1.{rng.choice(['weight', 'width', 'height'])}": 0.15 * size * _sign(rng)}
 
 
 def _world(**names: str) -> Callable[[Values], Change]:
@@ -211,7 +263,7 @@ def _world(**names: str) -> Callable[[Values], Change]:
 MADE = (
     Made(
         "force_bias",
-        lambda r, s: _some(r, FORCES, 0.16 * s),
+        _bias,
         lambda v: Change(stages=((READOUT, _force(lambda s, r: _row(v, FORCES))),)),
     ),
     Made(
@@ -221,8 +273,10 @@ MADE = (
     ),
     Made(
         "force_gain",
-        lambda r, s: {"gain": 0.16 * s * _sign(r)},
-        lambda v: Change(stages=((SCALE, lambda s, r: replace(s, force=s.force * (1 + v["gain"]))),)),
+        lambda r, s: _common_or_one(r, "gain", 0.16 * s * _sign(r), channels=True),
+        lambda v: Change(
+            stages=((SCALE, lambda s, r: replace(s, force=s.force * (1 + _by_channel(v, "gain")))),)
+        ),
     ),
     Made(
         "force_crosstalk",
@@ -237,10 +291,14 @@ MADE = (
         lambda r, s: {"angle1": 0.1 * s * _sign(r) * r.uniform(0.5, 1), "angle2": 0.1 * s * _sign(r)},
         lambda v: Change(stages=((MIX, _turned(v)),)),
     ),
-    Made("force_lag", lambda r, s: {"delay": 0.25 * s}, lambda v: Change(stages=((BAND, _late(v)),))),
+    Made(
+        "force_lag",
+        lambda r, s: _common_or_one(r, "delay", 0.25 * s),
+        lambda v: Change(stages=((BAND, _late(v)),)),
+    ),
     Made(
         "force_lowpass",
-        lambda r, s: {"time_constant": 0.2 * s},
+        lambda r, s: _common_or_one(r, "time_constant", 0.2 * s),
         lambda v: Change(stages=((BAND, _smooth(v)),)),
     ),
     Made("quantisation", lambda r, s: {"step": 0.2 * s}, lambda v: Change(sampling={"step": v["step"]})),
@@ -252,7 +310,7 @@ MADE = (
     Made(
         "link_length",
         lambda r, s: {"scale": 0.04 * s * _sign(r)},
-        lambda v: Change(stages=((LINKS, lambda s, r: replace(s, stretch=v["scale"])),)),
+        lambda v: Change(stages=((LINKS, lambda s, r: replace(s, stretch=s.stretch + v["scale"])),)),
     ),
     Made("backlash", lambda r, s: {"width": 0.012 * s}, lambda v: Change(stages=((ENCODER, _played(v)),))),
     Made("clock_jitter", lambda r, s: {"sd": 0.02 * s}, lambda v: Change(sampling={"jitter": v["sd"]})),
@@ -279,7 +337,14 @@ MADE = (
         "offcentre_mass",
         lambda r, s: {"offset": 0.005 * s * _sign(r)},
         _world(mass_offset="offset"),
+        scored=False,  # a hand that yields under the heavier side and a grip that then pushes askew add to it
     ),
+    Made(
+        "hand_roll",
+        lambda r, s: {"amplitude": 0.02 * s},
+        lambda v: Change(style={"roll": v["amplitude"]}),
+    ),
+    Made("actual", _misjudged, lambda v: Change()),
     Made("table_tilt", lambda r, s: {"angle": 0.04 * s * _sign(r)}, _world(tilt="angle")),
     Made(
         "table_compliance",

@@ -18,6 +18,7 @@ from experiments.blind_check.hand import load_rig
 from experiments.blind_check.operator import Style
 from experiments.blind_check.scene import Block
 from experiments.blind_check.sealing import unseal
+from experiments.blind_check.worlds import world_of
 
 KNOWN = {f.name for f in fields(Style)}
 
@@ -65,12 +66,15 @@ def follow(folder: Path, results: Path, progress=None, first: int | None = None)
 def _record(entry: dict[str, Any], asked: dict[str, Any], place: Path) -> None:
     """Fresh trials of a sealed case in the style that was asked for."""
     blocks = {n: Block(**b) for n, b in entry["blocks"].items()}
-    case = Case(entry["case"], entry["seed"], entry["tier"], blocks, entry["effects"], entry["sizes"],
-                entry["measured"], tuple(entry["exclude"]))  # fmt: skip
+    case = Case(
+        entry["case"], entry["seed"], entry["tier"], world_of(entry), blocks, entry["effects"],
+        entry["sizes"], entry["measured"], tuple(entry["exclude"]),
+    )  # fmt: skip
     unknown = set(asked["operator"]) - KNOWN
     if unknown:
         raise ValueError(f"{entry['case']}: the simulated operator has no setting {sorted(unknown)}")
     style = {k: (float(v[0]), float(v[1])) for k, v in asked["operator"].items()}
     if not style:  # nothing to be done otherwise: the blocks are to be measured
         case = replace(case, measured=True)
-    write_folder(place, case, record_case(case, load_rig(NOMINAL / "rig.toml"), style, first=TRIALS))
+    nominal = load_rig(NOMINAL / "rig.toml")
+    write_folder(place, case, record_case(case, nominal, style, first=TRIALS), nominal)

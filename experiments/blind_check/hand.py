@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+Stretch = float | np.ndarray
 OUTWARD = (-1.0, 1.0)  # the left elbow points left, the right one right
 
 
@@ -47,14 +48,15 @@ def load_rig(path: Path) -> Rig:
     )
 
 
-def angles(rig: Rig, tips: np.ndarray, stretch: float = 0.0) -> np.ndarray:
+def angles(rig: Rig, tips: np.ndarray, stretch: Stretch = 0.0) -> np.ndarray:
     """Angles q11, q12, q21, q22 (n, 4) [rad] of tips x1, y1, x2, y2 (n, 4) [m].
 
-    The elbow is where two circles meet; links are longer than the rig says by the share `stretch`.
+    The elbow is where two circles meet; links are longer than the rig says by the share `stretch`, one
+    for all or (2 fingers, 2 links).
     """
     out = np.empty_like(tips)
     for i in (0, 1):
-        upper, lower = rig.links[i] * (1 + stretch)
+        upper, lower = (rig.links * (1 + stretch))[i]
         way = tips[:, 2 * i : 2 * i + 2] - rig.bases[i]
         far = np.hypot(way[:, 0], way[:, 1])
         along = (far**2 + upper**2 - lower**2) / (2 * far)
@@ -83,18 +85,18 @@ def tips(rig: Rig, q: np.ndarray) -> np.ndarray:
     return out
 
 
-def jacobians(rig: Rig, q: np.ndarray, stretch: float = 0.0) -> np.ndarray:
+def jacobians(rig: Rig, q: np.ndarray, stretch: Stretch = 0.0) -> np.ndarray:
     """Derivatives (n, 2 fingers, 2 axes, 2 joints) [m/rad] of tips by angles."""
     out = np.empty((len(q), 2, 2, 2))
     for i in (0, 1):
         for j in (0, 1):
-            length = rig.links[i, j] * (1 + stretch)
+            length = (rig.links * (1 + stretch))[i, j]
             out[:, i, 0, j] = -length * np.sin(q[:, 2 * i + j])
             out[:, i, 1, j] = length * np.cos(q[:, 2 * i + j])
     return out
 
 
-def rates(rig: Rig, q: np.ndarray, velocity: np.ndarray, stretch: float = 0.0) -> np.ndarray:
+def rates(rig: Rig, q: np.ndarray, velocity: np.ndarray, stretch: Stretch = 0.0) -> np.ndarray:
     """Angular rates (n, 4) [rad/s] at angles q of tips that move at `velocity` (n, 4) [m/s]."""
     jacobian = jacobians(rig, q, stretch)
     return np.linalg.solve(jacobian, velocity.reshape(-1, 2, 2)[..., None])[..., 0].reshape(-1, 4)

@@ -1,17 +1,21 @@
-"""A person's paths for reversing two stacked blocks, as knots that minimum-jerk motions join.
+"""A person's paths for any task of blocks, as knots that motions of some profile join.
 
-Flash & Hogan, J. Neurosci. 5, 1985. Every length, duration and force is drawn anew for each trial.
+Every length, duration and force is drawn anew for each trial; profile and servo are the lab's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.blind_check.scene import PIVOT, STEP, TIP, Block, Servo, World
+from experiments.blind_check import untidy
+from experiments.blind_check.profiles import PROFILES, Profile
+from experiments.blind_check.scene import PAD, PIVOT, STEP, TIP, Block, Servo, World
+from experiments.blind_check.tasks import GROUND, Task
 
-CLEAR = 0.012  # m between a carried block and what it passes over
+CLEAR = 0.016  # m between a carried block and what it passes over
 OPEN = (0.010, 0.013)  # m that fingers are opened wider than a block
 
 
@@ -19,9 +23,13 @@ OPEN = (0.010, 0.013)  # m that fingers are opened wider than a block
 class Style:
     """How a case is worked, as ranges: `pace` (1: two moves in 10 s), `grip` and `press` [N], waits [s]
     at the start (`rest`), open around a block (`dwell`), held (`hold`), placed (`place`) and at the end
-    (`finish`); `rise` [m] after letting go; `height` [m] of the grasp over a block's centre.
+    (`finish`); `rise` [m] after letting go; `height` [m] of the grasp over a block's centre; `stagger`
+    [s] by which one finger closes and opens before the other; the fingers' heights differ by `uneven` [m].
 
-    Names and meanings are those of the operator settings that a next experiment carries.
+    Of the lab: `profile` of motions, servo `stiffness` [N/m], whether the task is worked to the left
+    (`mirrored`). `roll` [rad], rms, turns both fingers about the grip while they carry. `untidy` names what
+    else happens (untidy.py). The first names and meanings are those of the operator settings that a next
+    experiment carries.
     """
 
     pace: tuple[float, float] = (0.9, 1.15)
@@ -34,6 +42,13 @@ class Style:
     finish: tuple[float, float] = (0.25, 0.4)
     rise: tuple[float, float] = (0.010, 0.016)
     height: tuple[float, float] = (-0.0012, 0.0012)
+    stagger: tuple[float, float] = (0.0, 0.0)
+    uneven: tuple[float, float] = (-0.0005, 0.0005)
+    stiffness: tuple[float, float] = (600.0, 1000.0)
+    profile: str = "minimum_jerk"
+    mirrored: bool = False
+    roll: float = 0.0
+    untidy: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -46,93 +61,164 @@ class Plan:
     moved: tuple[str, ...]
 
 
-class _Knots:
-    """Targets in time of middle x, height y and opening, each reached by minimum jerk."""
+class Knots:
+    """Targets in time of middle x, height y, each finger's opening (half) and roll."""
 
-    def __init__(self, x: float, y: float, opening: float) -> None:
-        self.now = 0.0
-        self.value = {"x": x, "y": y, "opening": opening}
+    def __init__(self, profile: Profile, rng: np.random.Generator, **start: float) -> None:
+        self.now, self.profile, self.rng = 0.0, profile, rng
+        self.first, self.value = dict(start), dict(start)
         self.parts: list[tuple[str, float, float, float, float]] = []
+        self.held: list[tuple[float, float]] = []  # times from grip to release
 
     def to(self, duration: float, early: float = 0.0, **targets: float) -> None:
         """Move to `targets` in `duration` [s], begun `early` [s] before the last motion ends."""
         start = self.now - early
         for name, target in targets.items():
-            self.parts.append((name, start, duration, self.value[name], target))
-            self.value[name] = target
+            self.add(name, start, duration, target)
         self.now = start + duration
+
+    def add(self, name: str, start: float, duration: float, target: float) -> None:
+        """One coordinate's motion at a time of its own."""
+        self.parts.append((name, start, duration, self.value[name], target))
+        self.value[name] = target
+
+    def fingers(self, duration: float, opening: float, apart: float = 0.0) -> None:
+        """Open or close; one finger begins `apart` [s] after the other (negative: the left one)."""
+        left, right = max(-apart, 0.0), max(apart, 0.0)
+        self.add("left", self.now + left, duration, opening / 2)
+        self.add("right", self.now + right, duration, opening / 2)
+        self.now += duration + abs(apart)
 
     def wait(self, duration: float) -> None:
         self.now += duration
 
-    def path(self, name: str, first: float, t: np.ndarray) -> np.ndarray:
-        out = np.full_like(t, first)
+    def path(self, name: str, t: np.ndarray) -> np.ndarray:
+        out = np.full_like(t, self.first[name])
         for part, start, duration, before, after in self.parts:
             if part == name:
-                s = np.clip((t - start) / duration, 0, 1)
-                out += (after - before) * (((6 * s - 15) * s + 10) * s**3)
+                out += (after - before) * self.profile((t - start) / duration)
         return out
 
 
-def plan(blocks: dict[str, Block], world: World, style: Style, rng: np.random.Generator) -> Plan:
-    """Commands that put block1 from block2 on the table, then block2 on it."""
+def plan(
+    task: Task, blocks: Mapping[str, Block], world: World, style: Style, rng: np.random.Generator
+) -> Plan:
+    """Commands that carry out the task's moves in order."""
     u = rng.uniform
-    first, second = blocks["block1"], blocks["block2"]
-    pace = u(*style.pace)
-    stiffness = u(600.0, 1000.0)
+    pace, stiffness = u(*style.pace), u(*style.stiffness)
     servos = tuple(_servo(stiffness * u(0.95, 1.05), u(0.10, 0.16), u(0.8, 1.1)) for _ in (0, 1))
-    here = u(0.106, 0.118)
-    # Far enough off that a finger opened around block2 passes block1 where it was put down.
-    there = here + (first.width + second.width + OPEN[1]) / 2 + 2 * TIP + u(0.005, 0.014)
-    lean = u(-0.0008, 0.0008)
-    slope = np.tan(world.tilt)
-    low = second.height / 2 + slope * (here - PIVOT)
-    centres = {
-        "block2": (here, low),
-        "block1": (here + lean, slope * (here - PIVOT) + second.height + first.height / 2),
-    }
-    top = centres["block1"][1] + first.height / 2
-    x0, y0, open0 = here + u(-0.015, 0.02), top + u(0.012, 0.02), first.width + u(*OPEN)
-    k = _Knots(x0, y0, open0)
+    yard = _Yard(task, blocks, np.tan(world.tilt), style.mirrored, rng)
+    centres = dict(yard.centres)
+    first = task.moves[0][0]
+    x, top = centres[first][0], centres[first][1] + blocks[first].height / 2
+    half = (blocks[first].width + u(*OPEN)) / 2
+    k = Knots(
+        PROFILES[style.profile](rng),
+        rng,
+        x=x + u(-0.015, 0.02),
+        y=top + u(0.012, 0.02),
+        left=half,
+        right=half,
+    )
     k.wait(u(*style.rest) / pace)
-    ground = slope * (there - PIVOT) + first.height / 2
-    _move(k, first, centres["block1"], (there, ground), top, world, stiffness, style, pace, rng)
-    placed = slope * (there - PIVOT) + first.height
-    high = max(placed, second.height + slope * (here - PIVOT))
-    target = (there + u(-0.0008, 0.0008), placed + second.height / 2)
-    _move(k, second, centres["block2"], target, high, world, stiffness, style, pace, rng)
+    for block, to in task.moves:
+        start = yard.centres[block]
+        end, height = yard.put(block, to)
+        _move(k, blocks[block], start, end, height, world, stiffness, style, pace)
     k.wait(u(*style.finish))
     t = np.arange(int(k.now / STEP) + 1) * STEP
-    x, y, opening = k.path("x", x0, t), k.path("y", y0, t), k.path("opening", open0, t)
-    uneven = u(-0.0005, 0.0005)
-    command = np.stack([x - opening / 2, y - uneven / 2, x + opening / 2, y + uneven / 2], 1)
+    x, y, left, right = (k.path(name, t) for name in ("x", "y", "left", "right"))
+    # Uneven heights are settled by the hand that holds: half a roll up on one side, down on the other.
+    lean = u(*style.uneven) + _rolled(k, t, style.roll, rng) * (left + right)
+    command = np.stack([x - left, y - lean / 2, x + right, y + lean / 2], 1)
     tremor, wander = u(2.5e-5, 6e-5, 4), u(3e-5, 1.5e-4, 4)
     for c in range(4):
         command[:, c] += _shake(t, 7.0, 11.0, tremor[c], rng) + _shake(t, 0.1, 0.5, wander[c], rng)
-    return Plan(command, servos, centres, ("block1", "block2"))  # type: ignore[arg-type]
+    return Plan(command, servos, centres, tuple(b for b, _ in task.moves))  # type: ignore[arg-type]
+
+
+class _Yard:
+    """Where blocks stand now: spots on the ground, and the heights of what stands on them."""
+
+    def __init__(self, task: Task, blocks: Mapping[str, Block], slope: float, mirrored: bool, rng) -> None:
+        u, widest = rng.uniform, sorted(b.width for b in blocks.values())
+        self.blocks, self.slope, self.rng = blocks, slope, rng
+        self.on = dict(task.on)
+        # Far enough off that a finger opened around one block passes its neighbour.
+        apart = sum(widest[-2:]) / min(len(widest), 2) + OPEN[1] / 2 + 2 * TIP + u(0.005, 0.014)
+        grounded = [b for b, on in task.on.items() if on == GROUND]
+        here = u(0.106, 0.118)
+        spots = [here + i * apart for i in range(3)]
+        if mirrored:
+            spots = [2 * PIVOT + 0.01 - x for x in spots]
+        self.spots = dict(zip(grounded, spots, strict=False))
+        self.free = spots[len(grounded)]
+        self.x = dict(self.spots)
+        self.centres: dict[str, tuple[float, float]] = {}
+        for block in sorted(task.on, key=self._level):
+            below = self.on[block]
+            if below != GROUND:
+                self.x[block] = self.x[below] + u(-0.0008, 0.0008)
+            self.centres[block] = self._centre(block)
+
+    def _level(self, block: str) -> int:
+        return 0 if self.on[block] == GROUND else 1 + self._level(self.on[block])
+
+    def _face(self, block: str, x: float) -> float:
+        """Height of what `block` stands on at x."""
+        below = self.on[block]
+        if below == GROUND:
+            return self.slope * (x - PIVOT)
+        return self._face(below, x) + self.blocks[below].height
+
+    def _centre(self, block: str) -> tuple[float, float]:
+        return self.x[block], self._face(block, self.x[block]) + self.blocks[block].height / 2
+
+    def put(self, block: str, to: str) -> tuple[tuple[float, float], float]:
+        """Put the block there: its new centre, and the height of all that it passes."""
+        others = [self._face(b, self.x[b]) + self.blocks[b].height for b in self.on if b != block]
+        self.on[block] = to
+        if to == GROUND:
+            self.x[block] = self.free
+        else:
+            self.x[block] = self.x[to] + self.rng.uniform(-0.0008, 0.0008)
+        self.centres[block] = self._centre(block)
+        return self.centres[block], max([0.0, *others])
 
 
 def _servo(stiffness: float, mass: float, ratio: float) -> Servo:
     return Servo(mass, stiffness, 2 * ratio * (stiffness * mass) ** 0.5)
 
 
-def _move(k: _Knots, block: Block, start, end, top: float, world: World, stiffness: float, style: Style,
-          pace: float, rng: np.random.Generator) -> None:  # fmt: skip
+def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffness: float, style: Style,
+          pace: float) -> None:  # fmt: skip
     """One block from centre `start` to centre `end` past anything up to `top` [m]."""
-    u = rng.uniform
-    grasp = u(*style.height)
-    over = max(top + block.height / 2 + CLEAR + 0.004, k.value["y"])
+    u = k.rng.uniform
+    lowest = PAD + TIP + 0.001 - start[1] if not style.untidy else -1.0  # pads keep clear of the table
+    grasp = max(u(*style.height), lowest)
+    over = max(top + block.height / 2 + CLEAR, k.value["y"])
     wide = block.width + u(*OPEN)
-    k.to(u(0.25, 0.35) / pace, y=over, opening=max(wide, k.value["opening"]))
+    opening = max(wide, k.value["left"] * 2)
+    k.add("left", k.now, 0.3 / pace, opening / 2)
+    k.add("right", k.now, 0.3 / pace, opening / 2)
+    k.to(u(0.25, 0.35) / pace, y=over)
     k.to(u(0.5, 0.65) / pace, early=0.1 / pace, x=start[0] + u(-0.0006, 0.0006))
-    k.to(u(0.45, 0.6) / pace, early=0.02 / pace, y=start[1] + grasp, opening=wide)
+    k.add("left", k.now, 0.4 / pace, wide / 2)
+    k.add("right", k.now, 0.4 / pace, wide / 2)
+    untidy.before_grip(k, style, start[1] + grasp, pace)
+    k.to(u(0.45, 0.6) / pace, early=0.02 / pace, y=start[1] + grasp)
     k.wait(u(*style.dwell))
     grip = u(*style.grip)
     inwards = grip * (1 / stiffness + 1 / world.normal_stiffness)
-    k.to(u(0.2, 0.28) / pace, opening=block.width - 2 * inwards)
+    untidy.tap(k, style, block.width, wide, inwards, pace)
+    closed = k.now
+    way = float(k.rng.choice([-1.0, 1.0]))
+    k.fingers(u(0.2, 0.28) / pace, block.width - 2 * inwards, way * u(*style.stagger))
     k.wait(u(*style.hold) / pace)
-    clear = max(start[1], top + block.height / 2) + CLEAR + grasp
+    untidy.held_on_ground(k, style)
+    clear = max(start[1], top + block.height / 2) + CLEAR - 0.004 + grasp
     k.to(u(0.42, 0.55) / pace, y=clear)
+    untidy.carried(k, style, block.width, inwards)
     k.to(u(0.5, 0.65) / pace, early=u(0.0, 0.08) / pace, x=end[0])
     sag = block.weight / 2 * (1 / stiffness + 1 / world.shear_stiffness)
     touch = end[1] + grasp + sag
@@ -141,9 +227,23 @@ def _move(k: _Knots, block: Block, start, end, top: float, world: World, stiffne
     # No stop at the surface: a hand goes on until it feels the resistance it expects.
     k.to(u(0.36, 0.48) / pace, y=touch - pressing)
     k.wait(u(*style.place) / pace)
-    k.to(u(0.18, 0.25) / pace, opening=wide)
+    k.held.append((closed, k.now))
+    k.fingers(u(0.18, 0.25) / pace, wide, -way * u(*style.stagger) / 2)
     k.wait(u(*style.dwell))
     k.to(u(0.3, 0.4) / pace, y=max(top, end[1] + block.height / 2) + u(*style.rise))
+
+
+def _rolled(k: Knots, t: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Roll (n,) [rad] of the hand while it carries, rms `size`; none as it grips and lets go."""
+    if not size:
+        return np.zeros_like(t)
+    out, weight = _shake(t, 0.3, 1.2, 1.0, rng), np.zeros_like(t)
+    for begin, end in k.held:
+        rise = np.clip((t - begin - 0.5) / 0.3, 0, 1) * np.clip((end - 0.5 - t) / 0.3, 0, 1)
+        weight = np.maximum(weight, rise)
+    out *= weight
+    there = weight > 0.5
+    return size * out / np.sqrt(np.mean(out[there] ** 2)) if there.any() else 0 * out
 
 
 def _shake(t: np.ndarray, low: float, high: float, rms: float, rng: np.random.Generator) -> np.ndarray:

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from experiments.blind_check.operator import Plan
-from experiments.blind_check.scene import DAMPING, STEP, TIP_MASS, UPRIGHT, Block, World, mjcf
+from experiments.blind_check.scene import DAMPING, STEP, TIP_MASS, Block, World, mjcf
 
-EVERY = 5  # steps a millisecond
+EVERY = round(0.001 / STEP)  # steps a millisecond
 SETTLE = 0.15  # s that the servos stand still before the trial
 FELT = 2e-3  # N, contact
+mujoco.set_mju_user_warning(lambda text: None)  # a line search that gives up tells standard output so
+GAP = 30  # ms: a shock may lift a pad for less
+LIFT = 0.003  # m
+BOUNCE = 300  # ms after a release in which a finger may bounce
 
 
 @dataclass(frozen=True)
 class Motion:
     """A trial's truth, n rows [s, m, m/s, N]: `t`, and x1, y1, x2, y2 of tip position, velocity, force.
 
-    `boundaries`: both touch, leaves, meets, one lets go, for every move; `centres` (n, 2 blocks, 2).
+    `boundaries`: both touch, leaves, meets, one lets go, for every move; `centres` (n, blocks, 2) [m]
+    and `turns` (n, blocks) [rad], counterclockwise.
     """
 
     t: np.ndarray
@@ -28,52 +34,72 @@ class Motion:
     force: np.ndarray
     boundaries: tuple[float, ...]
     centres: np.ndarray
+    turns: np.ndarray
 
 
-def perform(plan: Plan, blocks: dict[str, Block], world: World) -> Motion:
+def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
     """Run a plan. ValueError where a grip never comes about or a block is lost."""
     text = mjcf(blocks, plan.centres, tuple(plan.command[0]), world, plan.servos)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
+    names = list(blocks)
     at = {model.joint(j).name: model.joint(j).qposadr[0] for j in range(model.njnt)}
     fingers = [at[n] for n in ("x1", "z1", "x2", "z2")]
-    pads = np.array([at[n] for n in ("n1", "s1", "n2", "s2")])
-    pads_list = list(pads)
-    cubes = [[at[f"x_{n}"], at[f"z_{n}"]] for n in blocks]
+    pads = [at[n] for n in ("n1", "s1", "n2", "s2")]
+    cubes = [[at[f"x_{n}"], at[f"z_{n}"]] for n in names]
+    turns = [at[f"turn_{n}"] for n in names]
     data.qpos[fingers] = plan.command[0]
-    settle = round(SETTLE / STEP)
-    n = len(plan.command)
-    law = _PadLaw(world)
-    rows = n // EVERY
-    names = list(blocks)
-    supports = {model.geom(f"foot_{b}").id: k for k, b in enumerate(names)}
+    data.qpos[turns] = world.tilt  # what stands on a slope stands inclined
+    command = plan.command[::EVERY]
+    rows, law = len(command), _PadLaw(world)
+    bears = _bearings(model, names)
     q_log, v_log = np.empty((rows, model.nq)), np.empty((rows, model.nv))
-    pad_log, a_log, stands = np.empty((rows, 4)), np.empty((rows, 4)), np.zeros((rows, len(names)), bool)
-    turning = _Turning(model, data, blocks, world) if world.mass_offset else None
-    for k in range(-settle, rows * EVERY):
-        data.ctrl[:4] = plan.command[max(k, 0)]
-        if law.needed:
-            law.push(data.qpos[pads_list])
-            data.qfrc_applied[pads_list] = law.extra
-        if turning is not None:
-            turning.aim()
-        if k >= 0 and k % EVERY == 0:
-            r = k // EVERY
-            q_log[r], v_log[r], pad_log[r] = data.qpos, data.qvel, law.extra
-            for pair in data.contact.geom[: data.ncon]:
-                for geom in pair:
-                    if geom in supports:
-                        stands[r, supports[geom]] = True
+    pad_log, a_log = np.empty((rows, 4)), np.empty((rows, 4))
+    stands = np.zeros((rows, len(names)), bool)
+    for _ in range(round(SETTLE / STEP)):
+        data.ctrl[:] = command[0]
+        law.push(data, pads)
         mujoco.mj_step(model, data)
-        if k >= 0 and k % EVERY == 0:  # the accelerations belong to the state before the step
-            a_log[k // EVERY] = data.qacc[fingers] + data.qacc[pads_list]
-    stiffness = np.array([world.normal_stiffness, world.shear_stiffness] * 2) * (world.exponent == 1.0)
+    for r in range(rows):
+        data.ctrl[:] = command[r]
+        law.push(data, pads)
+        q_log[r], v_log[r], pad_log[r] = data.qpos, data.qvel, law.extra
+        mujoco.mj_step(model, data)
+        # Accelerations and contacts belong to the state before the step.
+        a_log[r] = data.qacc[fingers] + data.qacc[pads]
+        for a, b in data.contact.geom[: data.ncon].tolist():
+            k = bears[a, b]
+            if k >= 0:
+                stands[r, k] = True
+        if law.needed:
+            for _ in range(EVERY - 1):
+                law.push(data, pads)
+                mujoco.mj_step(model, data)
+        else:
+            mujoco.mj_step(model, data, EVERY - 1)
+    stiffness = np.array(world.pads()) * (world.exponent == 1.0)
     force = -q_log[:, pads] * stiffness - v_log[:, pads] * DAMPING + pad_log - TIP_MASS * a_log
     t = np.arange(rows) * STEP * EVERY
     start = np.array([plan.centres[b] for b in names])
     centres = np.stack([q_log[:, c] for c in cubes], 1) + start
-    boundaries = _boundaries(t, force, stands, [names.index(b) for b in plan.moved])
-    return Motion(t, q_log[:, fingers], v_log[:, fingers], force, boundaries, centres)
+    boundaries = _boundaries(t, force, stands, centres, [names.index(b) for b in plan.moved])
+    return Motion(t, q_log[:, fingers], v_log[:, fingers], force, boundaries, centres, q_log[:, turns])
+
+
+def _bearings(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
+    """For two geoms in contact, which block stands on the other there; -1: none does."""
+    out = np.full((model.ngeom, model.ngeom), -1)
+    geoms = {model.geom(i).name: i for i in range(model.ngeom)}
+    for k, name in enumerate(names):
+        for end in (1, 2):
+            for what in ("table", *(f"box_{o}" for o in names if o != name)):
+                out[geoms[f"foot{end}_{name}"], geoms[what]] = k
+                out[geoms[what], geoms[f"foot{end}_{name}"]] = k
+            for other in names:
+                if other != name:
+                    out[geoms[f"top{end}_{other}"], geoms[f"box_{name}"]] = k
+                    out[geoms[f"box_{name}"], geoms[f"top{end}_{other}"]] = k
+    return out
 
 
 class _PadLaw:
@@ -85,14 +111,16 @@ class _PadLaw:
     def __init__(self, world: World) -> None:
         self.world = world
         self.needed = world.creep_ratio > 0 or world.exponent != 1.0
-        self.stiffness = np.array([world.normal_stiffness, world.shear_stiffness] * 2)
+        self.stiffness = np.array(world.pads())
         self.arm, self.before = np.zeros(4), np.zeros(4)
         self.extra = np.zeros(4)
         self.fade = np.exp(-STEP / world.creep_time)
 
-    def push(self, place: np.ndarray) -> None:
-        """Forces on the tips [N] for their displacements `place` (4,) [m]."""
-        out = np.zeros(4)
+    def push(self, data: mujoco.MjData, pads: list[int]) -> None:
+        """Apply the forces on the tips [N] for where they are."""
+        if not self.needed:
+            return
+        place, out = data.qpos[pads], np.zeros(4)
         if self.world.exponent != 1.0:
             scale = self.world.reference / self.stiffness
             out -= self.world.reference * np.sign(place) * (np.abs(place) / scale) ** self.world.exponent
@@ -102,53 +130,40 @@ class _PadLaw:
             self.before = place.copy()
             out += self.arm
         self.extra = out
+        data.qfrc_applied[pads] = out
 
 
-class _Turning:
-    """Blocks whose mass lies beside the middle: carried, they turn until the pads' shear balances it.
+def _boundaries(
+    t: np.ndarray, force: np.ndarray, stands: np.ndarray, centres: np.ndarray, moved: list[int]
+) -> tuple[float, ...]:
+    """Times [s] at which the contacts change, four a move.
 
-    Flat pads keep a block upright against everything else, as in the healthy world, and the hand holds up
-    the heavier side: its fingers stay where they are.
+    A touch that is given up before the block is lifted is no grip: the last one before it counts.
     """
-
-    def __init__(self, model, data, blocks: dict[str, Block], world: World) -> None:
-        self.data, self.smooth = data, np.zeros(len(blocks))
-        self.feet = [model.geom(f"foot_{b}").id for b in blocks]
-        width = np.array([b.width for b in blocks.values()])
-        # The couple +-c of both fingers' shear times half the width on each side is the mass's moment.
-        self.couple = np.array([b.weight for b in blocks.values()]) * world.mass_offset / width
-        yielding = world.shear_stiffness * width**2 / 2
-        self.aims = -self.couple / (world.shear_stiffness * width / 2) * (1 + yielding / UPRIGHT)
-        self.heights = [model.joint(f"z{i}").dofadr[0] for i in (1, 2)]
-
-    def aim(self) -> None:
-        """Set the turn aimed at and the hand's support for what is in the air now."""
-        standing = np.zeros(len(self.feet))
-        for pair in self.data.contact.geom[: self.data.ncon]:
-            for k, foot in enumerate(self.feet):
-                if foot in pair:
-                    standing[k] = 1.0
-        self.smooth += (1 - standing - self.smooth) * STEP / 0.01
-        self.data.ctrl[4:] = self.aims * self.smooth
-        carried = float(self.couple @ self.smooth)
-        self.data.qfrc_applied[self.heights] = -carried, carried
-
-
-def _boundaries(t: np.ndarray, force: np.ndarray, stands: np.ndarray, moved: list[int]) -> tuple[float, ...]:
-    """Times [s] at which the contacts change, four a move."""
-    touching = (force[:, 0] > FELT) & (-force[:, 2] > FELT)
+    touching = _filled((force[:, 0] > FELT) & (-force[:, 2] > FELT))
     out: list[float] = []
     k = 0
     for b in moved:
-        touch = _first(touching, k)
-        leave = _last(stands[:, b], touch, _middle(stands[:, b], touch))
-        meet = _first(stands[:, b], _middle(stands[:, b], touch))
+        middle = _lifted(stands[:, b], touching, centres[:, b, 1], k)
+        leave = _last(stands[:, b], k, middle)
+        touch = _last(~touching, k, leave)
+        meet = _first(stands[:, b], middle)
         part = _first(~touching, meet)
-        if not touching[leave:meet].all():
+        if not touching[touch:part].all():
             raise ValueError("a grip was lost on the way")
         out += [float(t[i]) for i in (touch, leave, meet, part)]
-        k = part + 300  # a finger may bounce as it lets go
+        k = part + BOUNCE
     return tuple(out)
+
+
+def _filled(what: np.ndarray) -> np.ndarray:
+    """Without interruptions shorter than GAP."""
+    out = what.copy()
+    ends = np.flatnonzero(np.diff(np.concatenate([[1], what.astype(int), [1]])))
+    for begin, end in ends.reshape(-1, 2):
+        if end - begin < GAP:
+            out[begin:end] = True
+    return out
 
 
 def _first(what: np.ndarray, start: int) -> int:
@@ -160,14 +175,19 @@ def _first(what: np.ndarray, start: int) -> int:
 
 def _last(what: np.ndarray, start: int, end: int) -> int:
     """The sample after the last true one before `end`."""
-    return start + int(np.flatnonzero(what[start:end])[-1]) + 1
+    found = np.flatnonzero(what[start:end])
+    if not found.size:
+        raise ValueError("a contact never came about")
+    return start + int(found[-1]) + 1
 
 
-def _middle(stands: np.ndarray, start: int) -> int:
-    """A sample within the longest time off the support after `start`."""
-    off = np.flatnonzero(np.diff(np.concatenate([[1], stands[start:].astype(int), [1]])))
-    spans = off.reshape(-1, 2)
-    if not len(spans):
+def _lifted(stands: np.ndarray, touching: np.ndarray, height: np.ndarray, start: int) -> int:
+    """A sample of the flight: held, off the support and above it by more than tremor makes.
+
+    A hand that wanders may lift a gripped block by a hair and set it down again before it carries it.
+    """
+    high = touching & ~stands & (height > height[start] + LIFT)
+    high[:start] = False
+    if not high.any():
         raise ValueError("a block never left its support")
-    begin, end = spans[np.argmax(spans[:, 1] - spans[:, 0])]
-    return start + (int(begin) + int(end)) // 2
+    return int(high.argmax())

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from experiments.blind_check.cases import SUBTASKS
 from experiments.blind_check.sealing import unseal
 from experiments.blind_check.truth import (
     FLOOR,
@@ -172,7 +171,7 @@ def _covered(entry: dict, found: dict) -> dict[str, bool]:
 
 def _cells(entry: dict, found: dict) -> dict[str, Any]:
     """Hits, false and missed cells, and the channels of those missed."""
-    truly = affected_cells(entry, SUBTASKS)
+    truly = affected_cells(entry)
     said = {(w["channel"], w["subtask"]) for w in found["where"]}
     missed = sorted(f"{channel} {subtask}" for channel, subtask in truly - said)
     return {"hit": len(truly & said), "false": len(said - truly), "missed": len(missed), "which": missed}

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import lfilter
 
-from experiments.blind_check.hand import Rig, angles, jacobians, rates, tips
+from experiments.blind_check.hand import Rig, Stretch, angles, jacobians, rates, tips
 from experiments.blind_check.perform import Motion
 
 COLUMNS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
@@ -26,7 +27,7 @@ class Signals:
     motion: Motion
     rig: Rig
     force: np.ndarray
-    stretch: float = 0.0
+    stretch: Stretch = 0.0
     q: np.ndarray | None = None
     dq: np.ndarray | None = None
 
@@ -46,10 +47,16 @@ Stage = Callable[[Signals, np.random.Generator], Signals]
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the readout samples: sd [s] of the true times about the written ones, step [N] of forces."""
+    """How the readout samples: sd [s] of the true times about the written ones (`jitter`), `step` [N] of
+    forces, sizes of angle, velocity and force noise over the stated ones (`noise`), their correlation
+    from sample to sample (`colour`), whether rates are the drive's backward differences of its angles.
+    """
 
     jitter: float = 0.0
     step: float = 0.0
+    noise: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    colour: float = 0.0
+    differences: bool = False
 
 
 def sense(motion: Motion, rig: Rig, stages: Sequence[tuple[int, Stage]], rng: np.random.Generator) -> Signals:
@@ -76,12 +83,22 @@ def sample(
     every = np.concatenate([signals.q, signals.dq, signals.force], 1)
     values = np.stack([np.interp(at, t, c) for c in every.T], 1)
     if noisy:
-        sd = [rig.angle_noise] * 4 + [rig.velocity_noise] * 4 + [rig.force_noise] * 4
-        values = values + noise * sd
+        size = np.repeat(sampling.noise, 4)
+        sd = size * ([rig.angle_noise] * 4 + [rig.velocity_noise] * 4 + [rig.force_noise] * 4)
+        values = values + _coloured(noise, sampling.colour) * sd
+    if sampling.differences:
+        before = np.concatenate([values[:1, :4], values[:-1, :4]])
+        values[:, 4:8] = (values[:, :4] - before) * rig.rate
     if sampling.step:
         values[:, 8:] = sampling.step * np.round(values[:, 8:] / sampling.step)
     order = [0, 1, 4, 5, 8, 9, 2, 3, 6, 7, 10, 11]
     return times, dict(zip(COLUMNS, values[:, order].T, strict=True))
+
+
+def _coloured(white: np.ndarray, keep: float) -> np.ndarray:
+    """White noise (n, c) made a stationary AR(1) of unit size."""
+    drive = np.concatenate([white[:1], np.sqrt(1 - keep**2) * white[1:]])
+    return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=0))
 
 
 def task_space(rig: Rig, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

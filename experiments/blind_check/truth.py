@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from experiments.blind_check.effects import CATALOGUE
+
 FLOOR = 5.0  # nats of held-out log-likelihood
 AFFECTED = 3.0  # standard deviations of a sample
-RATE = 20.0  # Hz
 # What these recordings cannot tell from a withheld effect (gap-effects.md; * only without actual.toml).
 PARTNERS = {
     "force_gain": ("fingertip_compliance*",),
@@ -19,7 +20,7 @@ PARTNERS = {
 
 def label(entry: dict[str, Any]) -> str:
     """The probability's name that ought to be large."""
-    if entry["tier"] == "healthy":
+    if entry["tier"] in ("healthy", "slight"):
         return "none"
     if entry["tier"] in ("outside", "withheld"):
         return "unknown"
@@ -33,13 +34,13 @@ def partners(entry: dict[str, Any]) -> set[str]:
     return {p.rstrip("*") for p in given if not (p.endswith("*") and entry["measured"])}
 
 
-def affected_cells(entry: dict[str, Any], subtasks: tuple[str, ...]) -> set[tuple[str, str]]:
+def affected_cells(entry: dict[str, Any]) -> set[tuple[str, str]]:
     """Cells (channel, subtask) whose mean shift, over the trials, is at least AFFECTED sd of a sample."""
     out = set()
     for channel in entry["shift"][0]:
         rows = np.array([trial[channel] for trial in entry["shift"]])  # (trials, subtasks)
         size = np.sqrt((rows**2).mean(0))
-        out |= {(channel, s) for s, z in zip(subtasks, size, strict=True) if z >= AFFECTED}
+        out |= {(channel, s) for s, z in zip(entry["subtasks"], size, strict=True) if z >= AFFECTED}
     return out
 
 
@@ -47,9 +48,12 @@ def true_parameters(entry: dict[str, Any]) -> dict[str, float]:
     """True values by the names that a diagnosis uses: prefixed by the effect where there are two."""
     out = {}
     for name, values in entry["effects"].items():
+        if not CATALOGUE[name].scored:
+            continue
         prefix = "" if len(entry["effects"]) == 1 else f"{name}."
         for key, value in values.items():
             if name == "structural_vibration" and key == "frequency":
-                value = abs(value - RATE * round(value / RATE))  # known modulo aliases
+                rate = entry["world"]["rate"]
+                value = abs(value - rate * round(value / rate))  # known modulo aliases
             out[prefix + key] = value
     return out
