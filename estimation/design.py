@@ -140,7 +140,7 @@ def build(
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
     free_mean, free_variance = _free(aligned, noise)
     surprise = unexpected_bias(free_mean, free_variance, rig)
-    deviations = nuisances(rig, surprise)
+    deviations = nuisances(rig, surprise, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}
     shifts = np.zeros((*there.shape, len(deviations)))
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))

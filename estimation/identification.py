@@ -162,6 +162,10 @@ def identify_aligned(
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(trials, weighed, noise, aligned.task, rig)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
+    hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
+    if "friction" in hidden:
+        friction = {obj: FrictionPosterior(None, reason=hidden["friction"], ground=f.ground)
+                    for obj, f in friction.items()}  # fmt: skip
     warnings, notes = _misfits(aligned), []
     sampled, predictive = None, None
     reasons = _reasons(aligned, design, friction)

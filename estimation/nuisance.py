@@ -63,8 +63,17 @@ def _stiffer_pad(finger: int):
     return read
 
 
-def nuisances(rig: Rig, biased: np.ndarray) -> tuple[Nuisance, ...]:
-    """The deviations that the rig admits; `biased` (4,): extra prior sd of each force bias [N]."""
+def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
+    """Fingers that touch a block when they are `size` further apart than their distance says."""
+    signals = task_space(trial, rig)
+    return replace(signals, x1=signals.x1 - size / 2, x2=signals.x2 + size / 2)
+
+
+def nuisances(rig: Rig, biased: np.ndarray, touch_sd: float = 0.0) -> tuple[Nuisance, ...]:
+    """The deviations that the rig admits; `biased` (4,): extra prior sd of each force bias [N].
+
+    `touch_sd` [m]: how well the distance is known at which the fingers touch a block.
+    """
     s, out = rig.systematic, []
     for i, name in enumerate(FORCE_CHANNELS):
         sd = float(np.hypot(s.force_bias[i], biased[i]))
@@ -87,4 +96,6 @@ def nuisances(rig: Rig, biased: np.ndarray) -> tuple[Nuisance, ...]:
         if s.pad_stiffness[finger - 1] > 0 and np.isfinite(rig.fingertip.normal_stiffness):
             out.append(Nuisance(f"pad_stiffness.{finger}", s.pad_stiffness[finger - 1], 1e-3,
                                 _stiffer_pad(finger)))  # fmt: skip
+    if touch_sd > 0:
+        out.append(Nuisance("touch", touch_sd, 1e-5, _wider))
     return tuple(out)

@@ -30,6 +30,7 @@ CHANNELS = ("force", "distance", "rise")
 MAX_RATE = 50.0  # Hz; noise of finer samples is averaged before it is weighed
 NUM_ALIGNMENTS = 16
 MIN_STRETCH = 0.5
+LEAST = 1e-8  # m or N: noise of a sample is no less, which keeps rounding out of the posterior
 MIN_FREE = 8  # samples of free motion that tell the scale of the forces there
 
 
@@ -221,7 +222,8 @@ def _noise(pooled: dict[str, list], scales: dict[str, float]) -> Noise:
         # One location a grip was fitted: correct for the lost degrees of freedom.
         lost = psi.size / max(psi.size - len(pairs), 1)
         stretch = autocorrelation_time([w * r for r, w in pairs])
-        variance[key] = float(np.mean(psi**2) / slope**2 * lost * stretch)
+        found = float(np.mean(psi**2) / slope**2 * lost * stretch)
+        variance[key] = max(found, LEAST**2)
         count[key] = float(max(psi.size - len(pairs), 1) / stretch)
     return Noise(variance, count)
 

@@ -189,6 +189,8 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
     for trial in found:
         for warning in trial.warnings:
             out.warn(warning)
+        for note in trial.notes:
+            out.print(note)
     return found
 
 

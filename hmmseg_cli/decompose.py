@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
 from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, TaskArgument
 
+RigFile = Annotated[Path | None, typer.Option(
+    "--rig", metavar="R", help="The hand: what it cannot reveal is left out, with the reason.")]  # fmt: skip
 
-def decompose(task: TaskArgument, json: JsonOption = None, seed: SeedOption = 0,
+
+def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, seed: SeedOption = 0,
               quiet: QuietOption = False) -> None:  # fmt: skip
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task
@@ -15,6 +23,11 @@ def decompose(task: TaskArgument, json: JsonOption = None, seed: SeedOption = 0,
 
     with Output("decompose", json=json, seed=seed, quiet=quiet) as out:
         found = decompose_task(read_task(task))
+        if rig is not None:
+            from hmmseg.contact.hands import revealed_by
+            from hmmseg.io.rig import read_rig
+
+            found = revealed_by(found, read_rig(rig))
         out.print(decomposition_table(found), equation(found))
         for note in (*found.notes, *(f"{key}: {reason}" for key, reason in reasons(found).items())):
             out.print(note)

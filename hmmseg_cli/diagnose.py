@@ -111,7 +111,11 @@ def diagnose(
             raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
         from hmmseg.io.rig import read_rig
 
-        out.finish(run(out, paths, description, read_rig(rig), actual, effect or [], calibrate))
+        hand = read_rig(rig)
+        if hand.gripper is not None:
+            problem = "a wrist sensor does not feel each finger, which the effects act on"
+            raise InputError(f"{rig}: [gripper]", problem, "a hand with forces at both fingertips")
+        out.finish(run(out, paths, description, hand, actual, effect or [], calibrate))
 
 
 def run(

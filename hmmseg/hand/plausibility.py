@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hmmseg.errors import InputError
+from hmmseg.hand.gripper_signs import check_gripper
 from hmmseg.hand.signs import check_signs
+from hmmseg.hand.wrist import halved
 from hmmseg.io.plausibility import Finding, check_angles, check_clock, check_lengths, check_velocities
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
@@ -17,7 +19,12 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
     Units come first: what moves 120 m has no sides.
     """
     out: list[Finding] = []
-    for look in (check_clock, check_lengths, check_angles, check_velocities, check_signs):
+    looks = [check_clock, check_lengths, check_angles, check_velocities, check_signs]
+    if halved(trial):
+        looks.remove(check_signs)  # a wrist's force has no sides
+    if rig.gripper is not None:
+        looks = [check_clock, check_gripper]
+    for look in looks:
         for finding in look(trial, rig):
             mapped = "topics" if any(name in rig.topics for name in finding.changes) else "columns"
             out.append(replace(finding, table=mapped))

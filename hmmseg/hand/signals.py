@@ -40,6 +40,7 @@ class Signals:
     sd_vx: np.ndarray
     sd_vy: np.ndarray
     sd_force: float
+    touches: tuple[tuple[float, float], ...] = ()  # times of touch and release known apart, and sds [s]
 
     @property
     def x(self) -> np.ndarray:
@@ -124,7 +125,7 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
                 variances[f"v{axis}"] += variance / 2
     sds = {f"sd_{name}": np.sqrt(variance) for name, variance in variances.items()}
     force = np.nan if noise.force is None else noise.force
-    return Signals(t=trial.t, **out, **sds, sd_force=force)  # type: ignore[arg-type]
+    return Signals(t=trial.t, **out, **sds, sd_force=force, touches=trial.touches)  # type: ignore[arg-type]
 
 
 def _square(sd: float | None) -> float:

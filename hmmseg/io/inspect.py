@@ -11,6 +11,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.formats import parts_of, read_table
 from hmmseg.io.propose import as_toml, mended, propose
+from hmmseg.io.propose_gripper import propose_gripper
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.units import unit_in_name
@@ -62,6 +63,9 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
     entries, said = mended(table, entries, rig)
+    toml = as_toml(entries, table) if entries else ""
+    if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
+        toml = propose_gripper(table, entries) or toml
     t, origin = _clock(table, entries, rig)
     channels = tuple(_channel(table, name, t) for name in table.names if name in table.columns)
     gaps: list[tuple[float, float]] = []
@@ -74,7 +78,7 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     return Inspection(
         str(path), tuple(parts), int(table.rows.size), None if t is None or not t.size else float(t[0]),
         None if t is None or not t.size else float(t[-1]), rate, origin, tuple(gaps), channels, entries,
-        as_toml(entries, table) if entries else "", tuple(said),
+        toml, tuple(said),
     )  # fmt: skip
 
 

@@ -97,7 +97,7 @@ def _clock(names: Sequence[str]) -> dict[str, str]:
         return {}
     for wanted in TIME:
         for name in names:
-            if re.sub(r"[\[(].*", "", name).strip().lower() == wanted or _words(name)[:1] == [wanted]:
+            if re.sub(r"[\[(].*", "", name).strip().lower() == wanted or words(name)[:1] == [wanted]:
                 return {"t": name}
     return {}
 
@@ -106,7 +106,7 @@ def _matched(names: Sequence[str]) -> dict[str, str]:
     """The first column that fits each of our channels; z is up where a finger has no y."""
     found: dict[str, str] = {}
     for name in names:
-        channel = _channel(_words(name))
+        channel = _channel(words(name))
         if channel is not None:
             found.setdefault(channel, name)
     out = {name: source for name, source in found.items() if "z" not in name}
@@ -134,7 +134,7 @@ def _channel(words: list[str]) -> str | None:
     return f"{'' if quantity == 'p' else quantity}{axis}{finger}"
 
 
-def _words(name: str) -> list[str]:
+def words(name: str) -> list[str]:
     """Words of a name: `finger_left_x_mm` and `LeftForceX1` taken apart, its unit left out."""
     name = re.sub(r"[\[(]\s*[^\d\])][^\])]*[\])]", "", name)
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)

@@ -30,7 +30,10 @@ class Trial:
     """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
 
     `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
-    channels of a log, the samples that lie between two messages; `warnings` say what is unlikely.
+    channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
+    `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
+    reason. `touch_sd` [m]: how well the distance is known at which the fingers touch a block, beside noise;
+    `touches` [s]: times of touch and release known apart from forces, with their standard deviations.
     """
 
     file: str
@@ -39,6 +42,10 @@ class Trial:
     origin: int | None = None
     interpolated: dict[str, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    hidden: dict[str, str] = field(default_factory=dict)
+    touch_sd: float = 0.0
+    touches: tuple[tuple[float, float], ...] = ()
 
     @staticmethod
     def read(source: Any, rig: Any = None, task: Any = None) -> Trial:
@@ -87,11 +94,17 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     read = read_table if isinstance(source, str | Path) else frame_table
     table = read(source, theirs)
     trial = trial_of(table, rig, task)
-    if task is not None or rig is None or rig.gripper is not None:
+    if task is not None or rig is None:
         return trial
     from hmmseg.hand.plausibility import check  # which reads trials itself
+    from hmmseg.hand.wrist import from_halves, halved, two_fingers
 
-    return replace(trial, warnings=check(trial, rig))
+    warnings = check(trial, rig)
+    if rig.gripper is not None:
+        trial = two_fingers(trial, rig)
+    elif halved(trial):
+        trial = from_halves(trial, rig)
+    return replace(trial, warnings=warnings)
 
 
 def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:

@@ -13,7 +13,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
-from hmmseg.segmentation.boundaries import BoundaryPosterior, combine
+from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
 from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
 from hmmseg.segmentation.crossings import NEAREST, Contacts, contacts
 from hmmseg.segmentation.emissions import Features
@@ -26,6 +26,7 @@ from hmmseg.segmentation.tables import trials_table
 from hmmseg.tables import as_html, as_text
 
 INTERVAL = (0.05, 0.95)
+NEARBY = 0.15  # s; a touch known apart from forces this near a boundary is that boundary
 
 
 @dataclass(frozen=True)
@@ -255,8 +256,20 @@ def boundary_posteriors(
             density = _density(table, steps[k], steps[k + 1], int(n), held)
             if density is not None:
                 densities[int(n)] = density
-        out.append(combine(signals.t, probability, densities))
+        found = combine(signals.t, probability, densities)
+        if FREE in (steps[k].state, steps[k + 1].state):
+            found = _known(signals, found)
+        out.append(found)
     return tuple(out)
+
+
+def _known(signals: Signals, found: BoundaryPosterior) -> BoundaryPosterior:
+    """The touch or release that is known apart from forces where there is one nearby, else as it is."""
+    middle = found.quantile(0.5)
+    for time, sd in sorted(signals.touches, key=lambda touch: abs(touch[0] - middle))[:1]:
+        if abs(time - middle) < max(NEARBY, 3 * sd, 3 * found.sd):
+            return normal(time, sd)
+    return found
 
 
 def _density(table: Contacts, before: Subtask, after: Subtask, n: int, held: slice) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 POINTS = 41  # nodes per sample interval
 BEND = 0.015  # bend that the cubic misses, as a share of interval x change of velocity
@@ -81,6 +81,12 @@ class BoundaryPosterior:
     def sd(self) -> float:
         """Posterior standard deviation [s]."""
         return float(np.sqrt(self.probabilities @ (self.times - self.mean) ** 2))
+
+
+def normal(mean: float, sd: float) -> BoundaryPosterior:
+    """A boundary at a normally distributed time [s]."""
+    shares = (np.arange(POINTS) + 0.5) / POINTS
+    return BoundaryPosterior(mean + sd * ndtri(shares), np.full(POINTS, 1 / POINTS))
 
 
 def crossing_density(crossings: list[Crossing], width: float) -> np.ndarray:

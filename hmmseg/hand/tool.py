@@ -1,0 +1,209 @@
+"""The tool that hangs on a wrist sensor, and what it does to the world once its own share is taken out.
+
+With F what the sensor reads, R the turn from the tool's axes to the world's, a and v the acceleration and
+velocity of the tool, g gravity and f what the tool does to its environment, in its axes,
+
+    F = b + Q (m_a R^T a - m R^T g + d R^T v + f),
+
+b the sensor's offset, m the tool's mass, d the drag of cables and hoses, and Q the axes of the sensor, with
+det Q = -1 where it reads the reaction. m_a is m for a rigid tool; gears that spin with the arm make it
+appear larger, so it is found apart. In free motion f = 0, so all of them follow from how F goes with the
+motion (robust least squares; Q by Kabsch's 1976 solution of the orthogonal Procrustes problem). An arm
+that never turns its hand tells b only together with the tool's weight, which does not matter: it is the same
+throughout.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.errors import InputError
+from hmmseg.hand.pose import Pose, bridged, smooth
+from hmmseg.io.gripper import Gripper, direction
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+
+ROUNDS = 20
+TAIL = 4.0  # degrees of freedom of the Student-t weights, as in the emissions
+CLEAR = 5.0  # standard errors at which a parameter shows in free motion
+TURNED = 0.02  # rad, root mean square: a hand that turns less tells nothing of its weight and centre
+SAMPLES = 20  # of free motion, at least
+
+
+@dataclass(frozen=True)
+class Tool:
+    """What free motion tells of the tool: `axes` Q (3, 3), `offset` and `drift` (3,) [N, N/s].
+
+    `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
+    [N s/m]; `noise` [N]: scale of one component of F in free motion about the model;
+    `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns tell it.
+    """
+
+    axes: np.ndarray
+    mass: float
+    weighed: bool
+    inertia: float
+    drag: float
+    offset: np.ndarray
+    drift: np.ndarray
+    noise: float
+    centre_of_mass: np.ndarray | None = None
+
+
+def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
+    """Forces (num_timesteps, 3) as the sensor reads them [N], NaN where missing."""
+    return np.stack([trial.channels[name] for name in gripper.wrench[:3]], axis=1)
+
+
+def _in_tool(pose: Pose, gripper: Gripper, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (num_timesteps, 3) of the world in the axes that the wrench is given in or turns with."""
+    if gripper.frame == "world":
+        return vectors
+    return np.einsum("tji,tj->ti", pose.turned, vectors)
+
+
+def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
+    """Acceleration, minus gravity and velocity (3, num_timesteps, 3) in those axes."""
+    weight = np.broadcast_to(gravity * pose.up, pose.acceleration.shape)
+    return np.stack([_in_tool(pose, gripper, v) for v in (pose.acceleration, weight, pose.velocity)])
+
+
+def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
+    """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
+    gripper = rig.gripper
+    assert gripper is not None
+    where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
+    if free.sum() < SAMPLES:
+        raise InputError(where, "show no free motion to find the tool's own share from",
+                         "samples before the first grip and after the last")  # fmt: skip
+    force = np.stack([bridged(trial.t, c) for c in wrench_of(trial, gripper).T], axis=1)
+    force, terms = (
+        smooth(trial.t, force, window=pose.window)[free],
+        _terms(pose, gripper, rig.gravity)[:, free],
+    )
+    time = trial.t[free] - trial.t.mean()
+    turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
+    # Smoothed samples within one window go together.
+    together = max(1.0, pose.window / float(np.median(np.diff(trial.t))))
+    weights = np.ones(len(force))
+    for _ in range(ROUNDS):
+        axes = _axes(gripper, weights, force, terms[0] + terms[1])
+        fitted = _regressed(weights, force @ axes, terms, time, turns, gripper.tool_mass)
+        residual = fitted.residual
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        weights = (TAIL + 3) / (TAIL + ((residual / scale) ** 2).sum(axis=1))
+    error = scale * np.sqrt(together) * fitted.errors
+    _check(where, gripper, fitted.inertia, float(error[0]), rig.gravity, fitted.offset, scale)
+    mass = fitted.mass if fitted.mass is not None else fitted.inertia
+    centre = _centre_of_mass(trial, gripper, axes, mass, free, terms[0] + terms[1])
+    offset, drift = axes @ fitted.offset, axes @ fitted.drift
+    return Tool(
+        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, offset, drift, scale, centre
+    )
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """`mass` None where it goes into the offset; `errors` of inertia, drag for unit noise."""
+
+    inertia: float
+    mass: float | None
+    drag: float
+    offset: np.ndarray
+    drift: np.ndarray
+    residual: np.ndarray
+    errors: np.ndarray
+
+
+def _regressed(weights: np.ndarray, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool,
+               given: float | None) -> _Fitted:  # fmt: skip
+    """Least squares of F in the tool's axes (n, 3) on the terms; what is not there is left out."""
+    n = len(force)
+    constant = np.broadcast_to(np.eye(3), (n, 3, 3))  # row, axis, parameter
+    columns = [terms[0][:, :, None], terms[2][:, :, None], constant, constant * time[:, None, None]]
+    left = force if given is None else force - given * terms[1]
+    if turns and given is None:
+        columns.insert(2, terms[1][:, :, None])
+    rows = np.concatenate(columns, axis=2)
+    root = np.sqrt(weights)[:, None]
+    flat = (rows * root[:, :, None]).reshape(3 * n, -1)
+    found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
+    information = flat.T @ flat
+    errors = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-9)))[:2]
+    mass = given if given is not None else float(found[2]) if turns else None
+    residual = left - rows @ found
+    return _Fitted(float(found[0]), mass, float(found[1]), found[-6:-3], found[-3:], residual, errors)
+
+
+def _spread(vectors: np.ndarray) -> float:
+    """Root mean square distance of vectors (n, 3) from their mean."""
+    return float(np.sqrt(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.ndarray) -> np.ndarray:
+    """Q (3, 3) as the rig has it, else as the reading goes with the specific force."""
+    total = weights.sum()
+    f, v = force - weights @ force / total, felt - weights @ felt / total
+    together = (weights[:, None] * f).T @ v
+    if gripper.sensor_axes is not None or gripper.frame != "sensor":
+        stated = np.eye(3)
+        if gripper.sensor_axes is not None and gripper.frame == "sensor":
+            stated = np.stack([direction(axis) for axis in gripper.sensor_axes])
+        against = gripper.reaction
+        if against is None:
+            against = float(np.trace(stated.T @ together)) < 0
+        return -stated if against else stated
+    left, size, right = np.linalg.svd(together)
+    flip = np.ones(3)
+    if gripper.reaction is not None or size[2] < 1e-3 * size[0]:
+        flip[2] = (-1.0 if gripper.reaction else 1.0) * np.linalg.det(left @ right)
+    return (left * flip) @ right
+
+
+def _check(where: str, gripper: Gripper, inertia: float, error: float, gravity: float, offset: np.ndarray,
+           scale: float) -> None:  # fmt: skip
+    """InputError where free motion contradicts what the rig says, or cannot tell what it leaves open."""
+    if inertia < -CLEAR * error and gripper.reaction is not None:
+        problem = "go against the hand's own acceleration in free motion: the sign is the other way round"
+        raise InputError(where, problem, f"reaction = {str(not gripper.reaction).lower()} under [gripper]")
+    left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
+    if (left_open or gripper.reaction is None) and abs(inertia) < CLEAR * error:
+        problem = "do not show the hand's own mass in free motion, so nothing tells how the sensor stands"
+        raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
+                         "under [gripper], as they are mounted")  # fmt: skip
+
+
+def _centre_of_mass(trial: Trial, gripper: Gripper, axes: np.ndarray, mass: float, free: np.ndarray,
+                    felt: np.ndarray) -> np.ndarray | None:  # fmt: skip
+    """Where the tool's mass sits, from how torques go with its specific force as the hand turns."""
+    if gripper.centre_of_mass is not None:
+        return np.asarray(gripper.centre_of_mass)
+    if len(gripper.wrench) < 6 or gripper.frame == "world":
+        return None
+    if not gripper.turns or _spread(felt / np.linalg.norm(felt, axis=1, keepdims=True)) < TURNED:
+        return None
+    torque = np.stack([bridged(trial.t, trial.channels[name]) for name in gripper.wrench[3:]], axis=1)
+    torque = smooth(trial.t, torque)[free] @ axes * np.linalg.det(axes)  # an axial vector in the tool's axes
+    arm = mass * felt
+    # torque = c x arm + offset: linear in c
+    cross = np.zeros((len(arm), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = arm[:, 2], -arm[:, 1], arm[:, 0]
+    cross -= np.swapaxes(cross, 1, 2)
+    rows = (cross - cross.mean(axis=0)).reshape(-1, 3)
+    found, *_ = np.linalg.lstsq(rows, (torque - torque.mean(axis=0)).reshape(-1), rcond=1e-3)
+    return found
+
+
+def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
+    """What the tool does to its environment (num_timesteps, 3), in the world's axes [N]."""
+    gripper = rig.gripper
+    assert gripper is not None
+    reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - trial.t.mean())[:, None]
+    moved, hung, dragged = _terms(pose, gripper, rig.gravity)
+    own = tool.inertia * moved + tool.drag * dragged
+    if tool.weighed:
+        own = own + tool.mass * hung
+    force = reading @ tool.axes - own
+    return force if gripper.frame == "world" else np.einsum("tij,tj->ti", pose.turned, force)

@@ -1,0 +1,256 @@
+"""A gripper with a sensor in its wrist as the two fingers that the contact equations know.
+
+The wrist feels the sum of what both fingers do; each finger's half of it stands in the channels. What
+they press against each other with does not reach the wrist. Where no grip force is recorded, the
+pads' own spring tells it: their squeeze is the opening at which they touched less the one they are
+held at (`hmmseg.hand.opening`). That says when something is held, and where the touch lies within what
+the slowing of the closing leaves open, but is no measured force: friction is not bounded by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hmmseg.hand.gripper_signs import counts_closing, lifts_pull
+from hmmseg.hand.opening import Grip, closings, grip_of
+from hmmseg.hand.pose import Pose, bridged, pose_of, smooth
+from hmmseg.hand.tool import Tool, applied_force, free_tool
+from hmmseg.io.gripper import Gripper, direction
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+
+ACTIVE = 8.0  # noise scales above which the wrist feels something: chosen
+RAISED = 3e-3  # m from where it gripped: the hand has gone somewhere
+TOGETHER = 5  # samples within one smoothing window
+LOADED = 5.0  # standard errors at which a grip carries a load
+LAG = 0.012  # s; pads touch and let go off the opening's width by this, chosen: they are no ideal springs
+CLIPPED = 2.0  # noise scales
+STRAY, STRAY_TIME = 0.3, 0.1  # N, s: a touch in free motion that is told, chosen
+NOMINAL = 1.0  # N; stands for a grip of rigid pads whose force nobody measured: any will do
+HIDDEN_GRIP = (
+    "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
+    "[gripper] would tell"
+)
+
+
+HALVES = (
+    "columns fx1, fx2 and fy1, fy2 are the same in every sample, half of a wrist's force each: the grip is "
+    "read from the fingers' distance instead"
+)
+
+
+def halved(trial: Trial) -> bool:
+    """Whether the fingers' forces are halves of one wrist sensor's: no two fingertips feel the same."""
+    pairs = [("fx1", "fx2"), ("fy1", "fy2")]
+    if not all(name in trial.channels for pair in pairs for name in pair):
+        return False
+    same = [np.array_equal(trial.channels[a], trial.channels[b], equal_nan=True) for a, b in pairs]
+    return all(same) and any(np.ptp(trial.channels[a][np.isfinite(trial.channels[a])]) > 0 for a, _ in pairs)
+
+
+def from_halves(trial: Trial, rig: Rig) -> Trial:
+    """A trial whose fingers' forces are halves of a wrist's, as such a gripper's."""
+    c = trial.channels
+    channels = {
+        "x": (c["x1"] + c["x2"]) / 2, "z": (c["y1"] + c["y2"]) / 2, "opening": c["x2"] - c["x1"],
+        "fx": c["fx1"] + c["fx2"], "fy": np.zeros(trial.t.size), "fz": c["fy1"] + c["fy2"],
+    }  # fmt: skip
+    gripper = Gripper(position={"x": "x", "z": "z"}, closing="x", frame="world", reaction=False)
+    found = two_fingers(replace(trial, channels=channels), rig.model_copy(update={"gripper": gripper}))
+    return replace(found, notes=(f"{trial.file}: {HALVES}", *found.notes))
+
+
+def two_fingers(trial: Trial, rig: Rig) -> Trial:
+    """The trial with the channels of a Cartesian two-finger hand; InputError for what cannot be.
+
+    `touch_sd` of the result [m]: how well the openings at which the pads touch are known.
+    """
+    gripper = rig.gripper
+    assert gripper is not None
+    pose = pose_of(trial, gripper)
+    opening = np.sum([bridged(trial.t, trial.channels[name]) for name in gripper.opening], axis=0)
+    held = closings(trial.t, opening)
+    free = _surely_free(opening, held)
+    tool = free_tool(trial, rig, pose, free)
+    force = applied_force(trial, rig, pose, tool)
+    active = np.linalg.norm(np.nan_to_num(force), axis=1) > ACTIVE * tool.noise
+    pressing = _grip_force(trial, gripper)
+    grips = []
+    for closing in held:
+        give = _give(rig, pressing, opening, closing)
+        grip = grip_of(trial.t, opening, active, closing, give)
+        if grip is not None:
+            grips.append(grip)
+    loads = [_load(grip, pose, force, tool) for grip in grips]
+    loaded = [grip for grip, load in zip(grips, loads, strict=True) if load is None or load != 0]
+    lifts = [load for load in loads if load]
+    if lifts and max(lifts) < 0:
+        raise lifts_pull(trial, rig, min(lifts))
+    if grips and not loaded and _carries(-opening, trial, pose, force, tool):
+        raise counts_closing(trial, rig)
+    return _as_fingers(trial, rig, pose, tool, opening, force, loaded or grips, pressing)
+
+
+def _carries(opening: np.ndarray, trial: Trial, pose: Pose, force: np.ndarray, tool: Tool) -> bool:
+    """Whether something is lifted in some closing of this opening."""
+    nothing = np.zeros(opening.size, bool)
+    grips = [grip_of(trial.t, opening, nothing, each, 0.0) for each in closings(trial.t, opening)]
+    return any((_load(grip, pose, force, tool) or 0) > 0 for grip in grips if grip is not None)
+
+
+def _surely_free(opening: np.ndarray, held: list[tuple[int, int, int]]) -> np.ndarray:
+    """Samples outside of everything that may be a grip: more open than halfway back."""
+    free = np.ones(opening.size, bool)
+    for begun, least, opened in held:
+        top = min(opening[begun], opening[opened]) if opened > least else opening[begun]
+        inside = np.arange(begun, opened + 1)
+        free[inside[opening[inside] < opening[least] + 0.5 * (top - opening[least])]] = False
+    return free
+
+
+def _grip_force(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
+    """What each pad presses with [N]: samples, or a number while it grips; None where nothing tells."""
+    if isinstance(gripper.grip_force, str):
+        return np.abs(trial.channels[gripper.grip_force])
+    if gripper.grip_force is not None:
+        return float(gripper.grip_force)
+    if gripper.motor_current is not None and gripper.force_per_ampere is not None:
+        return np.abs(trial.channels[gripper.motor_current]) * gripper.force_per_ampere
+    return None
+
+
+def _give(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, closing: tuple[int, int, int]
+          ) -> float | None:  # fmt: skip
+    """What both pads give while held [m]; None where the force is not known."""
+    if pressing is None:
+        return None
+    if not isinstance(pressing, np.ndarray):
+        force = pressing
+    else:
+        begun, least, opened = closing
+        inside = slice(begun, opened + 1)
+        low = opening[inside] <= opening[least] + 0.1 * (opening[begun] - opening[least])
+        force = float(np.nanmedian(pressing[inside][low]))
+    return 2 * force / rig.fingertip.normal_stiffness if np.isfinite(force) else None
+
+
+def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
+    """What the hand carries while raised, or pushes while it moves along [N]: 0 where it is nothing.
+
+    None where it never goes anywhere, which leaves nothing to judge by.
+    """
+    inside = slice(grip.start, grip.stop)
+    height = pose.position[inside] @ pose.up
+    raised = height - max(height[0], height[-1]) > RAISED
+    lifted = raised.sum() > 3
+    moved = (
+        raised
+        if lifted
+        else np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > RAISED
+    )
+    load = force[inside][moved] @ (pose.up if lifted else pose.across)
+    load = load[np.isfinite(load)]
+    if load.size < 4:
+        return None
+    scatter = max(1.4826 * float(np.median(np.abs(load - np.median(load)))), tool.noise)
+    found = float(np.median(load))
+    if abs(found) <= LOADED * scatter / np.sqrt(load.size / TOGETHER):
+        return 0.0
+    return found if lifted else abs(found)
+
+
+def _as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,
+                grips: list[Grip], pressing: np.ndarray | float | None) -> Trial:  # fmt: skip
+    t = trial.t
+    x, y = pose.position @ pose.across, pose.position @ pose.up
+    velocity = smooth(t, pose.position, deriv=1)
+    fx, fy = force @ pose.across, force @ pose.up
+    free = np.ones(t.size, bool)
+    for each in grips:
+        free[max(each.start - 1, 0) : each.stop + 1] = False
+    strays = _strays(trial, free, np.hypot(fx, fy), tool)
+    for felt in (fx, fy):  # nothing is held there, whatever the wrist feels
+        felt[free] = np.clip(felt[free], -CLIPPED * tool.noise, CLIPPED * tool.noise)
+    grip = np.zeros(t.size)
+    shown = opening.copy()
+    rigid = not np.isfinite(rig.fingertip.normal_stiffness)
+    for each in grips:
+        inside = slice(each.start, each.stop)
+        squeeze = np.maximum(each.width - opening[inside], 0.0)
+        if isinstance(pressing, np.ndarray):
+            grip[inside] = np.nan_to_num(pressing[inside])
+        elif rigid:
+            size = pressing if pressing is not None else NOMINAL
+            whole = max(each.width - each.held, 1e-9)
+            grip[inside] = size * (np.clip(squeeze / whole, 0.05, 1.0) if whole > 1e-6 else 1.0)
+        else:
+            grip[inside] = squeeze * rig.fingertip.normal_stiffness / 2
+        if rigid:  # what gives is not the pads, and what is held has one width
+            shown[inside] = np.maximum(shown[inside], each.width)
+    closing = smooth(t, shown, deriv=1) / 2
+    channels = {
+        "x1": x - shown / 2, "y1": y, "vx1": velocity @ pose.across - closing, "vy1": velocity @ pose.up,
+        "fx1": fx / 2 + grip, "fy1": fy / 2,
+        "x2": x + shown / 2, "y2": y, "vx2": velocity @ pose.across + closing, "vy2": velocity @ pose.up,
+        "fx2": fx / 2 - grip, "fy2": fy / 2,
+    }  # fmt: skip
+    if pressing is not None and not isinstance(pressing, float):
+        missing = ~np.isfinite(pressing)
+        for name in ("fx1", "fx2"):
+            channels[name] = np.where(missing, np.nan, channels[name])
+    sds = [each.width_sd for each in grips]
+    touch_sd = float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
+    touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
+    return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches,
+                   notes=(*_notes(trial, rig, tool), *strays),
+                   hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip
+
+
+def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:
+    """Where the wrist feels something for a while though the opening says that nothing is held."""
+    t, out = trial.t, []
+    active = free & (np.nan_to_num(felt) > max(2 * ACTIVE * tool.noise, STRAY))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
+    for start, stop in edges.reshape(-1, 2):
+        if t[stop - 1] - t[start] > STRAY_TIME:
+            most = float(np.nanmax(felt[start:stop]))
+            when = f"from {t[start]:.2f} to {t[stop - 1]:.2f} s, with up to {most:.2g} N"
+            out.append(f"{trial.file}: the hand touches something {when}, though it holds nothing")
+    return out
+
+
+def _touches(t: np.ndarray, opening: np.ndarray, grip: Grip) -> list[tuple[float, float]]:
+    """When the opening passes the width, closing and opening again, and how uncertain that is [s]."""
+    found = []
+    for i in (grip.start, grip.stop):
+        if not 0 < i < t.size:
+            continue
+        before, after = opening[i - 1] - grip.width, opening[i] - grip.width
+        if before * after > 0:
+            continue
+        period = float(t[i] - t[i - 1])
+        share = before / (before - after) if before != after else 0.5
+        speed = max(abs(after - before) / period, 1e-3)
+        # Linear between samples, of which the contact bends the way: uniform over half of them.
+        sd = float(np.sqrt((grip.width_sd / speed) ** 2 + period**2 / 48 + LAG**2))
+        found.append((float(t[i - 1] + share * period), sd))
+    return found
+
+
+def _notes(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
+    """What was found of the tool, for the reader."""
+    gripper = rig.gripper
+    assert gripper is not None
+    if gripper.tool_mass is not None and gripper.sensor_axes is not None and gripper.reaction is not None:
+        return ()
+    mass = "as given" if gripper.tool_mass else "from free motion"
+    told = f"{trial.file}: tool of {tool.mass:.3g} kg on the sensor ({mass})"
+    if gripper.sensor_axes is None and gripper.frame == "sensor":
+        up = tool.axes @ direction(gripper.up)
+        names = gripper.wrench[:3]
+        largest = int(np.argmax(np.abs(up)))
+        sign = "-" if up[largest] < 0 else ""
+        told += f"; a load that hangs on it shows in {sign}{names[largest]}"
+    return (told,)

@@ -1,0 +1,219 @@
+"""A gripper with a wrist sensor: recordings made with known blocks, tools and mountings."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
+
+from estimation.identification import identify_aligned
+from hmmseg.contact.decompose import decompose
+from hmmseg.contact.hands import revealed_by
+from hmmseg.errors import InputError
+from hmmseg.hand.pose import pose_of
+from hmmseg.hand.tool import applied_force, free_tool
+from hmmseg.io.rig import parse_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial, trial_of
+from hmmseg.segmentation.align import align
+
+PLAIN = Setup()
+
+
+@pytest.fixture(scope="module")
+def performed():
+    return performances(2)
+
+
+def read_all(performed, setup, **said):
+    rig = wrist_rig(setup, **said)
+    return [read_trial(wrist_recording(s, setup, i), rig) for i, s in enumerate(performed)], rig
+
+
+def raw(simulated, setup, **said):
+    from hmmseg.io.frames import frame_table
+
+    rig = wrist_rig(setup, **said)
+    return trial_of(frame_table(wrist_recording(simulated, setup), None), rig, None), rig
+
+
+SETUPS = {
+    "as it is": (PLAIN, {}),
+    "reaction, untared": (Setup(reaction=True, offset=(3.0, -2.0, 8.0)), {}),
+    "all said": (Setup(reaction=True), {"reaction": True, "sensor_axes": ["y", "x", "-z"], "tool_mass": 0.7}),
+    "turning, untared": (Setup(heading=0.9, tilt=0.1, offset=(1.0, 2.0, 3.0), reaction=True), {}),
+    "world, drifting": (Setup(frame="world", drift=0.02), {}),
+    "poor": (Setup(noise=0.05, position_noise=2e-4), {}),
+    "500 Hz": (Setup(rate=500.0, noise=0.03), {}),
+}
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
+    setup, said = SETUPS[name]
+    trials, rig = read_all(performed, setup, **said)
+    aligned = align(trials, TASK, rig)
+    errors = []
+    for simulated, found in zip(performed, aligned.segmentations, strict=True):
+        assert found.failed is None
+        errors += list(np.abs([s.end for s in found.spans[:-1]] - simulated.boundaries))
+    assert np.median(errors) < 0.03
+    found = identify_aligned(aligned)
+    for obj, block in BLOCKS.items():
+        assert found.of(obj, "weight").mean() == pytest.approx(block.weight, rel=0.02)
+        assert found.of(obj, "height").mean() == pytest.approx(block.height, rel=0.005)
+        for prop in ("weight", "width"):
+            draws = found.of(obj, prop)
+            assert abs(draws.mean() - getattr(block, prop)) < 3 * draws.std()
+        assert found.of(obj, "width").std() > 1e-4  # what the pads give is not measured
+        assert "wrist" in found.reasons[f"{obj}.friction"]
+
+
+def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
+    setup = PLAIN
+    rig = wrist_rig(setup, grip_force="grip")
+    trials = []
+    for i, simulated in enumerate(performed):
+        columns = wrist_recording(simulated, setup, i)
+        pads = simulated.motion.force
+        squeeze = (pads[:, 0, 0] - pads[:, 1, 0]) / 2
+        columns["grip"] = np.interp(columns["t"], simulated.t, np.maximum(squeeze, 0))
+        trials.append(read_trial(columns, rig))
+    found = identify_aligned(align(trials, TASK, rig))
+    for obj, block in BLOCKS.items():
+        draws = found.of(obj, "width")
+        assert draws.mean() == pytest.approx(block.width, abs=2e-4)
+        assert found.friction[obj].lower_bound is not None
+
+
+def test_the_tool_is_found_from_free_motion(performed):
+    setup = Setup(mass=1.3, heading=0.5, tilt=0.15, offset=(4.0, -1.0, 2.0), reaction=True, noise=0.002)
+    trial, rig = raw(performed[0], setup)
+    pose = pose_of(trial, rig.gripper)
+    free = trial.t < 1.5
+    tool = free_tool(trial, rig, pose, free)
+    assert tool.mass == pytest.approx(1.3, rel=0.03)
+    assert np.linalg.det(tool.axes) == pytest.approx(-1)
+    np.testing.assert_allclose(tool.axes, -np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), atol=0.1)
+    np.testing.assert_allclose(tool.offset, setup.offset, atol=0.4)
+    force = applied_force(trial, rig, pose, tool)[free]
+    assert np.sqrt((force**2).mean()) < 0.1  # of a tool that weighs 13 N
+    assert np.abs(force.mean(axis=0)).max() < 0.01
+
+
+def test_a_missing_sample_is_bridged(performed):
+    columns = wrist_recording(performed[0], PLAIN)
+    whole = read_trial(columns, wrist_rig(PLAIN))
+    for name in ("gap", "pz", "Fz"):
+        columns[name] = columns[name].copy()
+        columns[name][200:203] = np.nan
+    holed = read_trial(columns, wrist_rig(PLAIN))
+    assert np.isnan(holed.channels["fy1"][200:203]).all()
+    assert np.nanmax(np.abs(holed.channels["fy1"] - whole.channels["fy1"])) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("setup", "said", "change", "line"),
+    [
+        (PLAIN, {"reaction": True, "sensor_axes": ["y", "x", "-z"]}, {}, "reaction = false under"),
+        (PLAIN, {}, {"pz": 1e3, "py": 1e3, "px": 1e3}, r'pz = \{from = "pz", unit = "mm"\}'),
+        (
+            PLAIN,
+            {},
+            {"gap": 1e3},
+            r'looks like cm|looks like mm; expected gap = \{from = "gap", unit = "mm"\}',
+        ),
+        (
+            PLAIN,
+            {},
+            {"gap": -1.0},
+            r"counts how far the gripper has closed; expected gap = \{from = .gap., sign = -1",
+        ),
+        (Setup(heading=0.3), {}, {"qw": 2.0}, "a quaternion of norm .*expected a norm of 1"),
+        (PLAIN, {}, {"t": 1e3}, r't = \{from = "t", unit = "ms"\}'),
+        (PLAIN, {}, {"gap": 1e-6}, "expected a gripper that closes and opens"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line):
+    columns = wrist_recording(performed[0], setup)
+    for name, factor in change.items():
+        columns[name] = columns[name] * factor
+    rig = wrist_rig(setup, **said)
+    with pytest.raises(InputError, match=line) as told:
+        read_trial(columns, rig)
+    assert "\n" not in str(told.value)
+
+
+def test_the_line_for_a_flipped_opening_mends_it(performed):
+    columns = wrist_recording(performed[0], PLAIN)
+    columns["gap"] = 0.085 - columns["gap"]
+    with pytest.raises(InputError) as told:
+        read_trial(columns, wrist_rig(PLAIN))
+    import tomllib
+
+    entry = str(told.value).split("expected ")[1].split(" under [columns]")[0]
+    table = wrist_rig(PLAIN).model_dump(exclude_none=True, exclude_defaults=True)
+    mended = parse_rig(table | {"columns": tomllib.loads(entry)})
+    trial = read_trial(columns, mended)
+    assert len(trial.touches) == 4
+
+
+def test_a_touch_in_free_motion_is_told(performed):
+    columns = wrist_recording(performed[0], PLAIN)
+    pressed = (columns["t"] > 1.2) & (columns["t"] < 1.5)
+    columns["Fz"] = columns["Fz"] - np.where(pressed, -2.0, 0.0)
+    notes = read_trial(columns, wrist_rig(PLAIN)).notes
+    assert any("the hand touches something from 1.2" in note for note in notes)
+
+
+def test_halves_of_a_wrist_are_no_fingers(performed):
+    simulated = performed[0]
+    t = np.arange(int(simulated.t[-1] * 50)) / 50
+    motion = simulated.motion
+    columns = {"t": t}
+    net = motion.force.sum(axis=1)
+    for i in (0, 1):
+        for k, axis in enumerate("xy"):
+            columns[f"{axis}{i + 1}"] = np.interp(t, simulated.t, motion.position[:, i, k])
+            columns[f"f{axis}{i + 1}"] = np.interp(t, simulated.t, net[:, k] / 2) - 2.5 * k
+    rig = parse_rig({"fingertip": wrist_rig(PLAIN).fingertip.model_dump()})
+    trial = read_trial(columns, rig)
+    assert any("half of a wrist's force" in note for note in trial.notes)
+    found = identify_aligned(align([trial], TASK, rig))
+    assert found.of("a", "weight").mean() == pytest.approx(BLOCKS["a"].weight, rel=0.02)
+
+
+def test_an_arm_of_another_simulator(shared):
+    folder = shared / "panda" / "wrist_restack_1"
+    rig = parse_rig({
+        "gravity": 9.81,
+        "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width", "wrench": ["Fx", "Fy", "Fz"]},
+        "columns": {"width": {"offset": -1.02e-3}},  # between the pads, as its own two-finger files have it
+        "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
+    })  # fmt: skip
+    aligned = align([read_trial(folder / f"wrist_0{k}.csv", rig) for k in (1, 2, 3, 4)],
+                    read_task(folder / "task.toml"), rig)  # fmt: skip
+    truth = [
+        json.loads((folder / "truth" / f"trial_0{k}.json").read_text())["boundaries"] for k in (1, 2, 3, 4)
+    ]
+    found = np.array([[span.end for span in s.spans[:-1]] for s in aligned.segmentations])
+    assert np.median(np.abs(found - truth)) < 0.03
+    blocks = json.loads((folder / "truth.json").read_text())
+    properties = identify_aligned(aligned)
+    for obj, actual in blocks.items():
+        assert properties.of(obj, "weight").mean() == pytest.approx(actual["weight"], rel=0.02)
+        assert properties.of(obj, "height").mean() == pytest.approx(actual["height"], abs=1e-4)
+        low, high = np.percentile(properties.of(obj, "width"), [2.5, 97.5])
+        assert low < actual["width"] < high
+
+
+def test_decompose_leaves_out_what_this_hand_cannot_reveal():
+    found = revealed_by(decompose(TASK), wrist_rig(PLAIN))
+    assert found.properties["a"]["friction"].evidence == ()
+    assert "wrist" in found.properties["a"]["friction"].reason
+    assert found.properties["a"]["weight"].kind == "value"
+    assert "opening" in found.properties["a"]["width"].evidence[0].condition
+    known = revealed_by(decompose(TASK), wrist_rig(PLAIN, grip_force=20.0))
+    assert known.properties["a"]["friction"].evidence
+    assert dataclasses.replace(known) == decompose(TASK)
