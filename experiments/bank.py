@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments.recordings import Case
+from hmmseg.hand.kinematics import inverse, joint_velocity
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig, Systematic, read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import Trial
-from simgap.world.hand import inverse, joint_velocity
 from simgap.world.properties import random_properties
 from simgap.world.simulate import simulate_trials
 

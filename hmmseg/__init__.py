@@ -6,8 +6,9 @@ with an underscore, and names that are not listed here, are internal.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hmmseg._lazy import lazily
 
 if TYPE_CHECKING:
     from hmmseg.api import align, decompose, fit, segment
@@ -47,12 +48,4 @@ _HOMES = {
     "segment": "hmmseg.api",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOMES)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hmmseg._lazy import lazily
 
 if TYPE_CHECKING:
     from simgap import effects
@@ -21,17 +22,8 @@ _HOMES = {
     "SimulatedTrial": "simgap.world.simulate",
     "VirtualModel": "simgap.world.virtual_model",
     "diagnose": "simgap.api",
+    "effects": "simgap.effects",
     "simulate": "simgap.api",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name == "effects":
-        return importlib.import_module("simgap.effects")
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOMES)

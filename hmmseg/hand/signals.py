@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.hand.kinematics import forward, jacobian
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
@@ -101,14 +102,12 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
     for i in (1, 2):
         if rig.jointed:
             finger = rig.finger(i)
-            q = np.stack([channels[f"q{i}1"], channels[f"q{i}2"]])
-            dq = np.stack([channels[f"dq{i}1"], channels[f"dq{i}2"]])
-            links = np.asarray(finger.links)[:, None]
-            jx, jy = -links * np.sin(q), links * np.cos(q)
-            out[f"x{i}"] = finger.base[0] + jy.sum(axis=0)
-            out[f"y{i}"] = finger.base[1] - jx.sum(axis=0)
-            out[f"vx{i}"], out[f"vy{i}"] = (jx * dq).sum(axis=0), (jy * dq).sum(axis=0)
-            reach = {"x": (jx**2).sum(axis=0), "y": (jy**2).sum(axis=0)}
+            q = np.stack([channels[f"q{i}1"], channels[f"q{i}2"]], -1)
+            dq = np.stack([channels[f"dq{i}1"], channels[f"dq{i}2"]], -1)
+            turning = jacobian(finger, q)
+            out[f"x{i}"], out[f"y{i}"] = forward(finger, q).T
+            out[f"vx{i}"], out[f"vy{i}"] = (turning * dq[:, None, :]).sum(-1).T
+            reach = dict(zip("xy", (turning**2).sum(-1).T, strict=True))
             for axis in "xy":
                 variances[axis] += reach[axis] * _square(noise.angle) / 2
                 variances[f"v{axis}"] += reach[axis] * _square(noise.velocity) / 2

@@ -11,8 +11,9 @@ docs/hmm.md shows all of it. Nothing heavy is imported before it is used.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from hmmseg._lazy import lazily
 
 if TYPE_CHECKING:
     from hmmseg.hmm.chain import Chain, InfeasibleAlignment, left_to_right
@@ -26,7 +27,7 @@ _MODULES = {
     "results": ("Alignment", "Alignments", "Filtered", "Posterior"),
     "streaming": ("Step", "StreamingFilter", "Window"),
 }
-_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+_HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "Alignment",
@@ -47,14 +48,4 @@ __all__ = [
     "viterbi",
 ]
 
-
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = found
-    return found
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazily(__name__, _HOMES)

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from simgap.effects.base import Performance
-from simgap.world.hand import forward, inverse, joint_velocity, tip_velocity
 
 Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 

@@ -16,9 +16,9 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 
 from hmmseg.errors import InputError
+from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import Rig
 from hmmseg.plot.style import BLUE, GREY, INK, OTHER_COLOURS, STYLE
-from simgap.world.hand import inverse
 from simgap.world.properties import Block
 
 FRAMES = 15.0  # a second, in real time

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hmmseg.hand.kinematics import inverse, joint_velocity, require_reach
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial
-from simgap.world.hand import inverse, joint_velocity, require_reach
 
 DEFAULT_RATE = 20.0  # Hz, the paper's
 # Standard deviations of one sample where a rig leaves them to be learned.

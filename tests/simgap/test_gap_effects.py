@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import Finger, Fingertip, Rig
 from simgap.effects import catalogue, decoys, effect_named, fitted
 from simgap.effects.base import FORCES, Performance, World, flat, tips
 from simgap.gap.residuals import contact
-from simgap.world.hand import inverse
 
 CONTRACT = {
     "force_bias",

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.errors import InputError
@@ -28,13 +26,17 @@ def forward(finger: Finger, q: Array) -> Array:
     return xp.stack([x, y], -1)
 
 
+def jacobian(finger: Finger, q: Array) -> Array:
+    """Derivatives (..., 2 axes, 2 links) [m/rad] of the tip by the link angles (..., 2) [rad]."""
+    xp, (first, second) = _module(q), finger.links
+    x = xp.stack([-first * xp.sin(q[..., 0]), -second * xp.sin(q[..., 1])], -1)
+    y = xp.stack([first * xp.cos(q[..., 0]), second * xp.cos(q[..., 1])], -1)
+    return xp.stack([x, y], -2)
+
+
 def tip_velocity(finger: Finger, q: Array, rate: Array) -> Array:
     """Tip velocities (..., 2) [m/s] from link angles [rad] and their rates (..., 2) [rad/s]."""
-    xp = _module(q)
-    one, two = finger.links[0] * rate[..., 0], finger.links[1] * rate[..., 1]
-    x = -one * xp.sin(q[..., 0]) - two * xp.sin(q[..., 1])
-    y = one * xp.cos(q[..., 0]) + two * xp.cos(q[..., 1])
-    return xp.stack([x, y], -1)
+    return (jacobian(finger, q) * rate[..., None, :]).sum(-1)
 
 
 def inverse(finger: Finger, number: int, tip: Array) -> Array:
@@ -74,4 +76,8 @@ def require_reach(finger: Finger, number: int, tip: np.ndarray) -> None:
 
 
 def _module(array: Array) -> Any:
-    return jnp if isinstance(array, jax.Array) else np
+    if isinstance(array, np.ndarray):
+        return np
+    import jax.numpy as jnp  # whoever has such an array has loaded it
+
+    return jnp

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg.hand.kinematics import forward, inverse, joint_velocity, require_reach, tip_velocity
 from hmmseg.io.rig import Finger
-from simgap.world.hand import forward, inverse, joint_velocity, require_reach, tip_velocity
 
 FINGERS = {1: Finger(base=(0.05, 0.17), links=(0.12, 0.10)), 2: Finger(base=(0.21, 0.17), links=(0.12, 0.12))}
 RNG = np.random.default_rng(0)
