@@ -25,7 +25,8 @@ from simgap.generic.effects import (
 from simgap.generic.features import FAST, SLOW
 from simgap.generic.locate import both_variances
 
-STEPS = 15
+STEP = 1e-3  # numerics: prior standard deviations, for derivatives by differences
+EVALUATIONS = 30  # numerics: of the residual, in one descent
 FURTHER = 4.0  # nats, as one effect is less likely than none
 FAR = 8.0  # prior standard deviations that no parameter leaves
 
@@ -215,7 +216,7 @@ def fit(
 
 
 def _block(given: Scene, block: Block, root: np.ndarray, difference: np.ndarray, mine: Sequence[Slot], known):
-    """Levenberg-Marquardt from every start of the effects that are not known yet; the best."""
+    """Least squares from every start of the effects that are not known yet; the best."""
     if not mine:
         z = np.linalg.solve(root, difference)
         return np.zeros(0), np.zeros((difference.size, 0)), np.zeros(difference.size), float(z @ z)
@@ -236,31 +237,22 @@ def _block(given: Scene, block: Block, root: np.ndarray, difference: np.ndarray,
 
 
 def _descend(given, block, root, difference, mine, zero, u, low, high):
+    """Least squares within bounds, priors as further residuals; u, whitened residual and its derivative."""
+    from scipy.optimize import least_squares  # slow to import
+
+    known: dict[bytes, np.ndarray] = {}  # residual and derivative are asked for at the same place
+
     def residual(v: np.ndarray) -> np.ndarray:
-        return np.linalg.solve(root, difference - (at(given, block, mine, v) - zero))
+        if v.tobytes() not in known:
+            known[v.tobytes()] = np.linalg.solve(root, difference - (at(given, block, mine, v) - zero))
+        return known[v.tobytes()]
 
-    def slopes(v: np.ndarray, z: np.ndarray) -> np.ndarray:
-        columns = []
-        for k in range(v.size):
-            step = np.zeros(v.size)
-            step[k] = 1e-3
-            columns.append((residual(v + step) - z) / 1e-3)
-        return np.stack(columns, 1)
+    def slopes(v: np.ndarray) -> np.ndarray:
+        return np.stack([(residual(v + step) - residual(v)) / STEP for step in STEP * np.eye(v.size)], 1)
 
-    z, damping = residual(u), 1e-3
-    for _ in range(STEPS):
-        j = slopes(u, z)
-        bend = j.T @ j + np.eye(u.size)
-        step = -np.linalg.solve(bend + damping * np.diag(np.diag(bend)), j.T @ z + u)
-        new = np.clip(u + step, low, high)
-        after = residual(new)
-        gain = z @ z + u @ u - after @ after - new @ new
-        if np.isfinite(gain) and gain > 0:
-            u, z, damping = new, after, damping / 5
-            if gain < 0.02:
-                break
-        else:
-            damping *= 8
-            if damping > 1e4:
-                break
-    return u, z, slopes(u, z)
+    found = least_squares(
+        lambda v: np.concatenate([residual(v), v]), np.clip(u, low, high),
+        jac=lambda v: np.concatenate([slopes(v), np.eye(v.size)]),  # type: ignore[arg-type]
+        bounds=(low, high), x_scale="jac", ftol=1e-4, max_nfev=EVALUATIONS,
+    )  # fmt: skip
+    return found.x, residual(found.x), slopes(found.x)
