@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help setup demo test lint typecheck tests slow wheel docs results paper sweeps check-gap
+.PHONY: help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -39,6 +39,9 @@ wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, 
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+
+constants: $(INSTALLED)  ## docs/constants.md: every numeric constant with its kind and reason
+	$(BIN)/python -m experiments.constants
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings

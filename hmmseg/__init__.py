@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.spans import Segmentation
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 __all__ = [
     "InputError",
     "Rig",
