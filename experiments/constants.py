@@ -66,16 +66,19 @@ def numeric(node: ast.expr) -> bool:
         return bool(node.elts) and all(numeric(each) for each in node.elts)
     if isinstance(node, ast.Dict):
         return bool(node.values) and all(numeric(each) for each in node.values)
-    if isinstance(node, ast.Call):  # np.array([...]), np.log(2)
-        return bool(node.args) and all(numeric(each) for each in node.args) and not node.keywords
+    if isinstance(node, ast.Call):  # np.array([...]), np.log(2); range(3) numbers names
+        named = isinstance(node.func, ast.Name) and node.func.id == "range"
+        return (
+            not named and bool(node.args) and all(numeric(each) for each in node.args) and not node.keywords
+        )
     return False
 
 
 def constants(path: Path) -> Iterator[Constant]:
     """Constants at the top of one module, in its order.
 
-    The comment is the one that ends the line (or lines) of the value, with what goes on in the lines of
-    comment below it, else the lines of comment right above.
+    The comment is the one that ends the line (or lines) of the value, with what goes on below it in lines of
+    comment that begin with a small letter, else the lines of comment right above.
     """
     source = path.read_text(encoding="utf-8")
     said, file = comments(source), str(path.relative_to(ROOT))
@@ -99,7 +102,7 @@ def stated(said: dict[int, str], lines: list[str], first: int, last: int) -> tup
     """Kind and reason of a constant on lines `first` to `last`."""
     words = [said[k] for k in range(first, last + 1) if k in said]
     after = last + 1
-    while words and after in said and lines[after - 1].lstrip().startswith("#"):
+    while words and said.get(after, "-")[0].islower() and lines[after - 1].lstrip().startswith("#"):
         words.append(said[after])
         after += 1
     before = first - 1
@@ -126,8 +129,8 @@ def page(found: list[Constant]) -> str:
     out = [
         "# Constants",
         "",
-        f"The {len(found)} numeric constants of the product, by kind. `make constants` writes this page from the",
-        "comments in the code.",
+        f"The {len(found)} numeric constants of the product, by kind. `make constants` writes this page",
+        "from the comments in the code.",
         "",
         "| kind | what it means | how many |",
         "|---|---|---|",

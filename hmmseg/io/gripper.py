@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable
@@ -85,6 +84,8 @@ class Gripper(StrictTable):
     @field_validator("sensor_axes")
     @classmethod
     def _right_handed(cls, axes: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        import numpy as np  # slow to import, and only grippers need it
+
         if axes is not None and not np.isclose(np.linalg.det(np.stack([direction(a) for a in axes])), 1):
             raise ValueError(f"{', '.join(axes)} are no right-handed axes; expected such as y, x, -z")
         return axes
@@ -120,6 +121,8 @@ class Gripper(StrictTable):
         return self.grip_force is not None or self.force_per_ampere is not None
 
 
-def direction(axis: str) -> np.ndarray:
-    """Unit vector (3,) of an axis such as `-z`."""
+def direction(axis: str) -> Any:
+    """Unit vector (3,), an array, of an axis such as `-z`."""
+    import numpy as np  # as above
+
     return (-1.0 if axis[0] == "-" else 1.0) * np.eye(3)[AXES.index(axis[-1])]
