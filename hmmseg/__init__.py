@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hmmseg.io.rig import Rig
     from hmmseg.io.task import Task
     from hmmseg.io.trial import Trial
+    from hmmseg.online.watcher import Watcher
     from hmmseg.segmentation.spans import Segmentation
 
 __version__ = "0.2.0.dev0"
@@ -26,6 +27,7 @@ __all__ = [
     "Segmentation",
     "Task",
     "Trial",
+    "Watcher",
     "__version__",
     "align",
     "decompose",
@@ -41,6 +43,7 @@ _HOMES = {
     "Segmentation": "hmmseg.segmentation.spans",
     "Task": "hmmseg.io.task",
     "Trial": "hmmseg.io.trial",
+    "Watcher": "hmmseg.online.watcher",
     "align": "hmmseg.api",
     "decompose": "hmmseg.api",
     "example_folder": "hmmseg.example",

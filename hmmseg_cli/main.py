@@ -15,7 +15,19 @@ import typer
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
-from hmmseg_cli import decompose, demo, diagnose, effects, fit, identify, inspect, new, segment, simulate
+from hmmseg_cli import (
+    decompose,
+    demo,
+    diagnose,
+    effects,
+    fit,
+    identify,
+    inspect,
+    new,
+    segment,
+    simulate,
+    watch,
+)
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -30,6 +42,7 @@ for _command in (
     fit.fit,
     segment.segment,
     identify.identify,
+    watch.watch,
     simulate.simulate,
     diagnose.diagnose,
     inspect.inspect,

@@ -17,13 +17,13 @@ _config: Any = numba.core.config
 
 
 @cache
-def cache_folder() -> str:
-    """Where compiled kernels are kept: one folder for each state of the kernels' sources.
+def cache_folder(sources: Path = Path(__file__).parent) -> str:
+    """Where compiled kernels are kept: one folder for each state of the files in `sources`.
 
     Numba notices a change of a function's own file alone, not of what the function calls.
     """
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(sources.glob("*.py")):
         digest.update(path.read_bytes())
     base = _config.CACHE_DIR or os.path.join(
         os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "hmmseg", "numba"
@@ -35,7 +35,7 @@ def compiled(function: Callable) -> Any:
     """`function` compiled at its first call; kept on disk where a folder is writable."""
     function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
     before = _config.CACHE_DIR
-    _config.CACHE_DIR = cache_folder()
+    _config.CACHE_DIR = cache_folder(Path(inspect.getfile(function)).parent)
     try:
         return numba.njit(function, nogil=True, error_model="numpy", cache=True)
     except (RuntimeError, OSError):  # no folder that could be written to

@@ -1,0 +1,1 @@
+"""Alignment, properties and conformity of a block task while it runs."""

@@ -1,0 +1,169 @@
+"""One answer of a watcher, and its line of JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hmmseg.contact.decompose import FREE, Subtask
+from hmmseg.online.properties import UNITS
+
+if TYPE_CHECKING:
+    from hmmseg.online.filter import Filter
+
+Z90, Z95 = 1.6448536269514722, 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A settled boundary: the subtask that it begins, of which round (from 0), when and how surely [s]."""
+
+    step: Subtask
+    round: int
+    t: float
+    sd: float
+
+
+class Answer:
+    """What a watcher knows at one row.
+
+    `t` [s]; `probabilities` (num_subtasks,) of the subtasks of one round; `departed`: probability that the
+    recording has left its task; `smoothed`: as `probabilities`, of the time t - lag; `properties`:
+    (object, property, mean, sd). Read it before the next row.
+    """
+
+    note: str | None  # what was odd about the row, in words
+
+    def __init__(self, watcher: Filter, t: float, now: np.ndarray, smoothed: np.ndarray,
+                 means: np.ndarray, best: np.ndarray, final: bool) -> None:  # fmt: skip
+        self._watcher, self.t, self.final = watcher, t, final
+        self.probabilities, self.departed = now[:-1], float(now[-1])
+        self.smoothed, self._means = smoothed[:-1], means
+        self.round, self._missed, self._left_at = int(best[0]), int(best[2]), float(best[3])
+        self._state, self.note = int(best[4]), None
+        self.index = int(self.probabilities.argmax())
+        if self.departed > 0.5:
+            self.index = self._missed
+
+    @property
+    def fits(self) -> bool:
+        """Whether the recording more likely than not follows its task; at its end, whether it is complete."""
+        if self.departed > 0.5:
+            return False
+        return not self.final or self._at_end
+
+    @property
+    def _at_end(self) -> bool:
+        w = self._watcher
+        last = self.index == w.num_steps - 1
+        return last and (w.task.repeat == "unknown" or self.round + 1 == w.num_rounds)  # type: ignore[union-attr]
+
+    @property
+    def subtask(self) -> Subtask:
+        """The most probable subtask; where the recording has left its task, the one it misses."""
+        return self._watcher.steps[self.index]
+
+    @property
+    def next(self) -> Subtask | None:
+        """What the task has next; None at its end and off it."""
+        w = self._watcher
+        if self.departed > 0.5:
+            return None
+        if self.index + 1 < w.num_steps:
+            return w.steps[self.index + 1]
+        return w.steps[1] if w.cyclic and self.round + 1 < w.num_rounds else None
+
+    @property
+    def properties(self) -> list[tuple[str, str, float, float]]:
+        """(object, property, mean, sd) of what is known so far, SI units."""
+        return self._watcher.properties.table(self._means)
+
+    @property
+    def failed(self) -> dict[str, Any] | None:
+        """Which subtask the recording does not show, as in `segment`; None while it fits."""
+        if self.fits:
+            return None
+        w = self._watcher
+        if self.departed > 0.5:
+            state, block = w.off_task[max(self._state - w.num_steps, 0)]
+            held = state if state == FREE else f"{state} of {block or 'another block'}"
+            step, reason = w.steps[self._missed], f"{held} from {self._left_at:.2f} s on"
+        else:
+            k = min(self.index + 1, w.num_steps - 1)
+            step, reason = w.steps[k], f"the recording ends in {self.subtask.name}"
+        return {"index": step.index, "subtask": step.name, "object": step.object, "reason": reason}
+
+    def line(self, more: dict[str, Any] | None = None) -> str:
+        """One line of JSON, without its newline; `more`: further entries of the last one."""
+        step = self.subtask
+        w = self._watcher
+        state = step.state if self.departed <= 0.5 else w.off_task[max(self._state - w.num_steps, 0)][0]
+        probabilities = ["0" if p < 5e-7 else f"{p:.6f}" for p in self.probabilities.tolist()]
+        parts = [
+            f'{{"t":{self.t:.9g},"subtask":"{step.name}","object":{_name(step.object)},"state":"{state}"',
+            f'"probabilities":[{",".join(probabilities)}]',
+            f'"next":{_step(self.next)}',
+            f'"properties":{w.properties_text(self)}',
+            f'"fits":{"true" if self.fits else "false"}',
+            f'"departed":{_share(self.departed)}',
+        ]
+        if w.cyclic:
+            parts.append(f'"repetition":{self.round + 1}')
+        if not self.final:
+            at = int(self.smoothed.argmax())
+            then, p = w.steps[at], _share(float(self.smoothed[at]))
+            parts.append(
+                f'"smoothed":{{"t":{self.t - w.lag:.9g},"subtask":"{then.name}",'
+                f'"object":{_name(then.object)},"probability":{p}}}'
+            )
+        if not self.fits:
+            parts.append(f'"failed":{json.dumps(self.failed)}')
+        if self.note is not None:
+            parts.append(f'"note":{json.dumps(self.note)}')
+        if self.final:
+            parts += ['"final":true', f'"segments":{json.dumps(self.segments())}']
+            parts += [f'"{key}":{json.dumps(value)}' for key, value in (more or {}).items()]
+        return ",".join(parts) + "}"
+
+    def properties_json(self) -> str:
+        """The object `properties`, as text."""
+        objects: dict[str, list[str]] = {}
+        for name, prop, mean, sd in self.properties:
+            objects.setdefault(name, []).append(
+                f'"{prop}":{{"unit":"{UNITS[prop]}","mean":{mean:.6g},"sd":{sd:.3g},'
+                f'"interval_95":[{mean - Z95 * sd:.6g},{mean + Z95 * sd:.6g}]}}'
+            )
+        return "{" + ",".join(f'"{name}":{{{",".join(own)}}}' for name, own in objects.items()) + "}"
+
+    def segments(self) -> list[dict[str, Any]]:
+        """The spans so far, as in `segment`; the last one ends at this row."""
+        w = self._watcher
+        first = w.first_t
+        edges = [(first, 0.0), *((c.t, c.sd) for c in w.crossings), (self.t, 0.0)]
+        steps = [w.steps[0], *(c.step for c in w.crossings)]
+        out = []
+        for step, (start, sd), (end, end_sd) in zip(steps, edges, edges[1:], strict=False):
+            end = max(start, end)
+            out.append({
+                "subtask": step.name, "object": step.object, "state": step.state, "start": start, "end": end,
+                "start_sd": sd, "end_sd": end_sd, "start_90": [start - Z90 * sd, start + Z90 * sd],
+                "end_90": [end - Z90 * end_sd, end + Z90 * end_sd],
+            })  # fmt: skip
+        return out
+
+
+def _share(p: float) -> str:
+    return "0" if p < 5e-7 else ("1" if p > 1 - 5e-7 else f"{p:.6f}")
+
+
+def _name(name: str | None) -> str:
+    return "null" if name is None else f'"{name}"'
+
+
+def _step(step: Subtask | None) -> str:
+    if step is None:
+        return "null"
+    return f'{{"subtask":"{step.name}","object":{_name(step.object)},"state":"{step.state}"}}'

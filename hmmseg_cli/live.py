@@ -1,0 +1,101 @@
+"""`hmmseg watch --plot`: subtasks, signals and properties in the terminal while they change."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rich.columns import Columns
+from rich.console import Console, Group
+from rich.live import Live as RichLive
+from rich.table import Table
+from rich.text import Text
+
+from hmmseg.online.answer import Answer
+
+if TYPE_CHECKING:
+    from hmmseg.online.watcher import Watcher
+
+REFRESH = 0.1  # s; a terminal shows no more
+WIDTH = 60  # points of a signal
+SECONDS = 10.0  # that it spans
+BLOCKS = " ▁▂▃▄▅▆▇█"
+
+
+class Live:
+    """The display; `lines`: whether lines of JSON go to standard output as well."""
+
+    def __init__(self, watcher: Watcher, lines: bool) -> None:
+        self.lines = lines
+        self._watcher, self._shown = watcher, 0.0
+        channels = watcher.channels
+        self._grip = channels.index("fx1"), channels.index("fx2")
+        self._lift = channels.index("fy1"), channels.index("fy2")
+        self._kept: deque[tuple[float, float, float]] = deque(maxlen=WIDTH)
+        self._notes: deque[str] = deque(maxlen=3)
+        self._console = Console(stderr=True)
+        self._live = RichLive(console=self._console, auto_refresh=False, transient=False)
+        self._live.start()
+        self._last: Answer | None = None
+
+    def update(self, answer: Answer, row: Sequence[float]) -> None:
+        """Take one answer and its row; redraw if it is time to."""
+        if answer.note is not None:
+            self._notes.append(f"{answer.t:.2f} s  {answer.note}")
+        if not self._kept or answer.t >= self._kept[-1][0] + SECONDS / WIDTH:
+            grip = (row[self._grip[0]] - row[self._grip[1]]) / 2
+            self._kept.append((answer.t, grip, row[self._lift[0]] + row[self._lift[1]]))
+        self._last = answer
+        now = time.monotonic()
+        if now - self._shown >= REFRESH:
+            self._shown = now
+            self._draw(answer)
+
+    def close(self) -> None:
+        """Leave the last picture on the screen."""
+        if self._last is not None:
+            self._draw(self._last)
+        self._live.stop()
+
+    def _draw(self, answer: Answer) -> None:
+        self._live.update(picture(self._watcher, answer, list(self._kept), list(self._notes)), refresh=True)
+
+
+def picture(
+    watcher: Watcher, answer: Answer, kept: Sequence[tuple[float, float, float]], notes: Sequence[str]
+) -> Group:
+    """What is known, drawn: bars of the subtasks, the grip and the net vertical force, properties, notes."""
+    step, then = answer.subtask, answer.next
+    fits = (
+        Text("fits its task", "green") if answer.fits else Text(f"does not fit: {answer.failed}", "bold red")
+    )
+    head = Text.assemble((f"{answer.t:9.2f} s  ", "bold"), (f"{step.name} {step.object or ''}", "bold cyan"),
+                         f"  next: {'end' if then is None else f'{then.name} {then.object}'}  ", fits)  # fmt: skip
+    bars = Table.grid(padding=(0, 1))
+    for k, (s, p) in enumerate(zip(watcher.filter.steps, answer.probabilities.tolist(), strict=True)):
+        start = next((f"{c.t:.3f} ± {c.sd:.3f} s" for c in reversed(watcher.crossings) if c.step is s), "")
+        style = "cyan" if k == answer.index else "dim"
+        bars.add_row(Text(f"{s.name} {s.object}", style), Text("█" * round(20 * p), style),
+                     f"{p:.2f}" if p > 0.005 else "", Text(start, "dim"))  # fmt: skip
+    known = Table("", "mean", "sd", "unit", box=None, header_style="dim")
+    for name, prop, mean, sd in answer.properties:
+        scale, unit = (1.0, "N") if prop == "weight" else (100.0, "cm")
+        known.add_row(f"{name} {prop}", f"{mean * scale:.3f}", f"{sd * scale:.3f}", unit)
+    signals = Group(
+        Text("grip    " + spark([g for _, g, _ in kept])), Text("lifting " + spark([y for *_, y in kept]))
+    )
+    return Group(head, Columns([bars, known]), signals, *[Text(note, "yellow") for note in notes])
+
+
+def spark(values: Sequence[float]) -> str:
+    """Values as a row of blocks from their least to their greatest, the greatest named."""
+    there = [v for v in values if math.isfinite(v)]
+    if not there:
+        return ""
+    low, high = min(0.0, *there), max(there)
+    scale = (len(BLOCKS) - 1) / max(high - low, 1e-9)
+    drawn = "".join(BLOCKS[round((v - low) * scale)] if math.isfinite(v) else "?" for v in values)
+    return f"{drawn} {high:.2f} N at most"

@@ -1,0 +1,218 @@
+"""A task followed while it runs: the same physics as off line, nothing looked ahead, nothing lost."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
+from hmmseg.errors import InputError
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import Task
+from hmmseg.io.trial import Trial
+from hmmseg.online import layout as at
+from hmmseg.online import scores
+from hmmseg.online.readings import SLOPE, WINDOW
+from hmmseg.online.watcher import Watcher
+from hmmseg.segmentation.align import segment
+from hmmseg.segmentation.emissions import Parameters, log_likelihoods
+from hmmseg.segmentation.features import features
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+CASE = RECORDINGS / "paper_blocks"
+TASK, RIG = CASE / "task.toml", CASE / "rig.toml"
+TRUTH = json.loads((CASE / "truth" / "trial_01.json").read_text())["boundaries"]
+
+
+def read(file=CASE / "trial_01.csv", rig=RIG):
+    trial = Trial.read(file, rig)
+    watcher = Watcher(file.parent / "task.toml", rig)
+    table = np.stack([trial.channels[name] for name in watcher.channels], axis=1)
+    return watcher, trial.t, table
+
+
+def follow(watcher, t, table):
+    return [json.loads(watcher.update(at, row).line()) for at, row in zip(t.tolist(), table, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def watched():
+    watcher, t, table = read()
+    lines = follow(watcher, t, table)
+    return watcher, lines, json.loads(watcher.finish().line())
+
+
+def test_emissions_are_those_off_line():
+    """A hypothesis that knows the parameters to the end scores as the emissions off line do."""
+    rig, task = Rig.read(RIG), Task.read(TASK)
+    trial = Trial.read(CASE / "trial_01.csv", rig)
+    f = features(task_space(trial, rig), rig)
+    scale = {"force": 0.012, "carry": 0.02, "net_x": 0.05, "shear": 0.08, "velocity": 0.003, "level": 1e-4,
+             "width": 1e-4}  # fmt: skip
+    steps = subtasks(task)
+    bias = np.array([0.01, -0.02, 0.005, 0.0])
+    p = Parameters(bias, {"block1": 0.34, "block2": 0.44}, scale, {"block1": 0.016, "block2": 0.0254},
+                   ({1: 0.05},))  # fmt: skip
+    expected = log_likelihoods(f, steps, p, 0)
+    h = np.zeros(at.Layout(2, 2).width)
+    sure = 1e14  # precision of what is known
+    for c in range(4):
+        h[at.BIAS + 2 * c : at.BIAS + 2 * c + 2] = bias[c] * sure, sure
+    for which, value in enumerate(scale.values()):
+        h[at.SCALES + 2 * which : at.SCALES + 2 * which + 2] = value**2, 1.0
+    h[at.OBJECTS : at.OBJECTS + 8] = np.array([0.34, 1, 0.016, 1, 0.44, 1, 0.0254, 1]) * sure
+    h[at.LEVEL : at.LEVEL + 2] = 0.05 * sure, sure
+    spans = np.array([f.span[name] for name in ("vx", "vy", "y", "d", "force")])
+    pads = np.array(f.pads)
+    for n in range(0, f.t.size, 3):
+        x = np.array([f.t[n], *f.force[n], f.vx[n], f.vy[n], f.ay[n], f.y[n], f.d[n], f.sd_y[n], f.sd_d[n],
+                      f.sd_vx[n], f.sd_vy[n], np.nan, np.nan])  # fmt: skip
+        for step in steps[:4]:
+            if step.state == FREE:
+                found, halt = scores.free(h, x, spans), scores.STILL
+            else:
+                found, halt = scores.held(h, 0, x, spans, pads, 2), 0.0
+                if step.state == ON_GROUND:
+                    found += scores.supported(h, at.GROUND_KIND, 0, x, spans, pads, step.index == 1)
+                else:
+                    assert step.state == ABOVE_GROUND
+                    found += scores.lifted(h, 0, x, spans, f.gravity, 2, 0.0)
+                    halt = scores.STILL * scores.JUST_LIFTED
+            if halt:  # what is said of a hand that halts comes on top
+                more = scores._standing(h, x, spans)
+                found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
+            np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
+
+
+def test_one_answer_a_row_and_a_last_one(watched):
+    _, lines, final = watched
+    assert len(lines) == 200
+    wanted = {"t", "subtask", "object", "state", "probabilities", "next", "properties", "fits"}
+    for line in lines:
+        assert wanted <= set(line)
+        assert len(line["probabilities"]) == 9
+        assert sum(line["probabilities"]) + line["departed"] == pytest.approx(1, abs=1e-5)
+        assert line["fits"]
+    assert lines[0]["subtask"] == "pregrasp" and lines[0]["next"]["subtask"] == "pickup"
+    assert lines[-1]["next"] is None
+    assert final["final"] is True and final["fits"]
+
+
+def test_boundaries_and_properties_agree_with_those_off_line(watched):
+    watcher, _, final = watched
+    trial = Trial.read(CASE / "trial_01.csv", RIG)
+    off_line = segment([trial], Task.read(TASK), Rig.read(RIG))[0].spans
+    assert [c.step.name for c in watcher.crossings] == [s.subtask for s in off_line[1:]]
+    for crossing, span, true in zip(watcher.crossings, off_line[1:], TRUTH, strict=True):
+        assert abs(crossing.t - span.start) < 2 * np.hypot(crossing.sd, span.start_sd)
+        assert abs(crossing.t - true) < 3 * crossing.sd
+    blocks = final["properties"]
+    assert blocks["block1"]["weight"]["mean"] == pytest.approx(0.343, abs=0.02)
+    assert blocks["block2"]["width"]["mean"] == pytest.approx(0.0254, abs=2e-4)
+    assert blocks["block1"]["height"]["mean"] == pytest.approx(0.016, abs=2e-4)
+
+
+def test_uncertainties_tighten(watched):
+    _, lines, _ = watched
+    sds = [line["properties"]["block1"]["weight"]["sd"] for line in lines
+           if "weight" in line["properties"].get("block1", {}) and 2.5 < line["t"] < 3.7]  # fmt: skip
+    assert sds[-1] < 0.7 * sds[0]
+
+
+def test_nothing_is_looked_ahead(watched):
+    """What comes later changes no answer before."""
+    _, lines, _ = watched
+    watcher, t, table = read()
+    table[120:] = table[:80]
+    assert follow(watcher, t[:120], table[:120]) == lines[:120]
+
+
+def test_a_smaller_lag_settles_sooner_from_less():
+    settled = {}
+    for lag in (0.1, 1.0):
+        _, t, table = read()
+        watcher = Watcher(TASK, RIG, lag)
+        for at_, row in zip(t, table, strict=True):
+            watcher.update(at_, row)
+            if watcher.crossings:
+                settled[lag] = at_
+                break
+    assert settled[0.1] < settled[1.0] <= TRUTH[0] + 1.0 + 0.15
+
+
+def test_a_block_let_go_in_mid_air_is_noticed():
+    _, t, table = read()
+    cut = int(np.searchsorted(t, 3.0))
+    rest = int(np.searchsorted(t, 4.6))  # what free motion looks like
+    table = np.vstack([table[:cut], table[rest : rest + 30]])
+    lines = follow(Watcher(TASK, RIG), t[: len(table)], table)
+    assert all(line["fits"] for line in lines[:cut])
+    assert not lines[-1]["fits"]
+    assert lines[-1]["failed"]["subtask"] == "place"
+
+
+def test_a_recording_that_ends_early_does_not_fit(watched):
+    watcher, t, table = read()
+    for at_, row in zip(t[:100], table[:100], strict=True):
+        answer = watcher.update(at_, row)
+    assert answer.fits
+    final = json.loads(watcher.finish().line())
+    assert not final["fits"] and final["failed"]["index"] == 5
+
+
+def test_late_and_repeated_rows_lose_nothing(watched):
+    """Rows in another order, some twice, give the same last answer."""
+    straight, _, final = watched
+    watcher, t, table = read()
+    order = [*range(50), 52, 51, 50, 50, *range(53, 120), 122, 120, 121, *range(123, 200)]
+    lines = follow(watcher, t[order], table[order])
+    notes = [line["note"].split(":")[0] for line in lines if "note" in line]
+    assert notes == ["late", "late", "repeated", "late", "late"] or set(notes) >= {"late", "repeated"}
+    assert watcher.counts["late"] == 4 and watcher.counts["repeated"] == 1
+    found = json.loads(watcher.finish().line())
+    assert [c.step.name for c in watcher.crossings] == [c.step.name for c in straight.crossings]
+    for a, b in zip(watcher.crossings, straight.crossings, strict=True):
+        assert a.t == pytest.approx(b.t, abs=1e-6)
+    assert found["properties"] == final["properties"]
+
+
+def test_gaps_and_rows_beyond_the_lag_are_told():
+    watcher, t, table = read()
+    keep = (t < 1.0) | (t > 1.3)
+    lines = follow(watcher, t[keep], table[keep])
+    assert [line["note"] for line in lines if "note" in line] == ["gap: 0.4 s since the row before"]
+    assert "too late" in watcher.update(0.5, table[10] + 1e-3).note
+
+
+def test_missing_channels_and_rows_of_nothing_pass():
+    watcher, t, table = read()
+    table[10:14, 3] = np.nan
+    table[60:63] = np.nan
+    lines = follow(watcher, t, table)
+    assert lines[-1]["fits"] and json.loads(watcher.finish().line())["fits"]
+
+
+def test_memory_and_hypotheses_do_not_grow():
+    watcher, t, table = read()
+    sizes = []
+    for again in range(5):  # ever further free motion after the end
+        for at_, row in zip(t[:30], table[:30], strict=True):
+            watcher.update(again * 2.0 + at_, row)
+        sizes.append((len(watcher.filter.rows), watcher.filter._state.count))
+    assert len({rows for rows, _ in sizes[1:]}) == 1
+    assert max(count for _, count in sizes) < 100
+
+
+def test_windows_are_those_off_line():
+    assert (WINDOW, SLOPE) == (6e-3, 1 / 40)
+
+
+def test_what_cannot_be_watched_is_refused():
+    with pytest.raises(InputError, match="plain ordered task"):
+        Watcher({"sequence": ["a", "b"]}, RIG)
+    with pytest.raises(InputError, match="lag"):
+        Watcher(TASK, RIG, -1.0)
+    with pytest.raises(ValueError, match="expected"):
+        Watcher(TASK, RIG).update(0.0, [1.0])

@@ -1,0 +1,82 @@
+"""`hmmseg watch` end to end: rows in, lines out, one clear line for what cannot be read."""
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from hmmseg_cli.main import main
+
+CASE = Path(__file__).parents[2] / "recordings" / "paper_blocks"
+ROWS = (CASE / "trial_01.csv").read_text().splitlines()
+COMMAND = ["watch", "--task", str(CASE / "task.toml"), "--rig", str(CASE / "rig.toml")]
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    def run(rows, *options):
+        text = io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n"))
+        monkeypatch.setattr(sys, "stdin", text)
+        code = main([*COMMAND, *options])
+        out, err = capsys.readouterr()
+        return code, [json.loads(line) for line in out.splitlines()], err
+
+    return run
+
+
+def test_one_line_a_row_and_a_last_one(run, tmp_path):
+    code, lines, err = run(ROWS, "--json", str(tmp_path / "out.json"))
+    assert code == 0 and err == ""
+    assert len(lines) == len(ROWS)  # the header's place is taken by the last line
+    assert [line["t"] for line in lines[:3]] == [0, 0.05, 0.1]
+    assert lines[-1]["final"] and lines[-1]["fits"] and lines[-1]["format"] == "hmmseg.watch/1"
+    assert [s["subtask"] for s in lines[-1]["segments"]][:3] == ["pregrasp", "pickup", "carry"]
+    assert json.loads((tmp_path / "out.json").read_text())["segments"] == lines[-1]["segments"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: [rows[0].replace("fx1", "fz1"), *rows[1:]], "column fx1: missing"),
+        (lambda rows: [*rows[:5], rows[5].replace(",", ",x", 1), *rows[6:]], "row 6, column q11: 'x"),
+        (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
+        (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
+        (lambda rows: [], "standard input: is empty"),
+    ],
+)
+def test_bad_input_gets_one_line(run, change, message):
+    code, _, err = run(change(ROWS[:10]))
+    assert code == 2
+    assert len(err.splitlines()) == 1 and message in err
+
+
+def test_bad_rows_can_be_left_out(run):
+    rows = [*ROWS[:5], "garbage", *ROWS[5:20]]
+    code, lines, err = run(rows, "--skip-bad-rows")
+    assert code == 0 and len(lines) == 20
+    assert "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
+
+
+def test_the_live_picture_shows_where_the_task_is():
+    from rich.console import Console
+
+    from hmmseg import Watcher
+    from hmmseg_cli.live import Live, spark
+
+    watcher = Watcher(COMMAND[2], COMMAND[4])
+    live = Live(watcher, lines=False)
+    live._console.file = io.StringIO()
+    for row in ROWS[1:60]:
+        t, *values = map(float, row.split(","))
+        answer = watcher.update(t, values)
+        live.update(answer, values)
+    live.close()
+    from hmmseg_cli.live import picture
+
+    console = Console(file=io.StringIO(), width=140)
+    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
+    text = console.file.getvalue()
+    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
+    assert spark([0.0, float("nan"), 2.0]) == " ?█ 2.00 N at most"
