@@ -69,11 +69,13 @@ def picture(
 ) -> Group:
     """What is known, drawn: bars of the subtasks, the grip and the net vertical force, properties, notes."""
     step, then = answer.subtask, answer.next
-    fits = (
-        Text("fits its task", "green") if answer.fits else Text(f"does not fit: {answer.failed}", "bold red")
-    )
+    failed = answer.failed
+    fits = Text("fits its task", "green")
+    if failed is not None:
+        fits = Text(f"does not fit its task at {failed['subtask']}: {failed['reason']}", "bold red")
+    after = "end" if then is None else f"{then.name} {then.object}"
     head = Text.assemble((f"{answer.t:9.2f} s  ", "bold"), (f"{step.name} {step.object or ''}", "bold cyan"),
-                         f"  next: {'end' if then is None else f'{then.name} {then.object}'}  ", fits)  # fmt: skip
+                         f"  next: {after}  ", fits)  # fmt: skip
     bars = Table.grid(padding=(0, 1))
     for k, (s, p) in enumerate(zip(watcher.filter.steps, answer.probabilities.tolist(), strict=True)):
         start = next((f"{c.t:.3f} ± {c.sd:.3f} s" for c in reversed(watcher.crossings) if c.step is s), "")
@@ -84,9 +86,8 @@ def picture(
     for name, prop, mean, sd in answer.properties:
         scale, unit = (1.0, "N") if prop == "weight" else (100.0, "cm")
         known.add_row(f"{name} {prop}", f"{mean * scale:.3f}", f"{sd * scale:.3f}", unit)
-    signals = Group(
-        Text("grip    " + spark([g for _, g, _ in kept])), Text("lifting " + spark([y for *_, y in kept]))
-    )
+    grip, lifting = spark([g for _, g, _ in kept]), spark([y for *_, y in kept])
+    signals = Group(Text("grip    " + grip), Text("lifting " + lifting))
     return Group(head, Columns([bars, known]), signals, *[Text(note, "yellow") for note in notes])
 
 

@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 WHERE = "standard input"
 LagOption = Annotated[float, typer.Option(
-    "--lag", metavar="S", min=0.0, help="How long a boundary is waited for before it is settled [s].")]  # fmt: skip
+    "--lag", metavar="S", min=0.0, help="How long a boundary is waited for [s].")]  # fmt: skip
 PlotOption = Annotated[bool, typer.Option(
     "--plot", help="Show it live in the terminal (standard error).")]  # fmt: skip
 SkipOption = Annotated[bool, typer.Option(
-    "--skip-bad-rows", help="Leave out rows that cannot be read, and say so, instead of stopping.")]  # fmt: skip
+    "--skip-bad-rows", help="Leave out rows that cannot be read, instead of stopping.")]  # fmt: skip
 SAID = {
-    "gaps": "gaps between rows", "late": "late rows put in their place", "repeated": "repeated rows counted once",
+    "gaps": "gaps between rows", "late": "late rows put in their place",
+    "repeated": "repeated rows counted once",
     "too late": "rows later than the lag left out", "contradictory": "second rows for one time left out",
     "bad": "rows that cannot be read left out",
 }  # fmt: skip
@@ -33,7 +34,8 @@ SAID = {
 
 def watch(
     task: TaskOption, rig: RigOption, lag: LagOption = 1.0, plot: PlotOption = False,
-    skip_bad_rows: SkipOption = False, json: JsonOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+    skip_bad_rows: SkipOption = False, json: JsonOption = None, seed: SeedOption = 0,
+    quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Follow a task while it runs: a CSV header then rows on standard input, one JSON line out per row."""
     from hmmseg.online.watcher import Watcher

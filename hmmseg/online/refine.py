@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 REACH = 0.6  # s before a boundary: what is read of the subtask that it ends
 FINE = 100.0  # Hz; in faster recordings the filter itself places touches
-SCALES = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
+SCALES: tuple[str, ...] = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
 
 
 def refined(
@@ -46,8 +46,8 @@ def refined(
     if touch and 1.0 / np.median(np.diff(t)) > FINE:
         return None
     table = np.array([each[1] for each in rows])
-    there = ~np.isnan(table).all(axis=0)
-    names = [name for name, known in zip(filter_.channels, there, strict=True) if known]
+    there = np.flatnonzero((~np.isnan(table)).any(axis=0))
+    names = [filter_.channels[i] for i in there]
     trial = Trial("stream", t, {name: table[:, filter_.channels.index(name)] for name in names})
     if set(filter_.channels) - set(names) - set(filter_.optional):
         return None
