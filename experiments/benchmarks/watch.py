@@ -172,22 +172,19 @@ def main() -> None:
 
 def draw(by_lag: dict) -> None:
     """Error of settled boundaries against the lag, beside the segmentation of the whole recording."""
-    import matplotlib.pyplot as plt
-
-    from hmmseg.plot.style import style
+    from hmmseg.plot.style import canvas
 
     lags = [lag for lag in LAGS if str(lag) in by_lag]
-    with style():
-        figure, axes = plt.subplots(figsize=(5.2, 3.2), layout="constrained")
+    with canvas(FIGURE, 5.2, 3.2) as figure:
+        axes = figure.subplots()
         for key, label, marker in (("median_ms", "median", "o-"), ("q90_ms", "90 % of boundaries", "s-")):
             line = axes.plot(lags, [by_lag[str(lag)][key] for lag in lags], marker, label=label)[0]
             axes.axhline(by_lag["off line"][key], color=line.get_color(), linestyle=":",
                          label=f"{label}, whole recording")  # fmt: skip
-        axes.set(xlabel="lag [s]", ylabel="error of a boundary [ms]", xscale="symlog", ylim=(0, None))
+        axes.set(xlabel="lag [s]", ylabel="error of a boundary [ms]", ylim=(0, None))
         axes.set_xscale("symlog", linthresh=0.05)
         axes.set_xticks(lags, [f"{lag:g}" for lag in lags])
-        axes.legend(fontsize=8)
-        figure.savefig(FIGURE, dpi=150)
+        axes.legend()
 
 
 if __name__ == "__main__":
