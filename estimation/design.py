@@ -7,8 +7,10 @@ channel c:
 
 A holds gravity factors (force), ones (distance) and coefficients of heights (rise), J finite
 differences through the hand. `unit` is the quantity that the channel's equation is built on: the
-carried force, the pads' give along the grip, their shear deflection. What the equation leaves out is
-stated as a share of it: one that all grips have in common, one that differs from grip to grip.
+carried force, the pads' give along the grip, what their shear deflection differs by between pickup
+and place. What the equation leaves out is stated as a share of it: one that all grips have in common,
+one that differs from grip to grip. Beside the means stand slopes over the pads' give within a grip
+(`estimation.compliance`), which show these shares themselves (unit 1), whatever the block.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.combinations import Terms, simplest_combinations
-from estimation.nuisance import Nuisance, nuisances
+from estimation.compliance import shear_give, squeeze_give, unexpected_share, unit_pads
+from estimation.nuisance import Nuisance, PadDoubt, nuisances
 from estimation.observations import (
     CHANNELS,
     Aligned,
@@ -37,7 +40,7 @@ from hmmseg.segmentation.features import thin
 
 PROPERTIES = ("weight", "width", "height")
 FORCE, DISTANCE, RISE = range(len(CHANNELS))
-RIGID = 4000.0  # N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
+READINGS = {DISTANCE: "distance", RISE: "place"}  # the samples whose slopes show the pads
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,12 @@ class Design:
 
     `mean`, `variance` (K,) of the observations, drawn alignments combined; `coefficients` (K, Q);
     `shifts` (K, N) per standard deviation of each deviation; `channel` (K,) indexes CHANNELS;
-    `unit` (K,): what shares of model error are taken of; `trial`, `move` (K,): where it was seen.
+    `unit` (K,): what shares of model error are taken of; `trial`, `move` (K,): where it was seen;
+    `slope` (K,): whether a slope over the give rather than a mean (its shares are those of the mean).
     `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
     free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
-    that free motion shows and the rig does not admit; `level_rises`: by move between equal heights,
-    the mean rise that was recorded [m].
+    that free motion shows and the rig does not admit, `doubt`: the like of the pads; `level_rises`: by
+    move between equal heights, the mean rise that was recorded [m].
     """
 
     unknowns: tuple[Unknown, ...]
@@ -85,11 +89,13 @@ class Design:
     unit: np.ndarray
     trial: np.ndarray
     move: np.ndarray
+    slope: np.ndarray
     free_mean: np.ndarray
     free_variance: np.ndarray
     free_shifts: np.ndarray
     scale_count: np.ndarray
     unexpected: tuple[Nuisance, ...] = ()
+    doubt: PadDoubt = field(default_factory=PadDoubt)
     level_rises: dict[int, float] = field(default_factory=dict)
 
     @property
@@ -98,8 +104,8 @@ class Design:
         return tuple(u.name for u in self.unknowns)
 
     def repeats(self) -> np.ndarray:
-        """By channel (3,): observations beyond the unknowns they determine, all that tell scatter."""
-        counts = np.bincount(self.channel, minlength=len(CHANNELS))
+        """By channel (3,): means beyond the unknowns they determine, all that tell scatter."""
+        counts = np.bincount(self.channel[~self.slope], minlength=len(CHANNELS))
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
 
@@ -112,6 +118,44 @@ def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) 
         means = {k: _mean(w, values[k], counts[k]) for k, w in weights.items()}
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
+
+
+def observe_slopes(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+    """Slopes of readings over the pads' give (num_moves, 3) of one trial, NaN where there is none."""
+    values, out = channel_values(signals, rig), np.full((len(moves), len(CHANNELS)), np.nan)
+    for i, move in enumerate(moves):
+        for c, reading in READINGS.items():
+            found = aligned.weights.slopes.get(move, {}).get(CHANNELS[c])
+            if found is not None:
+                out[i, c] = found.weights @ np.nan_to_num(values[reading])
+    return out
+
+
+def _slope_variance(aligned: Aligned, moves: Sequence[int]) -> np.ndarray:
+    """Variances (num_moves, 3) of the slopes, infinite of none."""
+    found = [[aligned.weights.slopes.get(m, {}).get(name) for name in CHANNELS] for m in moves]
+    return np.array([[np.inf if s is None else s.variance for s in row] for row in found])
+
+
+def _pad_doubt(slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[Aligned], rig: Rig) -> PadDoubt:
+    """What slopes (num_trials, num_moves, 3) say against the rig's pads, and a usual grip force."""
+    admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
+    found = {}
+    for c, stiffness in ((DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness)):
+        seen = np.isfinite(slopes[..., c])
+        stated = bool(np.isfinite(stiffness))
+        found[c] = unexpected_share(
+            slopes[..., c][seen], variance[..., c][seen], stated, admitted if stated else 0.0
+        )
+    squeeze = np.concatenate([_squeeze(a) for a in aligned])
+    # A width reads too small by the share of the give that the rig leaves out, a height too large.
+    return PadDoubt(-found[DISTANCE], found[RISE], max(float(np.median(squeeze)), 1e-3))
+
+
+def _squeeze(aligned: Aligned) -> np.ndarray:
+    """Mean grip force of one finger (num_moves,) [N]."""
+    force = np.nan_to_num(aligned.signals.fx1 - aligned.signals.fx2) / 2
+    return np.array([np.mean(w["distance"] @ force) for w in aligned.weights.grips.values()])
 
 
 def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -140,26 +184,38 @@ def build(
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
     free_mean, free_variance = _free(aligned, noise)
     surprise = unexpected_bias(free_mean, free_variance, rig)
-    deviations = nuisances(rig, surprise, max(trial.touch_sd for trial in trials))
+    slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in aligned])  # T, M, 3
+    slopes[..., ~there.any(axis=(0, 1))] = np.nan  # of channels that tell no unknown
+    slope_variance = np.stack([_slope_variance(a, moves) for a in aligned])
+    doubt = _pad_doubt(slopes, slope_variance, aligned, rig)
+    deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}
     shifts = np.zeros((*there.shape, len(deviations)))
+    slope_shifts = np.zeros((*there.shape, len(deviations)))
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))
     for j, deviation in enumerate(deviations):
         for i, (trial, a) in enumerate(zip(trials, aligned, strict=True)):
-            read = thin(deviation.read(trial, rig, deviation.step), _rate(a.signals))
-            slope = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) / deviation.step
-            shifts[i, ..., j] = slope * deviation.sd
-            slope = (free_mean[i] - free_forces(read, a)) / deviation.step
-            free_shifts[i, :, j] = slope * deviation.sd
-    where = np.nonzero(there)
+            read, size = thin(deviation.read(trial, rig, deviation.step), _rate(a.signals)), deviation.sd
+            change = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) / deviation.step
+            shifts[i, ..., j] = change * size
+            change = np.nan_to_num(slopes[i] - observe_slopes(read, a, rig, moves)) / deviation.step
+            slope_shifts[i, ..., j] = change * size
+            free_shifts[i, :, j] = (free_mean[i] - free_forces(read, a)) / deviation.step * size
+    where, steep = np.nonzero(there), np.nonzero(np.isfinite(slopes))
     mean, spread, rows = _combined(raw, variance, valid, coefficients, where)
+    rows = np.concatenate([rows, np.zeros((steep[0].size, len(unknowns)))])
+    shifts = np.concatenate([shifts[where], slope_shifts[steep]])
     counts = [noise.count["force"], noise.count["distance"], noise.count["pickup"] + noise.count["place"]]
     return Design(
-        unknowns=unknowns, nuisances=deviations, mean=mean, variance=spread, coefficients=rows,
-        shifts=shifts[where], channel=where[2], unit=_units(aligned, raw, rig)[where], trial=where[0],
-        move=where[1], free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
+        unknowns=unknowns, nuisances=deviations, mean=np.concatenate([mean, slopes[steep]]),
+        variance=np.concatenate([spread, slope_variance[steep]]), coefficients=rows, shifts=shifts,
+        channel=np.concatenate([where[2], steep[2]]),
+        unit=np.concatenate([_units(aligned, raw, rig)[where], np.ones(steep[0].size)]),
+        trial=np.concatenate([where[0], steep[0]]), move=np.concatenate([where[1], steep[1]]),
+        slope=np.repeat([False, True], [where[0].size, steep[0].size]),
+        free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
         scale_count=np.array(counts), unexpected=tuple(d for d in deviations if d.name in surprising),
-        level_rises=_level_rises(raw, rises),
+        doubt=doubt, level_rises=_level_rises(raw, rises),
     )  # fmt: skip
 
 
@@ -236,18 +292,22 @@ def _combined(
 
 
 def _units(aligned: Sequence[Aligned], raw: np.ndarray, rig: Rig) -> np.ndarray:
-    """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m]."""
-    tip = rig.fingertip
-    normal = tip.normal_stiffness if np.isfinite(tip.normal_stiffness) else RIGID
-    shear = tip.shear_stiffness if np.isfinite(tip.shear_stiffness) else RIGID
+    """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
+
+    Of a rise at least the give under the weight: contact forces that balance leave other errors.
+    """
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
-    squeeze = [np.nan_to_num(a.signals.fx1 - a.signals.fx2) for a in aligned]
-    grip = np.array([
-        [np.mean(w["distance"] @ s) for w in a.weights.grips.values()]
-        for a, s in zip(aligned, squeeze, strict=True)
-    ])  # fmt: skip
-    return np.stack([force, np.maximum(grip, 1e-3) / normal, np.maximum(force, 1e-3) / (2 * shear)], axis=-1)
+    grip, lever = [], []
+    for a in aligned:
+        squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
+        grips = a.weights.grips.values()
+        grip.append([np.mean(w["distance"] @ squeeze) for w in grips])
+        lever.append([np.mean(w["place"] @ shear) - np.mean(w["pickup"] @ shear) for w in grips])
+    hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
+    rise = np.array(lever)
+    rise = np.where(rise < 0, -1.0, 1.0) * np.maximum(np.abs(rise), hanging)
+    return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
 
 
 def _free(aligned: Sequence[Aligned], noise: Noise) -> tuple[np.ndarray, np.ndarray]:

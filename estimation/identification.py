@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation.actual import Actual
+from estimation.compliance import unit_pads
 from estimation.design import Design, Unknown, build
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.observations import CHANNELS, Aligned, Noise, aligned_weights
@@ -190,6 +191,7 @@ def identify_aligned(
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
     ]
+    warnings += _soft_pads(design, rig)
     warnings += _unnamed(aligned.task, design)
     return Identification(
         aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in kept[:num]),
@@ -242,6 +244,24 @@ def _not_recorded(aligned: AlignedTrials, obj: str, prop: str) -> str:
     if not needed:
         return f"no subtask of this task lifts {obj}"
     return f"the recording does not show {' and '.join(needed)} as the task has it"
+
+
+def _soft_pads(design: Design, rig: Rig) -> list[str]:
+    """Pads that give otherwise than the rig says, as every grip shows while its force changes."""
+    out, tip = [], unit_pads(rig)
+    for kind, share, compliance in (
+        ("normal", design.doubt.normal, tip.normal1), ("shear", design.doubt.shear, tip.shear1),
+    ):  # fmt: skip
+        stated = getattr(rig.fingertip, f"{kind}_stiffness")
+        if not share:
+            continue
+        true = compliance * (share + (1.0 if np.isfinite(stated) else 0.0))
+        seen = f"about {1 / true:.2g} N/m" if true > 0 else "no give at all, or forces that are late"
+        out.append(
+            f"[fingertip] {kind}_stiffness = {stated:g}, but readings within each grip show {seen}: "
+            f"{'widths' if kind == 'normal' else 'heights'} allow for it"
+        )
+    return out
 
 
 def _unnamed(task: BlockTask, design: Design) -> list[str]:

@@ -12,9 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.compliance import unit_pads
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial
+
+# A pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off by as
+# much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
+MOST_BENT = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,17 +55,45 @@ def _longer_link(finger: int, link: int):
     return read
 
 
-def _stiffer_pad(finger: int):
+@dataclass(frozen=True)
+class PadDoubt:
+    """What recordings show of the pads and the rig does not admit: how much softer they are, as shares.
+
+    Along the grip and in shear, 0 for no doubt: the compliance is 1 + share times the nominal, and its
+    extra prior sd is as large. `squeeze` is a usual grip force of one finger [N].
+    """
+
+    normal: float = 0.0
+    shear: float = 0.0
+    squeeze: float = 1.0
+
+
+def _softer_pad(finger: int, axis: str):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """A stiffer pad gives less: its face lies elsewhere under the same force."""
-        signals, tip, moved = task_space(trial, rig), rig.fingertip, {}
-        for axis, stiffness in (("x", tip.normal_stiffness), ("y", tip.shear_stiffness)):
-            force = getattr(signals, f"f{axis}{finger}")
-            position = getattr(signals, f"{axis}{finger}")
-            moved[f"{axis}{finger}"] = position - force / stiffness * (1 / (1 + size) - 1)
+        """A pad whose compliance is 1 + size of the nominal: its face lies elsewhere under a force."""
+        signals, name = task_space(trial, rig), f"{axis}{finger}"
+        give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
+        return replace(signals, **{name: getattr(signals, name) - give * size})
+
+    return read
+
+
+def _bent_pads(squeeze: float):
+    def read(trial: Trial, rig: Rig, size: float) -> Signals:
+        """Pads that give as force^(1 + size), as the nominal at the force `squeeze`; to first order."""
+        signals, moved = task_space(trial, rig), {}
+        for finger in (1, 2):
+            force = getattr(signals, f"fx{finger}")
+            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * squeeze) / squeeze)
+            moved[f"x{finger}"] = getattr(signals, f"x{finger}") - _compliance(rig, finger, "x") * bend * size
         return replace(signals, **moved)
 
     return read
+
+
+def _compliance(rig: Rig, finger: int, axis: str) -> float:
+    """Of one pad [m/N]: along the grip (x) or in shear (y)."""
+    return getattr(unit_pads(rig), ("normal" if axis == "x" else "shear") + str(finger))
 
 
 def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
@@ -69,10 +102,11 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
     return replace(signals, x1=signals.x1 - size / 2, x2=signals.x2 + size / 2)
 
 
-def nuisances(rig: Rig, biased: np.ndarray, touch_sd: float = 0.0) -> tuple[Nuisance, ...]:
-    """The deviations that the rig admits; `biased` (4,): extra prior sd of each force bias [N].
+def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0.0) -> tuple[Nuisance, ...]:
+    """The deviations that the rig admits, and those that recordings show beside.
 
-    `touch_sd` [m]: how well the distance is known at which the fingers touch a block.
+    `biased` (4,): extra prior sd of each force bias [N]; `doubt`: of the pads' compliances; `touch_sd`
+    [m]: how well the distance is known at which the fingers touch a block.
     """
     s, out = rig.systematic, []
     for i, name in enumerate(FORCE_CHANNELS):
@@ -92,10 +126,17 @@ def nuisances(rig: Rig, biased: np.ndarray, touch_sd: float = 0.0) -> tuple[Nuis
             if s.link_length[i] > 0:
                 out.append(Nuisance(f"link_length.{finger}{link + 1}", s.link_length[i], 1e-5,
                                     _longer_link(finger, link)))  # fmt: skip
-    for finger in (1, 2):
-        if s.pad_stiffness[finger - 1] > 0 and np.isfinite(rig.fingertip.normal_stiffness):
-            out.append(Nuisance(f"pad_stiffness.{finger}", s.pad_stiffness[finger - 1], 1e-3,
-                                _stiffer_pad(finger)))  # fmt: skip
+    # What slopes show is compliance and exponent together, so either may be off by as much as both.
+    bent = min(max(abs(doubt.normal), *s.pad_stiffness) / np.log(2), MOST_BENT)
+    extra = {"normal": float(np.hypot(doubt.normal, bent)) if doubt.normal else 0.0, "shear": doubt.shear}
+    for axis, kind in (("x", "normal"), ("y", "shear")):
+        rigid = np.isinf(getattr(rig.fingertip, f"{kind}_stiffness"))
+        for finger in (1, 2):
+            sd = float(np.hypot(0.0 if rigid else s.pad_stiffness[finger - 1], extra[kind]))
+            if sd > 0:
+                out.append(Nuisance(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pad(finger, axis)))
+    if any(n.name.startswith("pad_normal") for n in out):
+        out.append(Nuisance("pad_exponent", bent, 1e-3, _bent_pads(doubt.squeeze)))
     if touch_sd > 0:
         out.append(Nuisance("touch", touch_sd, 1e-5, _wider))
     return tuple(out)

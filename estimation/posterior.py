@@ -4,25 +4,28 @@ Given the noise scale s_c and the share k_c of model error that differs from gri
 channel c, all else is jointly Gaussian: properties, deviations of the hand z and the share e_c of
 model error that all grips have alike,
 
-    mean = A q + J z + unit e_c + N(0, s_c^2 variance + (k_c unit)^2),
-    z ~ N(0, 1) and as free motion has it,    e_c ~ N(0, COMMON_c^2 + k_c^2).
+    mean = A q + J z + unit (e_c + own) + N(0, s_c^2 variance),        own ~ N(0, k_c^2),
+    slope = J z + e_c + own + f_c + other + N(0, s_c^2 variance),        other ~ N(0, k_c^2),
+    z ~ N(0, 1) and as free motion has it,    e_c ~ N(0, COMMON_c^2 + k_c^2),  f_c ~ N(0, SLOPE_SD^2 + k_c^2).
 
 (What all grips have alike no repeat can show. It is at least what the prior says and at least as
-large as what differs between them.) An unknown q belongs to one channel, so it is eliminated there:
-what remains of a channel is a small quadratic form in (z, e_c) that depends on r_c = (k_c / s_c)^2
-alone, once 1 / s_c^2 is taken out. It is tabulated over r_c, and log_prob takes the same time
-whatever the number of blocks, grips and trials. Unknowns have a flat prior in here; their own is put
-in when they are drawn (`estimation.sampler`).
+large as what differs between them. A slope shows the same shares as its grip's mean, but a grip that
+does not follow its equation is no reliable witness of it.) An unknown q belongs to one channel, so it is
+eliminated there: what remains of a channel is a small quadratic form in (z, e_c, f_c) that depends on
+r_c = (k_c / s_c)^2 alone, once 1 / s_c^2 is taken out. It is tabulated over r_c, and log_prob takes the
+same time whatever the number of blocks, grips and trials. Unknowns have a flat prior in here; their own
+is put in when they are drawn (`estimation.sampler`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from estimation import priors
+from estimation.compliance import SLOPE_SD
 from estimation.design import Design
 from estimation.observations import CHANNELS
 
@@ -35,11 +38,14 @@ REACH = (-18.0, 26.0)  # of the table about the prior median of log r; priors le
 class Posterior:
     """Posterior of a design; scales theta are log s_c (3) and log(k_c / its prior median) (3).
 
-    `reference` (Q,): least squares, about which all else is written to keep its digits.
+    `reference` (Q,): least squares, about which all else is written to keep its digits. `rows` is the
+    design with independent observations, `levers` (K, 2) what e and f move them by (`independent`).
     """
 
     design: Design
     reference: np.ndarray
+    rows: Design
+    levers: np.ndarray
 
     @cached_property
     def scale_sd(self) -> np.ndarray:
@@ -65,16 +71,21 @@ class Posterior:
         return [_tabulate(self, c) for c in range(NUM_CHANNELS)]
 
     def channel_rows(self, c: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of one channel: rows A (n, Q_c), rows [J, unit] (n, N + 1), residuals (n,), which Q_c."""
-        d, mine = self.design, self.design.channel == c
+        """Of one channel: rows A (n, Q_c), rows [J, levers] (n, N + 2), residuals (n,), which Q_c."""
+        d, mine = self.rows, self.rows.channel == c
         which = np.array([i for i, u in enumerate(d.unknowns) if priors.CHANNEL[u.prop] == c], int)
-        shared = np.concatenate([d.shifts[mine], d.unit[mine, None]], axis=1)
+        shared = np.concatenate([d.shifts[mine], self.levers[mine]], axis=1)
         rows = d.coefficients[mine][:, which]
         return rows, shared, d.mean[mine] - rows @ self.reference[which], which
 
     def shares(self, theta: np.ndarray) -> np.ndarray:
         """Share (..., 3) of model error that differs from grip to grip."""
         return priors.SCATTER_MEDIAN * np.exp(theta[..., NUM_CHANNELS:])
+
+    def common(self, theta: np.ndarray) -> np.ndarray:
+        """Prior variances (..., 6) of the shares e and f that all grips have alike."""
+        own = self.shares(theta) ** 2
+        return np.concatenate([priors.COMMON**2 + own, SLOPE_SD**2 + own], axis=-1)
 
     def log_prior(self, theta: np.ndarray) -> np.ndarray:
         """Log prior (W,) of scales (W, 6), up to a constant."""
@@ -85,19 +96,20 @@ class Posterior:
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
         """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant."""
         num = len(self.design.nuisances)
-        size, log_s = num + NUM_CHANNELS, theta[:, :NUM_CHANNELS]
-        common = priors.COMMON**2 + self.shares(theta) ** 2
+        size, log_s = num + 2 * NUM_CHANNELS, theta[:, :NUM_CHANNELS]
+        common = self.common(theta)
         precision, gradient = np.zeros((len(theta), size, size)), np.zeros((len(theta), size))
         precision[:, :num, :num], gradient[:, :num] = self.hand_precision, self.hand_gradient
         out = self.log_prior(theta) - 0.5 * np.log(common).sum(axis=1)
         for c, table in enumerate(self._tables):
-            precision[:, num + c, num + c] += 1 / common[:, c]
+            for k in (c, NUM_CHANNELS + c):
+                precision[:, num + k, num + k] += 1 / common[:, k]
             if not table.count:
                 continue
             log_r = 2 * (theta[:, NUM_CHANNELS + c] - log_s[:, c])
             weight = np.exp(-2 * log_s[:, c])
             squares, log_det, quadratic, linear = table.at(log_r)
-            mine = [*range(num), num + c]
+            mine = [*range(num), num + c, num + NUM_CHANNELS + c]
             precision[:, np.ix_(mine, mine)[0], np.ix_(mine, mine)[1]] += weight[:, None, None] * quadratic
             gradient[:, mine] += weight[:, None] * linear
             out -= 0.5 * (2 * table.count * log_s[:, c] + log_det + weight * squares)
@@ -106,20 +118,20 @@ class Posterior:
         return out + 0.5 * (white**2).sum(axis=1) - np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
 
     def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (W, Q + N + 3) and Cholesky factor of the precision of (q, z, e) given scales (W, 6).
+        """Mean (W, Q + N + 6) and Cholesky factor of the precision of (q, z, e, f) given scales (W, 6).
 
         q relative to `reference`. Worked out from all observations, without the table.
         """
         d = self.design
         num_q, num = len(d.unknowns), len(d.nuisances)
-        size = num_q + num + NUM_CHANNELS
+        size = num_q + num + 2 * NUM_CHANNELS
         hand = slice(num_q, num_q + num)
         precision, gradient = np.zeros((len(theta), size, size)), np.zeros((len(theta), size))
         precision[:, hand, hand], gradient[:, hand] = self.hand_precision, self.hand_gradient
-        shares = self.shares(theta)
+        d, shares, common = self.rows, self.shares(theta), self.common(theta)
         for c in range(NUM_CHANNELS):
             rows, shared, residual, which = self.channel_rows(c)
-            mine = [*which, *range(num_q, num_q + num), num_q + num + c]
+            mine = [*which, *range(num_q, num_q + num), num_q + num + c, num_q + num + NUM_CHANNELS + c]
             every = np.concatenate([rows, shared], axis=1)
             own = d.channel == c
             variance = np.exp(2 * theta[:, [c]]) * d.variance[own] + (shares[:, [c]] * d.unit[own]) ** 2
@@ -127,7 +139,8 @@ class Posterior:
             block = (1 / variance @ outer).reshape(len(theta), len(mine), len(mine))
             precision[:, np.array(mine)[:, None], np.array(mine)] += block
             gradient[:, mine] += (residual / variance) @ every
-            precision[:, mine[-1], mine[-1]] += 1 / (priors.COMMON[c] ** 2 + shares[:, c] ** 2)
+            for k, place in ((c, mine[-2]), (NUM_CHANNELS + c, mine[-1])):
+                precision[:, place, place] += 1 / common[:, k]
         chol = np.linalg.cholesky(precision)
         mean = np.linalg.solve(np.swapaxes(chol, 1, 2), np.linalg.solve(chol, gradient[..., None]))
         return mean[..., 0], chol
@@ -137,15 +150,48 @@ def posterior(design: Design) -> Posterior:
     """The posterior of a design that determines at least one unknown."""
     sd = np.sqrt(design.variance)
     found, *_ = np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)
-    return Posterior(design, found)
+    return Posterior(design, found, *independent(design))
+
+
+def independent(design: Design) -> tuple[Design, np.ndarray]:
+    """The design with each grip's mean and slope turned into two independent rows, and levers (K, 2).
+
+    Their covariance is s^2 D + k^2 B, D diagonal, B = [[unit^2, unit], [unit, 2]]: the eigenvectors of
+    D^-1/2 B D^-1/2 make both diagonal whatever s and k. New rows have the mean's variance.
+    """
+    d = design
+    keys = list(zip(d.trial, d.move, d.channel, strict=True))
+    slopes = {key: i for i, key in enumerate(keys) if d.slope[i]}
+    means = [i for i, key in enumerate(keys) if not d.slope[i] and key in slopes]
+    levers = np.stack([d.unit, np.where(d.slope, 1.0, 0.0)], axis=1)
+    if not means:
+        return replace(d, unit=np.where(d.slope, np.sqrt(2.0), d.unit)), levers
+    first, second = np.array(means), np.array([slopes[keys[i]] for i in means])
+    sd = np.sqrt(d.variance[first] / d.variance[second])  # of the mean, in units of the slope's
+    own = np.array([[d.unit[first] ** 2, d.unit[first] * sd], [d.unit[first] * sd, 2 * sd**2]])
+    values, vectors = np.linalg.eigh(np.moveaxis(own, -1, 0))
+
+    def turned(rows: np.ndarray) -> np.ndarray:
+        out, shape = rows.copy(), (-1, *(1,) * (rows.ndim - 1))
+        a, b = rows[first], sd.reshape(shape) * rows[second]
+        for target, k in ((first, 1), (second, 0)):
+            weight = vectors[:, :, k]
+            out[target] = weight[:, 0].reshape(shape) * a + weight[:, 1].reshape(shape) * b
+        return out
+
+    variance, unit = d.variance.copy(), np.where(d.slope, np.sqrt(2.0), d.unit)
+    variance[second] = d.variance[first]
+    unit[first], unit[second] = np.sqrt(np.maximum(values.T[::-1], 0.0))
+    rows = {name: turned(getattr(d, name)) for name in ("mean", "coefficients", "shifts")}
+    return replace(d, **rows, unit=unit, variance=variance), turned(levers)
 
 
 @dataclass(frozen=True)
 class _Table:
-    """One channel's unknowns eliminated, on a grid of log r: rows (G, 2 + (N + 1)^2 + (N + 1)).
+    """One channel's unknowns eliminated, on a grid of log r: rows (G, 2 + (N + 2)^2 + (N + 2)).
 
     `count`: observations less unknowns. Columns: sum of squares, log determinants, quadratic form
-    and linear term in (z, e), all for s = 1.
+    and linear term in (z, e, f), all for s = 1.
     """
 
     count: int
@@ -168,10 +214,10 @@ def _tabulate(post: Posterior, c: int) -> _Table:
     rows, shared, residual, _ = post.channel_rows(c)
     if not len(rows):
         return _Table(0, np.zeros((0, 0)))
-    mine = post.design.channel == c
-    unit2 = (priors.SCATTER_MEDIAN[c] * post.design.unit[mine]) ** 2
+    mine = post.rows.channel == c
+    unit2 = (priors.SCATTER_MEDIAN[c] * post.rows.unit[mine]) ** 2
     grid = np.exp(np.arange(REACH[0], REACH[1] + STEP, STEP))
-    variance = post.design.variance[mine] + grid[:, None] * unit2  # G, n
+    variance = post.rows.variance[mine] + grid[:, None] * unit2  # G, n
     every = np.concatenate([rows, shared, residual[:, None]], axis=1)
     size = every.shape[1]
     outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), size**2)

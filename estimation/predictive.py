@@ -64,13 +64,13 @@ def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> Predictive
     new = rng.normal(size=z.shape)
     p_values, excess, repeats, warnings = {}, {}, {}, []
     for c, name in enumerate(CHANNELS):
-        mine = d.channel == c
+        mine = (d.channel == c) & ~d.slope
         if not mine.any():
             continue
         observed, replicated = ((v[:, mine] ** 2).sum(axis=1) for v in (z, new))
         p_values[name] = float(np.mean(replicated >= observed))
         share = priors.SCATTER_MEDIAN[c] * np.exp(scales[:, NUM_CHANNELS + c])
-        excess[name] = float(np.median(share) * np.mean(d.unit[mine]))
+        excess[name] = float(np.median(share) * np.mean(np.abs(d.unit[mine])))
         repeats[name] = int(d.repeats()[c])
         if p_values[name] < SMALL:
             warnings.append(f"{MEANING[name]} by more than sensor noise (p {p_values[name]:.3f})")

@@ -42,7 +42,7 @@ class Draws:
     """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
 
     `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest
-    split R-hat over scales, walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 3):
+    split R-hat over scales, walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6):
     of model error that all grips have alike; `deviations` (walkers, steps, N) of the hand.
     `apart`: largest distance of the chain's mean scales from those of importance-weighted draws, in
     posterior sds; None where these are too few. `method`: "emcee", or "laplace" for those draws, which
@@ -153,7 +153,7 @@ def _apart(chain: np.ndarray, drawn: np.ndarray, weight: np.ndarray) -> float:
 def draw_unknowns(
     post: Posterior, theta: np.ndarray, random: np.random.RandomState
 ) -> tuple[np.ndarray, float]:
-    """Draws (W, Q + N + 3) of unknowns, deviations and common shares, one for each row of scales.
+    """Draws (W, Q + N + 6) of unknowns, deviations and common shares, one for each row of scales.
 
     They come from the conditional Gaussian, whose prior of the unknowns is flat, and are resampled
     by the unknowns' own prior (systematically, so order is kept). Also the share of draws that this

@@ -8,6 +8,7 @@ from estimation_scene import TRUE, drawn, make_design
 from scipy import stats
 
 from estimation import priors
+from estimation.compliance import SLOPE_SD
 from estimation.posterior import REACH, STEP, posterior
 
 FLAT = 1e3  # sd of a prior that is flat against a width of micrometres, but not so flat that digits go
@@ -69,7 +70,8 @@ def test_the_conditional_gaussian_is_that_of_the_joint_one(deviations):
     post = posterior(design)
     theta = some_scales(3)
     means, chols = post.given(theta)
-    for row, mean, chol in zip(theta, means, chols, strict=True):
+    kept = slice(0, means.shape[1] - 3)  # without what slopes have alike: there are none
+    for row, mean, chol in zip(theta, means[:, kept], chols[:, kept, kept], strict=True):
         every, prior, noise, data = dense(design, row, post.reference)
         gain = prior @ every.T @ np.linalg.inv(every @ prior @ every.T + np.diag(noise))
         covariance = prior - gain @ every @ prior
@@ -98,7 +100,9 @@ def test_the_table_stands_for_the_sums_over_observations():
             squares, log_det, quadratic, linear = post._tables[c].at(np.array([log_r]))
             assert squares[0] == pytest.approx(rest[-1, -1], rel=1e-4)
             assert log_det[0] == pytest.approx(np.linalg.slogdet(normal)[1] - np.log(weight).sum(), rel=1e-5)
-            np.testing.assert_allclose(quadratic[0], rest[:-1, :-1], rtol=1e-4, atol=1e-4 * rest[-2, -2])
+            np.testing.assert_allclose(
+                quadratic[0], rest[:-1, :-1], rtol=1e-4, atol=1e-4 * rest[:-1, :-1].max()
+            )
             np.testing.assert_allclose(
                 linear[0], rest[:-1, -1], rtol=1e-3, atol=1e-4 * np.abs(rest[:-1, -1]).max()
             )
@@ -109,7 +113,7 @@ def test_a_channel_without_observations_keeps_its_prior():
     kept = design.channel < 2
     less = {
         k: getattr(design, k)[kept]
-        for k in ("mean", "variance", "shifts", "channel", "unit", "trial", "move")
+        for k in ("mean", "variance", "shifts", "channel", "unit", "trial", "move", "slope")
     }
     cut = replace(design, unknowns=design.unknowns[:2], coefficients=design.coefficients[kept][:, :2], **less)
     post = posterior(cut)
@@ -120,7 +124,7 @@ def test_a_channel_without_observations_keeps_its_prior():
     np.testing.assert_allclose(found - found[0], expected, atol=1e-9)
     assert cut.repeats().tolist() == [3, 3, 0]
     mean, _ = post.given(theta)
-    np.testing.assert_allclose(mean[:, -1], 0.0)  # the share of a channel that shows nothing
+    np.testing.assert_allclose(mean[:, -4], 0.0)  # the share of a channel that shows nothing
 
 
 def test_least_squares_is_the_reference():
@@ -159,3 +163,58 @@ def test_prior_of_a_difference_is_symmetric():
     values = np.array([-0.02, 0.02])
     low, high = priors.log_prior("height", np.array([1, -1]), values)
     assert low == pytest.approx(high)
+
+
+def with_slopes(design, seed=11):
+    """The design with a slope beside each mean of widths and heights, and what it stands for."""
+    means = np.flatnonzero(design.channel > 0)
+    rng = np.random.default_rng(seed)
+    more = {
+        "mean": 0.2 * rng.normal(size=means.size), "variance": np.full(means.size, 0.1**2),
+        "coefficients": np.zeros((means.size, len(design.unknowns))),
+        "shifts": 0.1 * rng.normal(size=(means.size, len(design.nuisances))),
+        "channel": design.channel[means], "unit": np.ones(means.size), "trial": design.trial[means],
+        "move": design.move[means], "slope": np.ones(means.size, bool),
+    }  # fmt: skip
+    joined = {k: np.concatenate([getattr(design, k), v]) for k, v in more.items()}
+    return replace(design, **joined), means
+
+
+def test_means_and_slopes_share_a_grips_own_error():
+    """Against one dense Gaussian in which each grip's own share enters its mean and its slope."""
+    plain, *_ = drawn(make_design(deviations=2), 1)
+    design, means = with_slopes(plain)
+    post = posterior(design)
+    theta = some_scales(8)
+    num, expected = design.mean.size, []
+    for row in theta:
+        share = priors.SCATTER_MEDIAN * np.exp(row[3:])
+        common = np.hypot(priors.COMMON, share)
+        levers = [design.unit * (design.channel == c) for c in range(3)]
+        levers += [1.0 * (design.slope & (design.channel == c)) for c in range(3)]
+        sds = [*common, *np.hypot(SLOPE_SD, share)]
+        sd_q = FLAT * np.array(
+            [
+                np.sqrt(plain.variance[plain.coefficients[:, i] != 0].mean())
+                for i in range(len(plain.unknowns))
+            ]
+        )
+        rows = np.concatenate([design.coefficients, design.shifts, np.stack(levers, axis=1)], axis=1)
+        prior = np.concatenate([sd_q, np.ones(2), sds]) ** 2
+        covariance = (rows * prior) @ rows.T + np.diag(np.exp(2 * row[design.channel]) * design.variance)
+        own = np.eye(num) * (share[design.channel] * design.unit) ** 2
+        for k, i in enumerate(means):
+            j = num - means.size + k
+            own[i, j] = own[j, i] = share[design.channel[i]] ** 2 * design.unit[i]
+            own[j, j] = 2 * share[design.channel[i]] ** 2
+        free = design.free_shifts.reshape(design.free_mean.size, 2)
+        both = np.zeros((num + free.shape[0],) * 2)
+        both[:num, :num] = covariance + own
+        both[num:, num:] = free @ free.T + np.diag(design.free_variance.ravel())
+        both[:num, num:] = design.shifts @ free.T
+        both[num:, :num] = both[:num, num:].T
+        data = np.concatenate([design.mean - design.coefficients @ post.reference, design.free_mean.ravel()])
+        expected.append(log_normal(data, both))
+    difference = post.log_prob(theta) - np.array(expected) - post.log_prior(theta)
+    np.testing.assert_allclose(difference - difference[0], 0.0, atol=5e-3)
+    assert np.ptp(expected) > 5.0

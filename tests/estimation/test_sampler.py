@@ -136,7 +136,7 @@ def test_progress_is_told(post):
 def test_draws_keep_their_shapes(post):
     theta = np.zeros((5, 6))
     found, efficiency = draw_unknowns(post, theta, np.random.RandomState(0))
-    assert found.shape == (5, len(TRUE) + 2 + 3) and 0.9 < efficiency <= 1.0 + 1e-9
+    assert found.shape == (5, len(TRUE) + 2 + 6) and 0.9 < efficiency <= 1.0 + 1e-9
 
 
 def test_density_of_the_proposal_integrates_to_one(post, mode):

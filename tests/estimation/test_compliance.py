@@ -1,0 +1,81 @@
+"""Slopes of readings over the pads' give, against signals whose pads are known."""
+
+import numpy as np
+import pytest
+
+from estimation.compliance import SLOPE_SD, slope, unexpected_share
+
+DT = 0.02
+
+
+def grip(share=0.0, lag=0.0, noise=0.0, seed=0):
+    """Times, give [m] and reading of a grip closed over 0.3 s, held with a sway, opened over 0.3 s.
+
+    `share`: of the give that is left out; `lag` [s]: by which the recorded give is late.
+    """
+    t = np.arange(0.0, 3.0, DT)
+
+    def give(at):
+        return (
+            1.2e-3
+            * np.clip(np.minimum((at - 0.2) / 0.3, (2.8 - at) / 0.3), 0, 1)
+            * (1 + 0.05 * np.sin(4 * at))
+        )
+
+    recorded = give(t - lag)
+    reading = 0.02 - (1 + share) * give(t) + recorded
+    return t, recorded, reading + noise * np.random.default_rng(seed).normal(size=t.size)
+
+
+def held(recorded):
+    return [recorded > 0.15 * np.median(recorded)]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, -0.2])
+def test_a_share_left_out_is_the_slope(share):
+    t, recorded, reading = grip(share)
+    found = slope(t, reading, recorded, held(recorded), 1e-7)
+    assert found.weights @ reading == pytest.approx(-share, abs=1e-6)
+    np.testing.assert_allclose(found.weights @ np.full(t.size, 5.0), 0.0, atol=1e-6)  # no level enters
+    assert found.variance == pytest.approx(SLOPE_SD**2, rel=1e-3)
+
+
+def test_a_late_force_is_no_softer_pad():
+    """30 ms late while the grip closes alone: to first order the rate takes what misleads a plain slope."""
+    t, recorded, reading = grip(lag=0.03)
+    closing = [held(recorded)[0] & (t < 1.5)]
+    found = slope(t, reading, recorded, closing, 1e-7)
+    plain = np.polyfit(recorded[closing[0]], reading[closing[0]], 1)[0]
+    assert abs(found.weights @ reading) < 0.03 < 0.08 < abs(plain)
+
+
+def test_variance_is_that_of_repeated_noise():
+    t, recorded, _ = grip()
+    readings = [grip(noise=3e-5, seed=k)[2] for k in range(200)]
+    slopes = [slope(t, reading, recorded, held(recorded), 1e-5) for reading in readings]
+    values = [s.weights @ reading for s, reading in zip(slopes, readings, strict=True)]
+    stated = np.sqrt(np.mean([s.variance - SLOPE_SD**2 for s in slopes]))
+    assert np.std(values) == pytest.approx(stated, rel=0.35)
+
+
+def test_a_slope_that_one_sample_bears_is_not_believed():
+    t, recorded, reading = grip(noise=1e-5)
+    one = (recorded > 0.95 * recorded.max()) | (np.arange(t.size) == 14)
+    reading = reading + np.where(np.arange(t.size) == 14, 3e-4, 0.0)
+    found = slope(t, reading, recorded, [one], 1e-5)
+    assert abs(found.weights @ reading) < 3 * np.sqrt(found.variance)
+
+
+def test_too_few_samples_tell_nothing():
+    t, recorded, reading = grip()
+    assert slope(t, reading, recorded, [np.arange(t.size) < 5], 1e-5) is None
+    assert slope(t, reading, 0 * recorded, held(recorded + 1), 1e-5) is None
+
+
+def test_what_the_rig_does_not_admit_is_told_once_it_is_certain():
+    shares, variances = np.array([0.5, 0.55, 0.45, 0.5]), np.full(4, SLOPE_SD**2 + 0.02**2)
+    assert unexpected_share(shares, variances, True, 0.0) == pytest.approx(0.5)
+    assert unexpected_share(shares, variances, True, 0.3) == 0.0  # the rig says so itself
+    assert unexpected_share(0.3 * shares, variances, True, 0.0) == 0.0  # within a slope's own error
+    assert unexpected_share(0.8 * shares, variances, False, 0.0) > 0  # of rigid pads any give is a surprise
+    assert unexpected_share(np.array([]), np.array([]), True, 0.0) == 0.0
