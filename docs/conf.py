@@ -33,8 +33,23 @@ autodoc_typehints = "description"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
 
+highlight_language = "none"
 html_theme = "furo"
 html_title = f"hmmseg {version}"
 html_static_path: list[str] = []
 html_show_copyright = False
 html_theme_options = {"navigation_with_keys": True}
+
+
+def _more(app, docname: str, source: list[str]) -> None:
+    """Pages that the index lists nowhere stand at its end, so that none is out of reach."""
+    if docname != "index":
+        return
+    listed = {line.strip() for line in source[0].splitlines()}
+    pages = sorted(path.stem for path in Path(app.srcdir).glob("*.md"))
+    source[0] = source[0].replace("@more@", "\n".join(p for p in pages if p not in listed and p != "index"))
+
+
+def setup(app) -> None:
+    """What Sphinx calls."""
+    app.connect("source-read", _more)
