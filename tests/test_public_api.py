@@ -15,7 +15,8 @@ from hmmseg import InputError, Rig, Task, Trial, align, segment
 
 STACK = Path(__file__).parents[1] / "recordings" / "none_1"
 PUBLIC = {
-    hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose example_folder fit segment",
+    hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose example_folder "
+    "fit segment",
     estimation: "Identification identify read_actual",
     simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate",
 }

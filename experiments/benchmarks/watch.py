@@ -45,7 +45,7 @@ def rows_of(case: Path, file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def timing(case: Path) -> dict:
-    """A stream of MINUTES at the recording's rate: its rows again and again, each a repetition of the task."""
+    """A stream of MINUTES at the recording's rate: its rows again and again, each a round of the task."""
     rig, task = Rig.read(case / "rig.toml"), Task.read(case / "task.toml")
     assert isinstance(task, BlockTask)
     lines = (sorted(case.glob("trial_*.csv"))[0]).read_text().splitlines()
@@ -125,7 +125,8 @@ def summary(errors: list[tuple[float, float]]) -> dict:
     e, sd = np.array(errors).T
     return {
         "boundaries": len(errors), "median_ms": float(1e3 * np.median(np.abs(e))),
-        "q90_ms": float(1e3 * np.quantile(np.abs(e), 0.9)), "within_2_sd": float((np.abs(e) <= 2 * sd).mean()),
+        "q90_ms": float(1e3 * np.quantile(np.abs(e), 0.9)),
+        "within_2_sd": float((np.abs(e) <= 2 * sd).mean()),
     }  # fmt: skip
 
 
