@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +12,7 @@ from rich.table import Table
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, read_task
+from hmmseg.numbers import estimate, interval, shown_as
 from hmmseg_cli.console import (
     ActualOption,
     FiguresOption,
@@ -141,8 +142,9 @@ def run(
         found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1), bank)
     for warning in found.warnings:
         out.warn(warning)
-    out.print(sentence(found.body), BANKS[found.body["detection"]["bank"]], *tables(found.body))
-    _draw(out, found, measured)
+    pads = rig.fingertip.model_dump()
+    out.print(sentence(found.body, pads), BANKS[found.body["detection"]["bank"]], *tables(found.body))
+    _draw(out, found, recordings, task, rig, measured)
     return found.body
 
 
@@ -187,55 +189,71 @@ def _against(
     for warning in found.warnings:
         out.warn(warning)
     out.print(sentence(found.body), *tables(found.body))
-    if out.figures is not None:
-        from hmmseg_cli.figures.gap_generic import draw_all
-
-        draw_all(found, out.figure)
-    if out.report is not None:
-        from hmmseg_cli.gap_report import generic_page
-
-        told = generic_page(found, sentence(found.body), cells_title(found.body))
-        out.stage(out.report).write_text(told, encoding="utf-8")
+    _draw_against(out, found, [trial.name for trial in read[: len(paths)]], task)
     out.finish(found.body)
 
 
-def _draw(out: Output, found, measured) -> None:
-    """Figures where asked for, and the page with the same figures inside."""
+def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
+    """Figures and page of a diagnosis against given simulated trials."""
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.figures.gap import draw_all
-    from hmmseg_cli.gap_report import page
+    from hmmseg_cli.figures.gap_generic import draw_signal
+    from simgap.generic.effects import CANDIDATES
+
+    shows = {name: candidate.shows for name, candidate in CANDIDATES.items()}
+    _show(out, found.body, files, task, lambda path: draw_signal(found, path), shows=shows)
+
+
+def _draw(out: Output, found, recordings, task: BlockTask, rig: Rig, measured) -> None:
+    """Figures and page of a diagnosis against the virtual model."""
+    if out.figures is None and out.report is None:
+        return
+    from hmmseg_cli.figures.gap_signal import draw_signal
+    from simgap.effects import catalogue
+
+    shows = {name: effect.shows for name, effect in catalogue().items()}
+    files = [trial.name for trial in recordings]
+    pads = rig.fingertip.model_dump()
+    _show(out, found.body, files, task, lambda path: draw_signal(found, path), pads, measured, shows)
+
+
+def _show(
+    out: Output,
+    body: dict[str, Any],
+    files: Sequence[str],
+    task,
+    signal: Callable[[Path], None],
+    pads: dict[str, float] | None = None,
+    measured=None,
+    shows: dict[str, str] | None = None,
+) -> None:
+    """Figures where asked for, and the page, from the body alone; `signal` draws the recorded one."""
+    from hmmseg.contact.decompose import subtasks
+    from hmmseg_cli.figures.gap import draw_all, draw_how_far
+    from hmmseg_cli.gap_report import Setting, page
+
+    names = list(dict.fromkeys(f"{s.name} {s.object or ''}".strip() for s in subtasks(task)))
+
+    def draw(path: Callable[[str], Path]) -> None:
+        signal(path("gap_signal.png"))
+        if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
+            draw_how_far(body, path("gap_before_after.png"))
 
     if out.figures is not None:
-        draw_all(found, out.figure)
+        draw_all(body, names, out.figure)
+        signal(out.figure("gap_signal.png"))
     if out.report is not None:
-        told = f"{sentence(found.body)} {BANKS[found.body['detection']['bank']]}"
-        text = page(found, told, cells_title(found.body), measured)
-        out.stage(out.report).write_text(text, encoding="utf-8")
+        setting = Setting(files, names, pads or {}, measured, shows or {}, out.warnings)
+        out.stage(out.report).write_text(page(body, setting, draw), encoding="utf-8")
 
 
-def p_text(p: float) -> str:
-    """A p value; what is too small to be told apart is only bounded."""
-    return f"p = {p:.2g}" if p > 1e-16 else "p < 1e-16"
+def sentence(body: dict[str, Any], pads: dict[str, float] | None = None) -> str:
+    """The verdict in words."""
+    from hmmseg_cli.finding import headline, remains, sentences
 
-
-def sentence(body: dict[str, Any]) -> str:
-    """The verdict in a sentence."""
-    p, causes = p_text(body["detection"]["p_value"]), " and ".join(body["causes"])
-    if body["verdict"] == "none":
-        return f"No gap beyond the sensors' noise was found ({p})."
-    if body["verdict"] == "unknown":
-        return f"There is a gap ({p}) that none of the candidate effects explains."
-    shrinkage, far = body["shrinkage"], ""
-    if shrinkage is not None and shrinkage["fraction"] is not None:
-        percent = f"{100 * shrinkage['fraction']:.0f} %"
-        far = f"; with it in the model the gap shrinks by {percent} on {shrinkage['evaluated_on']}"
-    if body["verdict"] == "set":
-        others = ", ".join(body["indistinguishable"])
-        return (
-            f"The gap is caused by {causes}, or by what these recordings cannot tell from it: {others}{far}."
-        )
-    return f"The gap is caused by {causes}{far}."
+    told = " ".join([*sentences(body, pads), *remains(body)])
+    causes = f" ({', '.join(body['causes'])})" if body["causes"] else ""
+    return f"{headline(body, pads)}{causes}. {told}"
 
 
 def cells_title(body: dict[str, Any]) -> str:
@@ -259,8 +277,8 @@ def tables(body: dict[str, Any]) -> list[Table]:
             values.add_column(head, no_wrap=True)
         for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
             low, high = p["interval_90"]
-            unit = "" if p["unit"] == "1" else f" {p['unit']}"
-            values.add_row(name, f"{p['mean']:.4g} +- {p['sd']:.2g}{unit}", f"{low:.4g} to {high:.4g}")
+            shown = shown_as(p["unit"])
+            values.add_row(name, estimate(p["mean"], p["sd"], shown), interval(low, high, shown))
         out.append(values)
     if body["next_experiment"] is not None:
         following = Table(title="next experiment", title_justify="left", show_header=False)

@@ -7,7 +7,8 @@ import warnings
 import numpy as np
 from matplotlib.lines import Line2D
 
-from hmmseg.plot.style import BLUE, GREY, RED, SHOWN, canvas
+from hmmseg.numbers import SHOWN
+from hmmseg.plot.style import BLUE, GREY, RED, canvas
 from paper_figs.results import load, target
 
 SIZE = 7.2  # in

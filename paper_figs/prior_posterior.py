@@ -11,7 +11,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import gaussian_kde
 
-from hmmseg.plot.style import BLUE, GREEN, GREY, RED, SHOWN, canvas
+from hmmseg.numbers import SHOWN
+from hmmseg.plot.style import BLUE, GREEN, GREY, RED, canvas
 from paper_figs.results import load, target
 
 PRIOR_SPREAD, POSTERIOR_SPREAD = 2.6, 4.0  # standard deviations shown

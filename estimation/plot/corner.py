@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from estimation.actual import Actual
-from hmmseg.plot.style import BLUE, RED, SHOWN, canvas
+from hmmseg.numbers import SHOWN
+from hmmseg.plot.style import BLUE, RED, canvas
 
 SIZE = 1.25  # in, a panel
 LEFT, RIGHT = 0.95, 0.3  # in, margins (below and above alike)

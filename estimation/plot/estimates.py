@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from estimation.actual import Actual
-from hmmseg.plot.style import BLUE, GREY, INK, SHOWN, canvas
+from hmmseg.numbers import SHOWN
+from hmmseg.plot.style import BLUE, GREY, INK, canvas
 
 ORDER = ("weight", "width", "height", "friction")
 

@@ -23,8 +23,6 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
 INK, GREY = "#222222", "#8C8C8C"
 STATE_COLOURS = {FREE: "#BDBDBD", ON_GROUND: ORANGE, SLIDING: PURPLE, ABOVE_GROUND: SKY}
 OTHER_COLOURS = (SKY, ORANGE, GREEN, PURPLE, YELLOW, RED, BLUE)
-# Property: factor from SI and the unit shown, as the paper shows it.
-SHOWN = {"weight": (1.0, "N"), "width": (100.0, "cm"), "height": (100.0, "cm"), "friction": (1.0, "")}
 STYLE: dict[Any, Any] = {
     "font.size": 8.0, "axes.titlesize": 8.0, "axes.labelsize": 8.0, "legend.fontsize": 7.5,
     "xtick.labelsize": 7.5, "ytick.labelsize": 7.5, "axes.linewidth": 0.6, "lines.linewidth": 0.9,

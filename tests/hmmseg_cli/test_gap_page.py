@@ -7,10 +7,11 @@ import subprocess
 
 import pytest
 
-from hmmseg_cli.demo import DATA
+import hmmseg
 from hmmseg_cli.main import main
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+DATA = hmmseg.example_folder()
 HEADLESS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--virtual-time-budget=5000",
@@ -31,10 +32,9 @@ def test_the_page_opens_in_a_browser(tmp_path):
     shown = subprocess.run(
         [*command, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=60, check=True
     )
-    for id in ("verdict", "where", "suspects", "parameters", "properties"):
+    for id in ("verdict", "next", "heat", "where", "suspects", "parameters", "properties"):
         assert f'id="{id}"' in shown.stdout
-    assert "fingertip_compliance" in shown.stdout.split('id="verdict"')[1].split("</p>")[0]
-    assert "Cells that fingertip_compliance shifted" in shown.stdout
+    assert "Fingertips that yield" in shown.stdout.split('id="verdict"')[1].split("</p>")[0]
     picture = tmp_path / "page.png"
     subprocess.run(
         [*command, f"--screenshot={picture}", "--window-size=1000,2400", page.as_uri()],

@@ -1,0 +1,84 @@
+"""Numbers for people: a value with its uncertainty, in one unit for one quantity, without exponents."""
+
+from __future__ import annotations
+
+import math
+
+# SI unit: factor to what is shown, and its name.
+UNITS = {
+    "m": (1e3, "mm"),
+    "rad": (1e3, "mrad"),
+    "s": (1e3, "ms"),
+    "kg": (1e3, "g"),
+    "N s": (1e3, "mN s"),
+    "1": (1.0, ""),
+}
+# Property of a block: the same, as the paper shows it.
+SHOWN = {"weight": (1.0, "N"), "width": (100.0, "cm"), "height": (100.0, "cm"), "friction": (1.0, "")}
+MOST = 6  # decimals shown
+
+
+def shown_as(unit: str, share: bool = False) -> tuple[float, str]:
+    """Factor and name of what an SI unit is shown in; a dimensionless `share` in per cent."""
+    return (100.0, "%") if share and unit in ("", "1") else UNITS.get(unit, (1.0, unit))
+
+
+def property_shown_as(name: str, unit: str) -> tuple[float, str]:
+    """The same for a property, "block1.width" or "width"; others by their unit."""
+    return SHOWN.get(name.rpartition(".")[2], shown_as(unit))
+
+
+def plain(value: float, digits: int = 3) -> str:
+    """A number with `digits` significant digits, without an exponent: 3985, 0.0123, 12.4."""
+    if not math.isfinite(value):
+        return "infinite" if value > 0 else "-infinite" if value < 0 else "none"
+    if value == 0:
+        return "0"
+    places = min(12, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
+    return f"{value:.{places}f}"
+
+
+def _places(error: float) -> int:
+    """Decimals that show two significant digits of an error; none where it is ten or more."""
+    return min(MOST, max(0, 1 - math.floor(math.log10(error))))
+
+
+def estimate(mean: float, sd: float, shown: tuple[float, str] = (1.0, "")) -> str:
+    """`3985 ± 180 N/m`: two significant digits of the uncertainty, the value to the same place."""
+    factor, name = shown
+    value, error = mean * factor, abs(sd * factor)
+    if not math.isfinite(error) or error == 0 or not math.isfinite(value):
+        return f"{plain(value)} {name}".rstrip()
+    places = _places(error)
+    rounded = error if places else float(f"{error:.2g}")
+    return f"{value:.{places}f} ± {rounded:.{places}f} {name}".rstrip()
+
+
+def interval(low: float, high: float, shown: tuple[float, str] = (1.0, ""), sds: float = 3.3) -> str:
+    """`3690 to 4280 N/m`: ends with the decimals of the estimate between them.
+
+    `sds`: standard deviations from end to end, 3.3 for 90 %.
+    """
+    factor, name = shown
+    a, b = low * factor, high * factor
+    if not (math.isfinite(a) and math.isfinite(b)) or a == b:
+        return f"{plain(a)} to {plain(b)} {name}".rstrip()
+    places = _places(abs(b - a) / sds)
+    return f"{a:.{places}f} to {b:.{places}f} {name}".rstrip()
+
+
+def percent(share: float) -> str:
+    """A share as a whole percentage; what rounds to none or all but is not says so."""
+    value = 100 * share
+    if 0 < value < 0.5:
+        return "under 1 %"
+    if 99.5 <= value < 100:
+        return "over 99 %"
+    return f"{value:.0f} %"
+
+
+def between(low: float | None, high: float | None) -> str:
+    """An interval of a share, "62 to 78 %"; empty where it is unknown or no wider than is shown."""
+    if low is None or high is None or round(100 * low) == round(100 * high):
+        return ""
+    return f"{100 * low:.0f} to {100 * high:.0f} %"

@@ -1,0 +1,193 @@
+"""A diagnosis in words, from its JSON alone: what it is, how sure, what remains, what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hmmseg.numbers import between, estimate, percent, plain, shown_as
+from hmmseg_cli.causes import checks, plain_name
+
+Body = Mapping[str, Any]
+CHANNELS = {
+    "x": "the hand's sideways position",
+    "y": "the hand's height",
+    "distance": "the distance of the fingers",
+    "offset": "the height difference of the fingers",
+    "vx": "the hand's sideways speed",
+    "vy": "the hand's vertical speed",
+    "fx": "the net sideways force",
+    "fy": "the net vertical force",
+    "grip": "the grip force",
+    "shear": "the difference of the fingers' vertical forces",
+}
+WHEN = {
+    "pregrasp": "while you reach for {0}",
+    "pickup": "while you hold {0} on its support",
+    "carry": "while you carry {0}",
+    "slide": "while you push {0}",
+    "place": "while you press {0} down",
+    "release": "after you let go of {0}",
+}
+SLOW = 1.5  # Hz: below it a residual is an offset for the eye
+SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
+TINY = 1e-16
+
+
+def p_text(p: float) -> str:
+    """A p-value; what is too small to be told apart is only bounded."""
+    return f"p = {plain(p, 2)}" if p >= 1e-4 else f"p = {p:.0e}" if p > TINY else "p < 1e-16"
+
+
+def probability(body: Body) -> float:
+    """Of what the verdict names."""
+    name = "+".join(body["causes"]) or body["verdict"]
+    return float(body["probabilities"].get(name, 0.0))
+
+
+def sureness(p: float) -> str:
+    """A probability in a word."""
+    return next(word for least, word in SURE if p >= least)
+
+
+def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
+    """The causes in plain words."""
+    name = "+".join(body["causes"])
+    entry = body["effects"].get(name, {"parameters": {}})
+    means = {k: p["mean"] for k, p in entry["parameters"].items() if p["mean"] is not None}
+    return plain_name(name, means, rig)
+
+
+def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
+    """The verdict in a line."""
+    verdict = body["verdict"]
+    if verdict == "none":
+        return "No gap that matters" if body.get("small_gap") else "No gap"
+    if verdict == "unknown":
+        return "A gap that no known cause explains"
+    text = named(body, rig)
+    return text[0].upper() + text[1:]
+
+
+def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
+    """What was found, how sure, and how far it goes, for an engineer who must act."""
+    verdict, p, small = body["verdict"], p_text(body["detection"]["p_value"]), body.get("small_gap")
+    if verdict == "none" and small:
+        size = (
+            f"{estimate(small['size'], 0, shown_as(small['unit']))}"
+            if small.get("size") is not None
+            else "small"
+        )
+        return [f"Recording and model differ ({p}), but by less than matters{size}.", *moving(body)]
+    if verdict == "none":
+        return [f"The model reproduces the recording to within the sensors' noise ({p})."]
+    if verdict == "unknown":
+        told = (
+            f"Recording and model differ beyond noise ({p}); no known cause explains the larger part of it."
+        )
+        return [told, *moving(body)]
+    chance = probability(body)
+    out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
+    if verdict == "set":
+        others = ", or ".join(plain_name(n) for n in body["indistinguishable"])
+        out.append(f"These recordings cannot tell it from {others}.")
+    out += [t for t in (explained(body), shrunk(body)) if t]
+    return out
+
+
+def explained(body: Body) -> str:
+    """Share of the gap that the causes explain, where the body tells it."""
+    parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]
+    known = [(n, a) for n, a in parts if a and a.get("share") is not None]
+    if not known:
+        return ""
+    if len(known) == 1:
+        own = known[0][1]
+        ends = between(*(own.get("interval_90") or (None, None)))
+        return f"It explains {percent(own['share'])} of the gap" + (
+            f" (90 % interval {ends})." if ends else "."
+        )
+    shares = ", ".join(f"{plain_name(n)} explains {percent(a['share'])}" for n, a in known)
+    return f"Of the gap, {shares}."
+
+
+def shrunk(body: Body) -> str:
+    """How far the gap shrinks."""
+    s = body.get("shrinkage")
+    if not s or s.get("fraction") is None:
+        return ""
+    ends = between(*(s.get("interval_90") or (None, None)))
+    far = percent(s["fraction"]) + (f" ({ends})" if ends else "")
+    return f"With it in the model the gap shrinks by {far} on {s['evaluated_on']}."
+
+
+def remains(body: Body) -> list[str]:
+    """What no cause explains, in words."""
+    rest = body.get("remainder")
+    if not rest or rest.get("share") is None or body["verdict"] == "none":
+        return []
+    if body["verdict"] == "unknown":
+        return [f"{percent(rest['share'])} of the gap is left when every likely cause has had its part."]
+    p = rest.get("p_value")
+    sure = "" if p is None else f" ({p_text(p)})"
+    if rest["share"] < 0.01 or not (rest.get("where") or (p is not None and p < 0.05)):
+        return [f"Nothing that stands out of the noise remains: {percent(rest['share'])} of the gap{sure}."]
+    return [
+        f"{percent(rest['share'])} of the gap remains{sure}.",
+        *moving({"where": rest.get("where") or []}),
+    ]
+
+
+def moving(body: Body, most: int = 3) -> list[str]:
+    """The largest parts of `where` (of a small gap or remainder) as sentences."""
+    return [_said(place, cells) for place, cells in list(by_place(body).items())[:most]]
+
+
+def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> str:
+    channel, subtask = key
+    what = CHANNELS.get(channel, channel)
+    share = share_of(cells)
+    largest = max(cells, key=lambda c: c["share"])
+    low, high = largest["band"]
+    verb = "moves otherwise"
+    if high is None or high <= SLOW:
+        verb = "is off"
+    elif low >= SLOW:
+        verb = f"moves otherwise above {plain(low, 2)} Hz"
+    trials = len({c["trial"] for c in cells})
+    often = f"{trials} trial{'s' if trials > 1 else ''}"
+    return f"{what[0].upper()}{what[1:]} {verb} {when(subtask)}: {percent(share)} of the gap, in {often}."
+
+
+def when(subtask: str) -> str:
+    """A subtask as a clause."""
+    name, _, block = subtask.partition(" ")
+    return WHEN[name].format(block or "the block") if name in WHEN else f"during {subtask}"
+
+
+def to_do(body: Body) -> list[str]:
+    """What to check on the rig, the next experiment last."""
+    suspects = [*body["causes"], *body["indistinguishable"]]
+    out = checks(suspects)
+    asked = body.get("next_experiment")
+    if asked:
+        told = ", ".join(plain_name(n) for n in asked["separates"])
+        out.append(f"Record once more: {asked['do']}. That tells apart: {told}.")
+    if body["verdict"] == "unknown" and body["where"]:
+        (channel, subtask), *_ = by_place(body)
+        what, at = CHANNELS.get(channel, channel), when(subtask)
+        out.append(f"Look at {what} {at}, where the gap is largest: what acts there that the model lacks?")
+    return out
+
+
+def by_place(body: Body) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
+    """The significant cells by channel and subtask, largest share first."""
+    rows: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for cell in (body.get("small_gap") or {}).get("where") or body["where"]:
+        rows.setdefault((cell["channel"], cell["subtask"]), []).append(cell)
+    return dict(sorted(rows.items(), key=lambda item: -share_of(item[1])))
+
+
+def share_of(cells: Sequence[Mapping[str, Any]]) -> float:
+    """Their share of the gap together."""
+    return float(sum(c["share"] for c in cells))

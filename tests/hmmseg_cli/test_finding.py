@@ -1,0 +1,112 @@
+"""Numbers and findings in words: from a diagnosis's JSON alone, old and new."""
+
+from __future__ import annotations
+
+import pytest
+
+from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
+from hmmseg_cli.causes import _told, checks, plain_name
+from hmmseg_cli.finding import headline, moving, remains, sentences, to_do
+from hmmseg_cli.gap_report import Setting, page
+from simgap.effects import catalogue
+
+SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
+
+
+def cell(channel: str, subtask: str, share: float, trial: str = "trial_01.csv", band=(0.0, 1.0)) -> dict:
+    return {
+        "trial": trial,
+        "channel": channel,
+        "subtask": subtask,
+        "band": list(band),
+        "share": share,
+        "z": 100 * share,
+    }
+
+
+def body(verdict: str, causes: list[str], **more) -> dict:
+    name = "+".join(causes) or verdict
+    parameters = {"normal_stiffness": {"mean": 3985.0, "sd": 181.0, "interval_90": [3687.0, 4283.0],
+                                       "unit": "N/m"}}  # fmt: skip
+    shift = {"block1.width": {"before": 0.0134, "after": 0.0162, "unit": "m"}}
+    effects = {name: {"parameters": parameters, "log_evidence": 12.0, "heldout_score": 9.0,
+                      "property_shift": shift}}  # fmt: skip
+    return {
+        "verdict": verdict, "causes": causes, "indistinguishable": [], "probabilities": {name: 0.93},
+        "detection": {"p_value": 1e-20, "statistic": 5.0}, "effects": effects if causes else {},
+        "where": [cell("offset", "carry block1", 0.4), cell("offset", "carry block1", 0.21, "trial_02.csv"),
+                  cell("fy", "place block1", 0.004, band=(1.0, 5.0))],
+        "shrinkage": None, "next_experiment": None,
+    } | more  # fmt: skip
+
+
+def test_numbers_have_one_unit_and_no_exponent():
+    assert estimate(3985.4, 181.2, shown_as("N/m")) == "3985 ± 180 N/m"
+    assert estimate(0.01234, 0.00056, shown_as("m")) == "12.34 ± 0.56 mm"
+    assert estimate(0.05, 0.004, shown_as("1", share=True)) == "5.00 ± 0.40 %"
+    assert estimate(-1.2e-5, 3e-6, shown_as("rad")) == "-0.0120 ± 0.0030 mrad"
+    assert interval(3687.2, 4283.0, shown_as("N/m")) == "3687 to 4283 N/m"
+    assert plain(180.0) == "180" and plain(0.000123) == "0.000123" and plain(float("inf")) == "infinite"
+    assert percent(0.004) == "under 1 %" and percent(0.997) == "over 99 %" and percent(1.0) == "100 %"
+    assert between(0.62, 0.78) == "62 to 78 %" and between(0.9961, 1.0) == "" and between(None, 1.0) == ""
+
+
+def test_every_effect_has_a_plain_name_and_a_check():
+    missing = [n for n, e in catalogue().items() if e.chosen and n not in _told()]
+    assert not missing
+    assert all(checks([n])[0].endswith(".") for n in _told())
+    assert plain_name("fingertip_compliance", {"normal_stiffness": 1200.0}, {"normal_stiffness": 4000.0}) == (
+        "softer fingertips"
+    )
+    assert plain_name("force_gain", {"finger1": 0.0, "finger2": -0.1}).endswith("too low (finger 2)")
+    assert plain_name("force_lag", {"finger1": 0.1, "finger2": 0.0}).endswith("late of finger 1")
+    assert plain_name("force_bias", {"fx1": 1.2, "fy1": 0.01}).endswith("force sensor fx1")
+    assert plain_name("something_new") == "something new"
+
+
+def test_a_named_cause_is_told_with_what_it_leaves():
+    found = body(
+        "named", ["fingertip_compliance"],
+        attribution={"fingertip_compliance": {"probability": 0.94, "share": 0.87,
+                                              "interval_90": [0.8, 0.91]}},
+        remainder={"share": 0.13, "p_value": 1e-6, "where": [cell("offset", "carry block1", 0.1)]},
+    )  # fmt: skip
+    assert headline(found, {"normal_stiffness": 4000.0}) == "Softer fingertips"
+    told = " ".join(sentences(found))
+    assert "93 %" in told and "It explains 87 % of the gap (90 % interval 80 to 91 %)" in told
+    left = remains(found)
+    assert left[0].startswith("13 % of the gap remains")
+    assert left[1].startswith("The height difference of the fingers is off while you carry block1: 10 %")
+
+
+def test_an_unknown_gap_says_what_moves():
+    found = body("unknown", [], remainder={"share": 0.7, "p_value": 1e-9, "where": []})
+    first, second = moving(found)
+    assert first == ("The height difference of the fingers is off while you carry block1: 61 % of the gap, "
+                     "in 2 trials.")  # fmt: skip
+    assert second.startswith("The net vertical force moves otherwise while you press block1 down: under 1 %")
+    assert "what acts there" in to_do(found)[-1]
+    assert remains(found) == ["70 % of the gap is left when every likely cause has had its part."]
+
+
+def test_a_small_gap_is_no_gap_that_matters():
+    small = {"size": 0.0003, "unit": "m", "where": [cell("y", "place block1", 0.9)]}
+    found = body("none", [], small_gap=small, where=[])
+    assert headline(found) == "No gap that matters"
+    assert "less than matters: 0.300 mm at most" in sentences(found)[0]
+
+
+@pytest.mark.parametrize("verdict", ["none", "named", "set", "unknown"])
+def test_every_verdict_has_a_page(verdict):
+    causes = ["fingertip_compliance"] if verdict in ("named", "set") else []
+    more = {"indistinguishable": ["force_gain"]} if verdict == "set" else {}
+    if verdict == "none":
+        more = {"where": []}
+    measured = {"block1": {"width": (0.016, 0.0001)}} if causes else None
+    text = page(body(verdict, causes, **more), Setting(["a.csv"], SUBTASKS, {}, measured), lambda path: None)
+    assert 'id="verdict"' in text and "<script" not in text
+    assert ('id="parameters"' in text) == bool(causes)
+    if verdict != "none":
+        assert text.count(">61 %<") == 1 and ">61<" in text  # heat map and table, the same number
+    if causes:
+        assert "3985 ± 180 N/m" in text and "1.6200 cm" in text
