@@ -73,11 +73,9 @@ def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
     """What was found, how sure, and how far it goes, for an engineer who must act."""
     verdict, p, small = body["verdict"], p_text(body["detection"]["p_value"]), body.get("small_gap")
     if verdict == "none" and small:
-        size = (
-            f"{estimate(small['size'], 0, shown_as(small['unit']))}"
-            if small.get("size") is not None
-            else "small"
-        )
+        size = ""
+        if small.get("size") is not None:
+            size = f": {estimate(small['size'], 0, shown_as(small['unit']))} at most"
         return [f"Recording and model differ ({p}), but by less than matters{size}.", *moving(body)]
     if verdict == "none":
         return [f"The model reproduces the recording to within the sensors' noise ({p})."]
