@@ -10,7 +10,6 @@ leaves it. Writes experiments/results/ablation.json; experiments.write_tables pu
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import numpy as np
 from experiments.bank import simulated_cases
 from experiments.estimates import estimate, summarise_estimates
 from experiments.recordings import Case
+from experiments.saving import save
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Fingertip
 from hmmseg.io.trial import Trial
@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     document = {"seed": FIRST_SEED, "cases": options.cases, "variants": rows}
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    save(options.output, document)
 
 
 if __name__ == "__main__":

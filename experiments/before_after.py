@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from experiments.recordings import Case, list_cases, read_case
+from experiments.saving import commit_of, save
 from experiments.table_text import RESULTS, load, markdown
 
 OUT = RESULTS / "before_after.json"
@@ -42,12 +43,6 @@ for k, case in enumerate(sys.argv[3:]):
     main(["identify", *trials, "--task", str(folder / "task.toml"), "--rig", str(folder / "rig.toml"),
           "--json", str(out), "--quiet"])
 """
-
-
-def commit_of(root: Path) -> str:
-    """The commit of a checkout, with a plus sign where its code has been changed since."""
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--dirty=+"]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def measure(root: Path, package: str, folders: Sequence[Path]) -> dict[str, Any]:
@@ -180,7 +175,7 @@ def main(args: Sequence[str] | None = None) -> None:
             compared(read_case(path), before[name], after[name])
             for name, path in cases.items() if name in before and name in after
         ]  # fmt: skip
-    OUT.write_text(json.dumps(found) + "\n", encoding="utf-8")
+    save(OUT, found)
 
 
 if __name__ == "__main__":

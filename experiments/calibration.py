@@ -10,7 +10,6 @@ and single trials. Writes experiments/results/calibration.json; docs/calibration
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathlib import Path
 from experiments.bank import SEED, simulated_cases
 from experiments.estimates import estimate, summarise_estimates
 from experiments.recordings import Case, list_cases, read_case
+from experiments.saving import save
 from hmmseg.io.rig import Systematic
 
 RESULTS = Path(__file__).parent / "results"
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     document["systematic"] = calibrate(deviating, singles=1)
     report("systematic", document["systematic"])
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    save(options.output, document)
 
 
 if __name__ == "__main__":

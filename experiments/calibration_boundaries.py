@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.estimates import KINDS
 from experiments.recordings import list_cases, read_case
+from experiments.saving import save
 from experiments.scoring import boundaries_covered, boundary_residuals
 from experiments.sweeps.trials import scene
 from hmmseg.segmentation.align import segment
@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows[name] = row
         print(line(name, row), flush=True)
     document = {"first": options.first, "rows": rows, "seconds": time.process_time() - began}
-    options.output.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    save(options.output, document)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,13 @@ same, boundaries found by the HMM; `planted`: cases of each effect. Sizes scatte
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 from scipy.stats import beta
 
+from experiments.saving import save
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.diagnose import detect, diagnosed
 from simgap.generic.synthetic import PLANTED, TASK, ensemble
@@ -110,7 +110,7 @@ def main() -> None:
         "healthy_aligned": alarms(a.aligned, True, 20_000),
         "planted": {name: planted(name, a.planted, 30_000 + 100 * k) for k, name in enumerate(PLANTED)},
     }
-    a.output.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    save(a.output, document)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ property, then z and coverage by folder, healthy cases and others apart; --json 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from experiments.recordings import list_cases, read_case
+from experiments.saving import save
 from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
 
 Row = dict[str, Any]
@@ -133,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ]  # fmt: skip
             print(*summary_lines(f"{folder.name}, {name}", summary(mine)), sep="\n", flush=True)
         if options.json is not None:
-            options.json.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            save(options.json, document)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import numpy as np
 
 from experiments.misfit_edits import EDITS
 from experiments.recordings import Case, list_cases, read_case
+from experiments.saving import save
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Move
@@ -140,10 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "edits_simulated": on_edits(simulated_cases(cases[0].rig)),
         "edits_displaced": on_edits([case for case in cases if case.name in DISPLACED]),
     }
-    options.output.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(document, indent=1, allow_nan=False)
-    (options.output / "misfits.json").write_text(text + "\n", encoding="utf-8")
-    print(text)
+    save(options.output / "misfits.json", document)
+    print(json.dumps(document, indent=1))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ or actual.toml. Prints a table a method and writes experiments/results/score_MET
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from rich.table import Table
 
 from estimation.paper_formulas import estimate_plugin
 from experiments.recordings import Case, list_cases, read_case
+from experiments.saving import save
 from experiments.scoring import (
     boundaries_covered,
     boundary_residuals,
@@ -144,8 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.output.mkdir(parents=True, exist_ok=True)
         document = {"method": name, "pooled": options.pooled, "seed": options.seed,
                     "summary": summaries, "cases": scores}  # fmt: skip
-        text = json.dumps(_null(document), indent=1, allow_nan=False)
-        (options.output / f"score_{name}.json").write_text(text + "\n", encoding="utf-8")
+        save(options.output / f"score_{name}.json", _null(document))
 
 
 def _null(value):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.blind_check.tables import FIGURES
+from experiments.saving import save
 from experiments.table_text import RESULTS, load, markdown
 
 ROOT = Path(__file__).parents[1]
@@ -89,7 +90,7 @@ def table() -> str | None:
 def main() -> None:
     sets = [spent_set(name) for name in ORDER]
     out = RESULTS / "blind_sets.json"
-    out.write_text(json.dumps({"sets": sets}, indent=1) + "\n", encoding="utf-8")
+    save(out, {"sets": sets})
     print(f"{out.name}: {len(sets)} sets")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-FLOORS = ("hmmseg_cli", "experiments", "paper_figs", "simgap", "estimation", "hmmseg")
+FLOORS = ("experiments", "paper_figs", "hmmseg_cli", "simgap", "estimation", "hmmseg")
 ROOT = Path(__file__).resolve().parents[1]
 
 

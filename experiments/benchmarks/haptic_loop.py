@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import gc
 import itertools
-import json
 import os
 import time
 import tracemalloc
@@ -23,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.saving import save
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from simgap.world.haptics import PassivityControl, stiffest_passive
@@ -148,7 +148,7 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     result = {"rate": rate, "passivity": measure_passivity()}
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    save(options.output, result)
     for key, value in result["rate"].items():
         print(f"{key:28s} {value:12.1f}")
     print("rate  stiffness  foam [s]  limit  control  returned [J]  speed left [m/s]")

@@ -10,7 +10,6 @@ counts. Writes experiments/results/benchmark_identify.json.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import subprocess
@@ -19,6 +18,8 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+
+from experiments.saving import save
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parents[1] / "results"
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
               f"(processor {cold['processor']:.1f} and {least['processor']:.1f} s)", flush=True)  # fmt: skip
     RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / "benchmark_identify.json"
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    save(path, document)
 
 
 if __name__ == "__main__":

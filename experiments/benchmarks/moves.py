@@ -10,7 +10,6 @@ simulated cases. Writes experiments/results/benchmark_moves.json.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from estimation.sampler import (
 )
 from experiments.bank import SEED, simulated_cases
 from experiments.recordings import Case
+from experiments.saving import save
 from hmmseg.segmentation.align import align
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         document["trials"][str(num_trials)] = rows
     RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / "benchmark_moves.json"
-    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    save(path, document)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.recordings import list_cases
+from experiments.saving import save
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
@@ -166,7 +167,7 @@ def main() -> None:
         "alarms_on_fitting": [v["case"] for v in verdicts if v["off_line"] and v["alarm"]],
         "differing": [v["case"] for v in verdicts if v["fits"] != v["off_line"]],
     }  # fmt: skip
-    OUT.write_text(json.dumps(document, indent=1) + "\n")
+    save(OUT, document)
     draw(document["by_lag"])
     print(json.dumps(document, indent=1))
 

@@ -22,6 +22,7 @@ from typing import Any
 
 from experiments.blind_check.sealing import code_digest
 from experiments.blind_check.tables import table
+from experiments.saving import save
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "blind_check.json"
 
@@ -90,7 +91,7 @@ def _score(given: argparse.Namespace) -> int:
     again = partial(follow, progress=lambda name: _tell(f"again {name}"), first=given.first)
     found = score(given.sealed, given.results, oracles, again, given.first)
     given.json.parent.mkdir(parents=True, exist_ok=True)
-    given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    save(given.json, found)
     print(table(found))
     print(f"\nSeal {found['seal']['sha256'][:12]} holds; diagnosed by code {found['code'][:12]}.")
     print(_published())

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from experiments.recordings import Case, read_case
+from experiments.saving import commit_of
 from hmmseg.hand.signals import task_space
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import segment_qualitative
@@ -65,9 +66,10 @@ def qualitative(case: Case) -> list[Segmentation]:
 
 
 def save(name: str, document: dict[str, Any]) -> None:
-    """Write a result, floats to six significant digits, lists of numbers on one line."""
+    """Write a result with this code's commit: floats of six significant digits, lists of numbers on a line."""
     RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{name}.json").write_text(_text(document) + "\n", encoding="utf-8")
+    text = _text({**document, "made_by": commit_of()})
+    (RESULTS / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
 def _text(value: Any, indent: int = 0) -> str:

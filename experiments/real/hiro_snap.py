@@ -12,12 +12,12 @@ themselves.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from experiments.saving import save
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
@@ -200,7 +200,7 @@ def main() -> None:
     arguments = parser.parse_args()
     document = run(arguments.folder, arguments.seeds, arguments.kinds)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(document, indent=1) + "\n")
+    save(arguments.output, document)
     print(table(document))
 
 

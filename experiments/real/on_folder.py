@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from experiments.saving import save
 
 
 def run_on_folder(doc: str, run: Callable[[Path], Any], results: Path) -> Any:
@@ -16,7 +17,5 @@ def run_on_folder(doc: str, run: Callable[[Path], Any], results: Path) -> Any:
     parser.add_argument("--output", type=Path, default=results)
     given = parser.parse_args()
     document = run(given.folder)
-    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-    given.output.parent.mkdir(parents=True, exist_ok=True)
-    given.output.write_text(text, encoding="utf-8")
+    save(given.output, document)
     return document

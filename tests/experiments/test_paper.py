@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from experiments.paper import estimates, rigid, slip, sources, states, tables, write_docs
+from experiments.saving import commit_of
 from hmmseg.plot import style as drawing
 from paper_figs import __main__ as figures
 from paper_figs import results
@@ -119,7 +120,9 @@ def test_results_are_written_without_nan_and_read_back(monkeypatch, tmp_path):
         "some", {"a": np.array([1.23456789, np.nan, -0.0]), "b": [{"c": True, "d": np.int64(3)}], "e": []}
     )
     text = (tmp_path / "some.json").read_text(encoding="utf-8")
-    assert json.loads(text) == {"a": [1.23457, None, 0.0], "b": [{"c": True, "d": 3}], "e": []}
+    read = json.loads(text)
+    assert read.pop("made_by", None) == commit_of()
+    assert read == {"a": [1.23457, None, 0.0], "b": [{"c": True, "d": 3}], "e": []}
 
 
 @pytest.mark.parametrize("name", figures.FIGURES)
