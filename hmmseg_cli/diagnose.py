@@ -21,10 +21,18 @@ from hmmseg_cli.console import (
     QuietOption,
     ReportOption,
     SeedOption,
-    TaskOption,
     TrialsArgument,
     distinct_trials,
     read_trials,
+)
+from hmmseg_cli.diagnose_robot import (
+    CandidateOption,
+    MapOption,
+    MjcfOption,
+    OwnSimulator,
+    PatchOption,
+    SimulatorOption,
+    diagnose_robot,
 )
 
 EffectOption = Annotated[
@@ -58,6 +66,12 @@ CalibrateOption = Annotated[
         "(a minute or two, once).",
     ),
 ]
+TaskFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--task", metavar="T", help="Task description (TOML); not needed with --simulator or --mjcf."
+    ),
+]
 BANKS = {
     "nominal": "Judged by healthy simulations of the paper's hand.",
     "bootstrap": "Judged by healthy simulations of the paper's hand, thresholds moved to this rig and task "
@@ -82,13 +96,18 @@ def spread_against(args: list[str]) -> list[str]:
 
 def diagnose(
     trials: TrialsArgument,
-    task: TaskOption,
+    task: TaskFile = None,
     rig: RigFile = None,
     actual: ActualOption = None,
     effect: EffectOption = None,
     against: AgainstOption = None,
     model: ModelFile = None,
     calibrate: CalibrateOption = False,
+    simulator: SimulatorOption = None,
+    mjcf: MjcfOption = None,
+    map_file: MapOption = None,
+    candidate: CandidateOption = None,
+    patch: PatchOption = None,
     json: JsonOption = None,
     figures: FiguresOption = None,
     report: ReportOption = None,
@@ -98,6 +117,13 @@ def diagnose(
     """The sim-to-real gap: where it lies, which unmodelled effect causes it, how far it shrinks."""
     with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
+        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
+        if own.given:
+            own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
+            diagnose_robot(out, paths, own, task, effect or [])
+            return
+        if task is None:
+            raise InputError("--task", "missing", "the task's description, or --simulator or --mjcf")
         description = read_task(task)
         if against:
             if calibrate:

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from simgap.simulators.protocol import Parameter, Simulator
+from simgap.simulators.protocol import Channels, Parameter, Simulator
 from simgap.simulators.recording import Recording
 
 Theta = Mapping[str, float]  # an effect's own parameters by short name
 Read = Callable[[np.ndarray, np.ndarray, Theta], np.ndarray]  # (times since the log's start, values, theta)
 Command = Callable[[Recording, Theta], Recording]
+Alter = Callable[[Recording, Channels, Theta], Channels]  # (window, channels as read so far, theta)
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,9 @@ class RobotEffect:
     """One candidate. `parameters` by short name, neutral at their nominal; it reads, commands or models.
 
     `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
-    `command` maps a whole recording to one whose commands are as the drives took them. `model` maps
-    short names to the simulator's parameters.
+    `alter` gives channels that depend on others. `command` maps a whole recording to one whose commands are
+    as the drives took them. `model` maps short names to the simulator's parameters. What is `fitted` is
+    fitted along with every cause and is none itself.
     """
 
     name: str
@@ -34,8 +36,15 @@ class RobotEffect:
     channel: str = ""
     read: Read | None = None
     undo: Read | None = None
+    alter: Alter | None = None
     command: Command | None = None
     model: Mapping[str, str] = field(default_factory=dict)
+    fitted: bool = False
+
+    @property
+    def reads(self) -> bool:
+        """Whether it acts on read-outs alone and needs no rollout."""
+        return self.read is not None or self.alter is not None
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed."""
@@ -54,11 +63,33 @@ class Setting:
         known = self.simulator.channels
         return [n for n, c in known.items() if (c.kind in kinds if kinds else c.kind != "command")]
 
+    def commands(self) -> list[str]:
+        """Channels that are commanded."""
+        return self.compared("command")
+
     def spread(self, channel: str) -> float:
         """Standard deviation of a channel over all recordings [its unit]; 1 where it is constant."""
         values = np.concatenate([r[channel] for r in self.recordings])
         found = float(np.nanstd(values))
         return found if found > 0 else 1.0
+
+
+def drives(setting: Setting) -> list[str]:
+    """Commands of torque, force, current or duty: those that are 0 where nothing is to be done."""
+    known = setting.simulator.channels
+    told = {n for n in setting.commands() if known[n].unit in ("N m", "N", "A", "Nm")}
+    switches = {n for n in setting.commands() if known[n].unit == "1" and _switches(setting, n)}
+    return [n for n in setting.commands() if n in told or (known[n].unit == "1" and n not in switches)]
+
+
+def places(setting: Setting) -> list[str]:
+    """Commands of a position."""
+    return [n for n in setting.commands() if setting.simulator.channels[n].unit in ("rad", "m", "deg", "mm")]
+
+
+def _switches(setting: Setting, name: str) -> bool:
+    """Whether a command has two values at most: a switch, not a drive."""
+    return all(np.unique(r[name][np.isfinite(r[name])]).size <= 2 for r in setting.recordings)
 
 
 def delayed(since: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:

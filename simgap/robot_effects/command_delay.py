@@ -19,7 +19,7 @@ def _late(names: list[str]):
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for all commands together; they hold their first value before the log's start."""
-    names = setting.compared("command")
+    names = setting.commands()
     if not names:
         return []
     delay = Parameter(0.0, 0.01, "s", low=0.0, high=0.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robot_effects.base import RobotEffect, Setting, drives, places
 from simgap.simulators.protocol import Parameter
 
 
@@ -17,6 +17,5 @@ def candidates(setting: Setting) -> list[RobotEffect]:
         RobotEffect(
             f"command:{name}.gain", "acted = (1 + gain) commanded", {"gain": gain}, command=_scaled(name)
         )
-        for name in setting.compared("command")
-        if setting.simulator.channels[name].unit != "1"
+        for name in (*drives(setting), *places(setting))
     ]

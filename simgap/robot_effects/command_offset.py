@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robot_effects.base import RobotEffect, Setting, drives, places
 from simgap.simulators.protocol import Parameter
 
 
@@ -13,14 +13,16 @@ def _shifted(name: str):
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each command; its usual size is 3 % of the command's spread."""
     out = []
-    for name in setting.compared("command"):
+    for name in (*drives(setting), *places(setting)):
         channel = setting.simulator.channels[name]
         if channel.unit != "1":
             offset = Parameter(0.0, 0.03 * setting.spread(name), channel.unit)
             out.append(
                 RobotEffect(
-                    f"command:{name}.offset", "acted = commanded + offset", {"offset": offset},
+                    f"command:{name}.offset",
+                    "acted = commanded + offset",
+                    {"offset": offset},
                     command=_shifted(name),
                 )
-            )  # fmt: skip
+            )
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hmmseg.errors import InputError
 from simgap.robot_effects.base import RobotEffect, Setting
 
 
@@ -11,7 +12,13 @@ def candidates(setting: Setting) -> list[RobotEffect]:
     known = setting.simulator.parameters
     for name, parameter in known.items():
         effect = parameter.effect or name
-        groups.setdefault(effect, {})[name.removeprefix(f"{effect}.")] = name
+        if any(known[n].fitted != parameter.fitted for n in groups.get(effect, {}).values()):
+            raise InputError(
+                f"simulator: effect {effect}", "has parameters fitted and not", "all or none fitted"
+            )
+        short = name.rpartition(".")[2]
+        short = short if short not in groups.get(effect, {}) else name
+        groups.setdefault(effect, {})[short] = name
     told = getattr(setting.simulator, "says", {})
     return [
         RobotEffect(
@@ -19,6 +26,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
             told.get(effect, "the simulator's own parameter"),
             {short: known[name] for short, name in names.items()},
             model=names,
+            fitted=all(known[n].fitted for n in names.values()),
         )
         for effect, names in groups.items()
     ]

@@ -1,84 +1,164 @@
-"""Residuals and sensitivities of all windows, whitened: recorded less simulated, and how effects move it.
+"""Residuals and sensitivities of all windows, in the channels' units: how effects and starts move rows.
 
-The start of a window is uncertain; with sensitivities D to the start and its variances P the residual of
-a window has covariance N + D P D', N the sensors' noise. Its Cholesky factor turns rows into
-innovations in the order of time: what each sample says beyond those before it in its window.
+Effects that kink at their neutral value (friction, dead bands) are taken where they act: their shift from
+neutral to `at` is a rollout of its own, their derivative a forward difference there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from hmmseg.errors import InputError
 from simgap.robots.model import Composed, Point
-from simgap.robots.windows import Window
+from simgap.robots.rows import Rows
 from simgap.simulators.protocol import Channels, run_all
 
-RATE_LIMIT = 100.0  # Hz: residuals are means over neighbours down to this rate
 STEP = 0.05  # of a parameter's standard deviation: the finite difference
 START_STEP = 0.3  # of a start's
 
 
 @dataclass(frozen=True)
+class Moved:
+    """How an effect moves rows: `shift` (N,) from neutral to `at` (k,), and its derivatives there (N, k)."""
+
+    at: np.ndarray
+    shift: np.ndarray
+    jacobian: np.ndarray
+
+
+@dataclass(frozen=True)
 class Linear:
-    """The gap about a point: n whitened rows, by log, channel, window and time.
+    """The gap about a point: `residual` (N,), recorded less simulated, by effect how it moves the rows, by
+    state (N,) how the windows' starts do. `diverged` are effects whose rollouts were not finite."""
 
-    `residual` (n,) at the point; `jacobian` effect -> (n, k) derivative of the prediction by its
-    parameters; `raw` (n,) the residual in the channel's unit, not whitened; `diverged` are effects whose
-    rollouts were not finite.
-    """
-
+    point: Point
+    rows: Rows
     residual: np.ndarray
-    raw: np.ndarray
-    log: np.ndarray
-    channel: np.ndarray
-    window: np.ndarray
-    time: np.ndarray
-    channels: tuple[str, ...]
-    jacobian: dict[str, np.ndarray]
+    starts: Mapping[str, np.ndarray]
+    moved: Mapping[str, Moved]
     diverged: tuple[str, ...]
-    dropped: int  # windows whose nominal rollout was not finite
+    dropped: int  # windows whose rollout was not finite
+    rates: np.ndarray  # (N,) the simulated channel's rate
+
+    def with_moved(self, more: Mapping[str, Moved], diverged: Sequence[str] = ()) -> Linear:
+        """With some effects' columns added or replaced."""
+        return replace(self, moved={**self.moved, **more}, diverged=(*self.diverged, *diverged))
 
 
-def linearise(composed: Composed, point: Point, effects: Sequence[str]) -> Linear:
-    """Residuals at a point, and derivatives by the parameters of these effects, by forward differences.
+@dataclass(frozen=True)
+class Base:
+    """Rollouts at a point, from which effects are varied: starts, true channels, as read, and their rows."""
 
-    InputError where the simulator diverges in every window.
-    """
+    point: Point
+    begun: list
+    true: list[Channels | None]
+    read: list[Channels | None]
+    rows: np.ndarray
+
+
+def base_at(composed: Composed, point: Point) -> Base:
+    """Rollouts of all windows at a point."""
     begun = composed.starts(point)
     true = run_all(composed.simulator, composed.jobs(point, begun))
     read = composed.read(true, point)
-    if all(channels is None for channels in read):
+    return Base(point, begun, true, read, composed.rows.averaged(read))
+
+
+def linearise(composed: Composed, point: Point, effects: Sequence[str], progress=None) -> Linear:
+    """Residuals at a point, sensitivities to starts, and to the parameters of these effects.
+
+    InputError where the simulator diverges in every window. `progress(1)` is called after each effect.
+    """
+    base = base_at(composed, point)
+    if all(channels is None for channels in base.read):
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
-    starts = _by_start(composed, point, begun, read)
-    columns: dict[str, list[list[Channels | None]]] = {}
-    diverged = []
+    residual = composed.rows.observed - base.rows
+    starts = _by_start(composed, base)
+    found = Linear(
+        point,
+        composed.rows,
+        residual,
+        starts,
+        {},
+        (),
+        sum(c is None for c in base.read),
+        _rates(composed, base),
+    )
+    moved, diverged = {}, []
     for name in effects:
-        columns[name] = _by_effect(composed, point, name, true, read, begun, starts)
-        if any(
-            r is not None and c is None for column in columns[name] for r, c in zip(read, column, strict=True)
-        ):
+        one = vary(composed, base, starts, name)
+        if one is None:
             diverged.append(name)
-            del columns[name]
-    names = tuple(n for n, c in composed.simulator.channels.items() if c.kind != "command")
-    parts = []
-    for k, window in enumerate(composed.windows):
-        here = read[k]
-        if here is not None:
-            moved = {name: [column[k] for column in of] for name, of in columns.items()}
-            parts.append(_rows(composed, k, window, names, here, starts[k], moved))
-    kept = [p for p in parts if p[0].size]
-    if not kept:
-        raise InputError("recordings", "have no samples of the channels to compare", "numbers")
-    joined = [np.concatenate([p[i] for p in kept]) for i in range(6)]
-    jacobian = {name: np.concatenate([p[6][name] for p in kept]) for name in columns}
-    dropped = sum(channels is None for channels in read)
-    residual, raw, log, channel, number, time = joined
-    return Linear(residual, raw, log, channel, number, time, names, jacobian, tuple(diverged), dropped)
+        else:
+            moved[name] = one
+        if progress is not None:
+            progress(1)
+    return found.with_moved(moved, diverged)
+
+
+def _rates(composed: Composed, base: Base) -> np.ndarray:
+    """Rates (N,) of the rows' channels; 0 where a rollout diverged."""
+    slopes: list[Channels | None] = []
+    for window, channels in zip(composed.windows, base.read, strict=True):
+        t = composed.recordings[window.log].t[window.begin : window.end]
+        slopes.append(None if channels is None else {n: np.gradient(v, t) for n, v in channels.items()})
+    found = composed.rows.averaged(slopes)
+    return np.where(np.isfinite(found), found, 0.0)
+
+
+def vary(
+    composed: Composed,
+    base: Base,
+    starts: Mapping[str, np.ndarray],
+    name: str,
+    at: Mapping[str, float] | None = None,
+) -> Moved | None:
+    """How an effect moves the rows from the base; None where it diverges. Where the base's point has it
+    act, or `at` is None, about the point itself; else about `at`, reached from neutral."""
+    effect = composed.effects[name]
+    neutral = effect.neutral()
+    now = {**neutral, **base.point.get(name, {})}
+    here, rows, shift = now, base.rows, np.zeros(base.rows.size)
+    if at is not None and name not in base.point:
+        here = {**neutral, **at}
+        rows = _rows_at(composed, base, starts, name, here)
+        shift = rows - base.rows
+    columns = []
+    for short in effect.parameters:
+        step = step_of(composed, name, short, here[short])
+        there = _rows_at(composed, base, starts, name, {**here, short: here[short] + step})
+        columns.append((there - rows) / step)
+    jacobian = np.stack(columns, 1)
+    fine = np.isfinite(base.rows)
+    if not (np.isfinite(jacobian[fine]).all() and np.isfinite(shift[fine]).all()):
+        return None
+    point = np.array([here[n] for n in effect.parameters])
+    if name in base.point:  # a straight line back to neutral
+        shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
+    return Moved(point, shift, jacobian)
+
+
+def _rows_at(
+    composed: Composed, base: Base, starts: Mapping[str, np.ndarray], name: str, values: Mapping[str, float]
+) -> np.ndarray:
+    """Rows (N,) with one effect at other values. A read-out needs no rollout: starts, which are read through
+    it too, move by their sensitivities."""
+    effect = composed.effects[name]
+    moved = {**base.point, name: dict(values)}
+    if not effect.reads:
+        run = run_all(composed.simulator, composed.jobs(moved, base.begun))
+        return composed.rows.averaged(composed.read(run, moved))
+    out = composed.rows.averaged(composed.read(base.true, moved))
+    if effect.undo is not None:
+        for old, new, mine in zip(base.begun, composed.starts(moved), composed.rows.of, strict=True):
+            if old is not None and new is not None:
+                for state, change in starts.items():
+                    if state in old and new[state] != old[state]:
+                        out[mine] = out[mine] + change[mine] * (new[state] - old[state])
+    return out
 
 
 def step_of(composed: Composed, effect: str, name: str, value: float) -> float:
@@ -88,95 +168,18 @@ def step_of(composed: Composed, effect: str, name: str, value: float) -> float:
     return step if value + step <= parameter.high else -step
 
 
-def _difference(a: Channels | None, b: Channels | None, step: float) -> Channels | None:
-    return None if a is None or b is None else {n: (b[n] - a[n]) / step for n in a}
-
-
-def _by_start(composed: Composed, point: Point, begun, read) -> list[dict[str, tuple[float, Channels]]]:
-    """By window: state -> its standard deviation, and the derivative of the channels as read by it."""
-    states = list(dict.fromkeys(n for w in composed.windows for n in w.doubt))
-    by_window: list[dict[str, tuple[float, Channels]]] = [{} for _ in composed.windows]
-    for state in states:
+def _by_start(composed: Composed, base: Base) -> dict[str, np.ndarray]:
+    """State -> derivative (N,) of the rows by each window's start."""
+    out = {}
+    for state in dict.fromkeys(n for w in composed.windows for n in w.doubt):
         steps = [START_STEP * w.doubt.get(state, 0.0) for w in composed.windows]
-        moved = [
+        begun = [
             s if s is None or state not in s else {**s, state: s[state] + h}
-            for s, h in zip(begun, steps, strict=True)
+            for s, h in zip(base.begun, steps, strict=True)
         ]
-        there = composed.read(run_all(composed.simulator, composed.jobs(point, moved)), point)
-        for k, (h, a, b) in enumerate(zip(steps, read, there, strict=True)):
-            change = None if h == 0 else _difference(a, b, h)
-            if change is not None:
-                by_window[k][state] = (composed.windows[k].doubt[state], change)
-    return by_window
-
-
-def _by_effect(composed: Composed, point: Point, name: str, true, read, begun, starts):
-    """For each parameter of an effect, by window, the derivative of the channels as read."""
-    effect = composed.effects[name]
-    values = {**effect.neutral(), **point.get(name, {})}
-    out: list[list[Channels | None]] = []
-    for short in effect.parameters:
-        step = step_of(composed, name, short, values[short])
-        moved = {**point, name: {**values, short: values[short] + step}}
-        if effect.read is None:
-            run = run_all(composed.simulator, composed.jobs(moved, begun))
-            out.append(
-                [_difference(a, b, step) for a, b in zip(read, composed.read(run, moved), strict=True)]
-            )
-            continue
-        changes = [_difference(a, b, step) for a, b in zip(read, composed.read(true, moved), strict=True)]
-        restarted = composed.starts(moved)
-        out.append([
-            _restarted(change, old, new, by_state, step)
-            for change, old, new, by_state in zip(changes, begun, restarted, starts, strict=True)
-        ])  # fmt: skip
+        run = run_all(composed.simulator, composed.jobs(base.point, begun))
+        there = composed.rows.averaged(composed.read(run, base.point))
+        by_row = np.array(steps)[composed.rows.window]
+        change = np.where(by_row > 0, (there - base.rows) / np.where(by_row > 0, by_row, 1.0), 0.0)
+        out[state] = np.where(np.isfinite(change), change, 0.0)
     return out
-
-
-def _restarted(change: Channels | None, old, new, by_state, step: float) -> Channels | None:
-    """A read-out's derivative with that of the start, which is read through it too."""
-    if change is None or old is None:
-        return change
-    out = dict(change)
-    for state, (_, derivative) in by_state.items():
-        for channel in out:
-            out[channel] = out[channel] + derivative[channel] * ((new[state] - old[state]) / step)
-    return out
-
-
-def _rows(composed: Composed, number: int, window: Window, names, here: Channels, starts, moved):
-    """Whitened rows of one window: residual, raw, log, channel, window, time, Jacobians."""
-    log = composed.recordings[window.log].window(window.begin, window.end)
-    span = log.t[-1] - log.t[0]
-    group = max(1, round(len(log) / max(span * RATE_LIMIT, 1.0)))
-    groups = [np.arange(i, min(i + group, len(log))) for i in range(0, len(log), group)]
-
-    def picked(channels: Channels) -> np.ndarray:
-        return np.array([np.mean(channels[n][rows[seen]]) for rows, n, seen in cells])
-
-    cells = []
-    for rows in groups:
-        for name in names:
-            seen = np.isfinite(log[name][rows])
-            if seen.any():
-                cells.append((rows, name, seen))
-    size = len(cells)
-    if size == 0:
-        return (*tuple(np.empty(0) for _ in range(6)), {})
-    raw = picked(log.columns) - picked(here)
-    variance = np.array([composed.noise[n] ** 2 / seen.sum() for _, n, seen in cells])
-    covariance = np.diag(variance)
-    for doubt, change in starts.values():
-        column = picked(change) * doubt
-        covariance += np.outer(column, column)
-    factor = np.linalg.cholesky(covariance)
-    jacobian = {
-        effect: solve_triangular(factor, np.stack([picked(c) for c in of], 1), lower=True)
-        for effect, of in moved.items()
-    }
-    channel = np.array([names.index(n) for _, n, _ in cells])
-    time = np.array([log.t[rows[seen]].mean() for rows, _, seen in cells])
-    return (
-        solve_triangular(factor, raw, lower=True), raw, np.full(size, window.log), channel,
-        np.full(size, number), time, jacobian,
-    )  # fmt: skip

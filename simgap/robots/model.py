@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from simgap.robot_effects.base import RobotEffect
-from simgap.robots.windows import Window, start_of
+from simgap.robots.rows import Rows, rows_of
+from simgap.robots.windows import LENGTH, Window, alike, cut, start_of
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 
@@ -22,6 +23,31 @@ class Composed:
     windows: tuple[Window, ...]
     effects: Mapping[str, RobotEffect]
     noise: Mapping[str, float]
+    rows: Rows
+
+    @classmethod
+    def of(
+        cls,
+        simulator: Simulator,
+        recordings: Sequence[Recording],
+        effects: Mapping[str, RobotEffect],
+        noise: Mapping[str, float],
+        length: float = LENGTH,
+    ) -> Composed:
+        """With windows of about `length` [s] cut, and their rows laid out."""
+        windows = tuple(cut(simulator, recordings, noise, length))
+        return cls(simulator, tuple(recordings), windows, effects, noise, rows_of(recordings, windows, noise))
+
+    def like(self, recordings: Sequence[Recording]) -> Composed:
+        """The same windows of other recordings of the same times."""
+        windows = tuple(alike(self.simulator, recordings, self.windows, self.noise))
+        rows = rows_of(recordings, windows, self.noise)
+        return replace(self, recordings=tuple(recordings), windows=windows, rows=rows)
+
+    def along(self, logs: Sequence[int]) -> Composed:
+        """The same along some of the logs alone, which keep their numbers."""
+        windows = tuple(w for w in self.windows if w.log in logs)
+        return replace(self, windows=windows, rows=rows_of(self.recordings, windows, self.noise))
 
     def commanded(self, point: Point) -> list[Recording]:
         """The recordings with commands as the drives took them."""
@@ -51,7 +77,7 @@ class Composed:
 
     def read(self, true: Sequence[Channels | None], point: Point) -> list[Channels | None]:
         """Channels of every window as they are read."""
-        acting = [(e, v) for e, v in self._acting(point) if e.read is not None]
+        acting = [(e, v) for e, v in self._acting(point) if e.reads]
         out: list[Channels | None] = []
         for window, channels in zip(self.windows, true, strict=True):
             if channels is None or not acting:
@@ -62,6 +88,8 @@ class Composed:
             for effect, theta in acting:
                 if effect.read is not None:
                     here[effect.channel] = effect.read(since, here[effect.channel], theta)
+                if effect.alter is not None:
+                    here |= effect.alter(log.window(window.begin, window.end), here, theta)
             out.append(here)
         return out
 
@@ -71,12 +99,16 @@ class Composed:
         if undone is None:
             return [w.start for w in self.windows]
         return [
-            None if w.start is None else {
-                n: v for n, (v, _) in
-                start_of(self.simulator, undone[w.log], w.begin, self.noise, w.forward).items()
+            None
+            if w.start is None
+            else {
+                n: v
+                for n, (v, _) in start_of(
+                    self.simulator, undone[w.log], w.begin, self.noise, w.forward
+                ).items()
             }
             for w in self.windows
-        ]  # fmt: skip
+        ]
 
     def unread(self, point: Point) -> list[Recording] | None:
         """The recordings with read-outs' effects undone, None where none acts."""

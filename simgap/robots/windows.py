@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,8 +35,9 @@ class Window:
     doubt: dict[str, float]
 
 
-def cut(simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[str, float],
-        length: float = LENGTH) -> list[Window]:  # fmt: skip
+def cut(
+    simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[str, float], length: float = LENGTH
+) -> list[Window]:
     """Windows of about `length` [s] that tile every log, new ones begun at the simulator's `contacts`.
 
     A simulator that cannot be restarted has one window a log. `noise` by channel [its unit].
@@ -46,23 +47,40 @@ def cut(simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[st
         if not restarts(simulator):
             out.append(Window(number, 0, len(log), True, None, {}))
             continue
-        edges = _edges(simulator, log, length)
-        forward = getattr(simulator, "contacts", None) is not None
-        for begin, end in itertools.pairwise(edges):
-            state = start_of(simulator, log, begin, noise, forward)
-            values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
-            out.append(Window(number, begin, end, forward, values, doubt))
+        marks = _marks(simulator, log)
+        for begin, end in itertools.pairwise(_edges(log, marks, length)):
+            near = any(abs(float(log.t[begin]) - m) < REACH for m in marks)
+            out.append(_begun(simulator, log, Window(number, begin, end, near, None, {}), noise))
     return out
 
 
-def _edges(simulator: Simulator, log: Recording, length: float) -> list[int]:
-    """First rows of the windows, and one past the last."""
-    marks = [0.0]
+def alike(
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    windows: Sequence[Window],
+    noise: Mapping[str, float],
+) -> list[Window]:
+    """The same windows of other recordings of the same times, begun as those have it."""
+    return [w if w.start is None else _begun(simulator, recordings[w.log], w, noise) for w in windows]
+
+
+def _begun(simulator: Simulator, log: Recording, window: Window, noise: Mapping[str, float]) -> Window:
+    state = start_of(simulator, log, window.begin, noise, window.forward)
+    values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
+    return replace(window, start=values, doubt=doubt)
+
+
+def _marks(simulator: Simulator, log: Recording) -> list[float]:
+    """Times [s] of the log at which contacts change."""
     contacts = getattr(simulator, "contacts", None)
+    return [] if contacts is None else [float(t) for t in contacts(log)]
+
+
+def _edges(log: Recording, contacts: Sequence[float], length: float) -> list[int]:
+    """First rows of the windows, and one past the last."""
     span = float(log.t[-1] - log.t[0])
-    if contacts is not None:
-        marks += [float(t) - float(log.t[0]) for t in contacts(log)]
-    marks = [*sorted(m for m in marks if 0 <= m < span), span]
+    inside = sorted(m - float(log.t[0]) for m in contacts)
+    marks = [0.0, *(m for m in inside if 0 <= m < span), span]
     times: list[float] = []
     for a, b in itertools.pairwise(marks):
         pieces = max(1, round((b - a) / length))
@@ -75,22 +93,25 @@ def _edges(simulator: Simulator, log: Recording, length: float) -> list[int]:
     return [*edges, len(log)]
 
 
-def start_of(simulator: Simulator, log: Recording, row: int, noise: Mapping[str, float],
-             forward: bool) -> dict[str, tuple[float, float]]:  # fmt: skip
+def start_of(
+    simulator: Simulator, log: Recording, row: int, noise: Mapping[str, float], forward: bool
+) -> dict[str, tuple[float, float]]:
     """State name -> (value, standard deviation) at a row of a log; see `smoothed` for `forward`."""
     own = getattr(simulator, "state_at", None)
     if own is not None:
         return {n: (float(v), float(s)) for n, (v, s) in own(log, float(log.t[row])).items()}
     out: dict[str, tuple[float, float]] = {}
+    told = getattr(simulator, "states", None)
     for name, channel in simulator.channels.items():
-        if channel.kind == "position":
+        if channel.kind == "position" and (told is None or name in told):
             (value, sd), (rate, rate_sd) = smoothed(log.t, log[name], row, noise[name], forward)
             out[name], out[name + RATE] = (value, sd), (rate, rate_sd)
     return out
 
 
-def smoothed(t: np.ndarray, values: np.ndarray, row: int, noise: float,
-             forward: bool = False) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
+def smoothed(
+    t: np.ndarray, values: np.ndarray, row: int, noise: float, forward: bool = False
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Value and rate at a row, each with its standard deviation, of a parabola through its neighbours.
 
     `forward` takes later samples alone: a contact changes rates. What the parabola misses counts as noise.

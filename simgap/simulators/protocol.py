@@ -26,7 +26,8 @@ Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
 class Parameter:
     """One parameter: `nominal` value, prior standard deviation `sd` about it, `unit`, bounds `low`, `high`.
 
-    Parameters of the same `effect` act as one candidate cause; without one, a parameter is its own.
+    Parameters of the same `effect` act as one candidate cause; without one, a parameter is its own. What is
+    `fitted` was never measured (a friction, say): it is fitted along with every cause and is none itself.
     """
 
     nominal: float
@@ -35,6 +36,7 @@ class Parameter:
     low: float = -math.inf
     high: float = math.inf
     effect: str | None = None
+    fitted: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.nominal) and math.isfinite(self.sd) and self.sd > 0):

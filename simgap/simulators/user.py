@@ -6,7 +6,7 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ class UserSimulator:
     state_at: Callable[..., Any] | None = None
     contacts: Callable[..., Any] | None = None
     simulate_many: Callable[..., Any] | None = None
+    says: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_simulator(spec: str) -> UserSimulator:
@@ -72,7 +73,9 @@ def checked(found: Any, where: str) -> UserSimulator:
     if all(c.kind == "command" for c in channels.values()):
         raise InputError(where, "has no channel to compare", "one that is no command")
     optional = {n: getattr(found, n, None) for n in ("state_at", "contacts", "simulate_many")}
-    return UserSimulator(parameters, channels, run, "start" in inspect.signature(run).parameters, **optional)
+    says = dict(getattr(found, "says", None) or {})
+    restarted = "start" in inspect.signature(run).parameters
+    return UserSimulator(parameters, channels, run, restarted, says=says, **optional)
 
 
 def _made(kind: type, value: Any, where: str) -> Any:

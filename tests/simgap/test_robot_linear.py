@@ -15,15 +15,22 @@ from simgap.robots.identifiable import identifiability
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises, resolution
-from simgap.robots.windows import cut, smoothed
+from simgap.robots.whiten import NONE, covariances, learned
+from simgap.robots.windows import smoothed
 from simgap.simulators.user import checked
 
 
 def composed(recordings, length: float = 0.4) -> Composed:
     simulator = checked(Swing(), "Swing")
-    noise = noises(simulator, recordings)
-    windows = tuple(cut(simulator, recordings, noise, length))
-    return Composed(simulator, tuple(recordings), windows, candidates(Setting(simulator, recordings)), noise)
+    effects = candidates(Setting(simulator, recordings))
+    return Composed.of(simulator, recordings, effects, noises(simulator, recordings), length)
+
+
+def whitened(model: Composed, point=None, effects=()):
+    """Residual and Jacobians, whitened by the sensors' noise and the starts' alone."""
+    linear = linearise(model, point or {}, list(effects))
+    whiten = covariances(linear, model.windows, {"angle": "position"}).whitener()
+    return whiten(linear.residual), {n: whiten(m.jacobian) for n, m in linear.moved.items()}, linear
 
 
 def test_windows_tile_every_log():
@@ -47,10 +54,10 @@ def test_a_start_is_right_within_what_it_says():
 
 def test_whitened_residuals_of_a_true_model_are_white():
     model = composed([log(s) for s in range(4)])
-    rows = linearise(model, {}, [])
-    assert 0.9 < np.sqrt(np.mean(rows.residual**2)) < 1.05
-    inside = rows.window[1:] == rows.window[:-1]
-    assert abs(np.mean((rows.residual[1:] * rows.residual[:-1])[inside])) < 0.06
+    residual, _, linear = whitened(model)
+    assert 0.9 < np.sqrt(np.mean(residual**2)) < 1.05
+    inside = linear.rows.window[1:] == linear.rows.window[:-1]
+    assert abs(np.mean((residual[1:] * residual[:-1])[inside])) < 0.06
 
 
 @pytest.mark.parametrize(
@@ -80,10 +87,10 @@ def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
         read = made.read(recording.t - recording.t[0], recording["angle"], values)
         planted = recording.with_columns({"angle": read})
     changed = composed([planted])
-    before = linearise(model, {}, [effect])
-    after = linearise(changed, {}, [effect])
-    shift = after.residual - before.residual
-    predicted = after.jacobian[effect] @ np.array([values[n] - p.nominal for n, p in made.parameters.items()])
+    before, _, _ = whitened(model)
+    after, jacobian, _ = whitened(changed, effects=[effect])
+    shift = after - before
+    predicted = jacobian[effect] @ np.array([values[n] - p.nominal for n, p in made.parameters.items()])
     left = np.linalg.norm(shift - predicted) / np.linalg.norm(shift)
     assert np.linalg.norm(shift) > 2 and left < 0.1
 
@@ -92,9 +99,9 @@ def test_an_effect_at_its_value_leaves_noise_alone():
     recording = log(5)
     late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)
     model = composed([recording.with_columns({"angle": late})])
-    nominal = linearise(model, {}, [])
-    there = linearise(model, {"readout:angle.lag": {"delay": 0.01}}, [])
-    assert np.mean(nominal.residual**2) > 3 and np.mean(there.residual**2) < 1.2
+    nominal, _, _ = whitened(model)
+    there, _, _ = whitened(model, {"readout:angle.lag": {"delay": 0.01}})
+    assert np.mean(nominal**2) > 3 and np.mean(there**2) < 1.2
 
 
 def test_lowpass_of_a_ramp_and_of_a_sine():
@@ -109,13 +116,13 @@ def test_lowpass_of_a_ramp_and_of_a_sine():
 def test_what_only_acts_together_is_said():
     """Torques and inertia scaled together change no motion: all four parameters are one set, exactly."""
     model = composed([log(s) for s in range(2)])
-    rows = linearise(model, {"viscous": {"viscous": 0.02}}, list(model.simulator.parameters))
-    names = list(rows.jacobian)
+    _, jacobian, _ = whitened(model, {"viscous": {"viscous": 0.02}}, list(model.simulator.parameters))
+    names = list(jacobian)
     scale = [model.simulator.parameters[n].sd for n in names]
-    found = identifiability(names, np.concatenate([rows.jacobian[n] for n in names], 1) * np.array(scale))
+    found = identifiability(names, np.concatenate([jacobian[n] for n in names], 1) * np.array(scale))
     assert any(a.own < 1e-3 and set(a.names) == set(names) for a in found.alike)
     without = [n for n in names if n != "torque_scale"]
-    columns = np.concatenate([rows.jacobian[n] for n in without], 1)
+    columns = np.concatenate([jacobian[n] for n in without], 1)
     assert (
         identifiability(
             without, columns * np.array([model.simulator.parameters[n].sd for n in without])
@@ -128,3 +135,17 @@ def test_resolution_is_found_and_only_where_there_is_one():
     values = np.random.default_rng(0).standard_normal(500)
     assert resolution(values) == 0.0 or resolution(values) < 1e-4
     assert resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
+
+
+def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
+    model = composed([log(s) for s in range(3)])
+    linear = linearise(model, {}, [])
+    cov = covariances(linear, model.windows, {"angle": "position"})
+    assert learned(cov, linear.residual) == NONE
+    off = composed([log(s, viscous=0.01) for s in range(3)])
+    linear = linearise(off, {}, [])
+    cov = covariances(linear, off.windows, {"angle": "position"})
+    found = learned(cov, linear.residual)
+    assert set(found.scale) >= {"angle"} and found.scale["angle"] > 0.1
+    white = cov.whitener(found)(linear.residual)
+    assert 0.4 < np.mean(white**2) < 1.6 < np.mean(cov.whitener()(linear.residual) ** 2)

@@ -1,0 +1,211 @@
+"""`hmmseg diagnose --simulator` and `--mjcf`: logs of any robot against its owner's own model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hmmseg.errors import InputError
+from hmmseg_cli.console import Output, check_folder
+
+if TYPE_CHECKING:
+    from simgap.robots.diagnose import RobotDiagnosis
+
+SimulatorOption = Annotated[
+    str | None,
+    typer.Option("--simulator", metavar="FILE.py:NAME", help="Your own model instead of the virtual blocks."),
+]
+MjcfOption = Annotated[
+    Path | None, typer.Option("--mjcf", metavar="XML", help="Your own model, for MuJoCo; it needs --map.")
+]
+MapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="MAP.toml",
+        help="Which column of the logs is which joint, actuator, sensor "
+        "or body of the MJCF model, in what unit.",
+    ),
+]
+CandidateOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--candidate",
+        metavar="NAME",
+        help="Offer one more thing the MJCF model can set as a cause, such as joint:elbow.frictionloss.",
+    ),
+]
+PatchOption = Annotated[
+    Path | None,
+    typer.Option("--patch", metavar="DIR", help="Write the corrected model and its ranges into this folder."),
+]
+
+
+@dataclass(frozen=True)
+class OwnSimulator:
+    """What the command line says of the owner's model."""
+
+    simulator: str | None
+    mjcf: Path | None
+    map_file: Path | None
+    candidates: Sequence[str]
+    patch: Path | None
+
+    @property
+    def given(self) -> bool:
+        """Whether a model was brought; InputError for what goes only with one."""
+        if self.simulator is None and self.mjcf is None:
+            if self.map_file is not None:
+                raise InputError(f"--map {self.map_file}", "goes with a MuJoCo model", "--mjcf XML")
+            if self.candidates:
+                raise InputError(
+                    f"--candidate {self.candidates[0]}", "goes with a MuJoCo model", "--mjcf XML"
+                )
+            return False
+        if self.simulator is not None and self.mjcf is not None:
+            raise InputError("--mjcf", "does not go with --simulator", "one model")
+        if self.mjcf is not None and self.map_file is None:
+            raise InputError(
+                "--map", "missing", "which column is which joint, actuator or sensor of the model"
+            )
+        if self.mjcf is None and (self.map_file is not None or self.candidates):
+            raise InputError(
+                "--map" if self.map_file else "--candidate", "goes with a MuJoCo model", "--mjcf XML"
+            )
+        return True
+
+    def check_alone(self, others: Mapping[str, Any]) -> None:
+        """InputError for an option that has no meaning with the owner's model."""
+        for option, value in others.items():
+            if value:
+                raise InputError(option, "does not go with a simulator of your own")
+        if self.patch is not None:
+            check_folder("--patch", self.patch)
+
+
+def diagnose_robot(
+    out: Output, paths: Sequence[Path], own: OwnSimulator, task: Path | None, effect: Sequence[str]
+) -> None:
+    """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
+    from simgap.robots.describe import body
+    from simgap.robots.diagnose import STAGES, diagnose
+    from simgap.simulators.recording import read_recording
+
+    if task is not None:
+        raise InputError(
+            f"--task {task}", "does not go with a simulator of your own yet: phases are told by motion"
+        )
+    more: list = []
+    if own.simulator is not None:
+        from simgap.simulators.user import load_simulator
+
+        simulator = load_simulator(own.simulator)
+        wanted = [n for n, c in simulator.channels.items()]
+        recordings = [read_recording(path, wanted) for path in paths]
+        at_risk = simulator
+    else:
+        from simgap.simulators.mjcf.load import load_mjcf
+
+        assert own.mjcf is not None and own.map_file is not None
+        loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
+        recordings = [loaded.read(path) for path in paths]
+        at_risk = loaded.simulator
+        more = loaded.effects(recordings)
+        for warning in loaded.warnings:
+            out.warn(warning)
+    with out.progress("diagnosing", total=STAGES) as advance:
+        found = diagnose(
+            at_risk,
+            recordings,
+            forced=tuple(dict.fromkeys(effect)),
+            seed=out.seed,
+            more=more,
+            tell=lambda text: advance(1),
+            warn=out.warn,
+        )
+    document = body(found)
+    told = sentence(document)
+    out.print(told, *tables(document, found))
+    if out.figures is not None or out.report is not None:
+        _draw(out, found, document, told)
+    if own.patch is not None:
+        from simgap.robots.patch import write_patch
+
+        write_patch(found, document, own.mjcf, lambda name: out.stage(own.patch / name))  # type: ignore[operator]
+    out.finish(document)
+
+
+def sentence(document: Mapping[str, Any]) -> str:
+    """The verdict in a sentence or two."""
+    from hmmseg_cli.diagnose import p_text
+
+    p = p_text(document["detection"]["p_value"])
+    if document["verdict"] == "none":
+        return f"No gap beyond the sensors' noise was found ({p})."
+    if document["verdict"] == "unknown":
+        return f"There is a gap ({p}) the larger part of which none of the candidate effects explains."
+    shrinkage, far = document["shrinkage"], ""
+    if shrinkage is not None:
+        percent = f"{100 * shrinkage['fraction']:.0f} %"
+        far = f"; with it in the model the gap shrinks by {percent} on {shrinkage['evaluated_on']}"
+    causes = " and ".join(document["causes"])
+    left = document["remainder"]["share"]
+    rest = f" {100 * left:.0f} % of the gap remain unexplained." if left > 0.02 else ""
+    if document["verdict"] == "set":
+        others = ", ".join(document["indistinguishable"])
+        return (
+            f"The gap is caused by {causes}, or by what these logs cannot tell from it: {others}{far}.{rest}"
+        )
+    return f"The gap is caused by {causes}{far}.{rest}"
+
+
+def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
+    """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
+    from hmmseg_cli.diagnose import tables as usual
+
+    out = []
+    unseen = document["identifiability"]["unseen"]
+    alike = document["identifiability"]["alike"]
+    if unseen or alike:
+        table = Table(title="what these logs cannot tell", title_justify="left", show_header=False)
+        for one in alike[:6]:
+            how = "act only together" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"
+            table.add_row(", ".join(one["parameters"]), how)
+        if unseen:
+            table.add_row(", ".join(unseen[:8]), "cannot be seen")
+        out.append(table)
+    out += usual(dict(document))
+    if document["shrinkage"] is not None:
+        rms = Table(title=f"residual on {document['shrinkage']['evaluated_on']}, rms", title_justify="left")
+        for head in ("channel", "before", "after", "noise"):
+            rms.add_column(head, justify="left" if head == "channel" else "right")
+        for name, v in document["shrinkage"]["rms"].items():
+            rms.add_row(
+                f"{name} [{v['unit']}]",
+                f"{v['before']:.4g}",
+                f"{v['after']:.4g}",
+                f"{found.composed.noise[name]:.2g}",
+            )
+        out.append(rms)
+    return out
+
+
+def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any], told: str) -> None:
+    """Figures where asked for, and the page with the same figures inside."""
+    from hmmseg_cli.figures.gap_robot import Drawn, draw_all
+
+    drawn = Drawn(found, document, found.warnings)
+    if out.figures is not None:
+        draw_all(drawn, out.figure)
+    if out.report is not None:
+        from hmmseg_cli.gap_report import rendered
+
+        says = {n: e.says for n, e in found.composed.effects.items()}
+        files = [r.name for r in found.composed.recordings]
+        page = rendered(drawn, told, "where the gap is largest", None, draw_all, files, says)
+        out.stage(out.report).write_text(page, encoding="utf-8")

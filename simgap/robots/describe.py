@@ -1,0 +1,161 @@
+"""A robot's diagnosis as the JSON document has it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from simgap.attribution.posterior import Model, fitted
+from simgap.robots.diagnose import RobotDiagnosis
+
+
+def body(found: RobotDiagnosis) -> dict[str, Any]:
+    """The document: verdict, causes, probabilities, where, effects, shrinkage, and what cannot be told."""
+    v = found.verdict
+    return {
+        "verdict": v.verdict,
+        "causes": list(v.causes),
+        "indistinguishable": list(v.indistinguishable),
+        "probabilities": v.probabilities,
+        "detection": {
+            "p_value": v.detection.p_value,
+            "statistic": v.detection.statistic,
+            "resolution": v.detection.resolution,
+        },
+        "remainder": {
+            "share": v.remainder if v.causes else (0.0 if v.verdict == "none" else 1.0),
+            "p_value": None if v.verdict == "none" else _remainder_p(found),
+            "where": _cells(v.remainder_where),
+        },
+        "attribution": _attribution(found),
+        "where": _cells(v.where),
+        "effects": _effects(found),
+        "fitted": _fitted(found),
+        "discrepancy": dict(found.discrepancy),
+        "identifiability": found.identifiable.body(),
+        "shrinkage": _shrinkage(found),
+        "next_experiment": None
+        if found.next_log is None
+        else {
+            "do": f"repeat the motion of {found.next_log.log}",
+            "separates": list(found.next_log.separates),
+            "expected_gain_nats": found.next_log.gain,
+        },
+    }
+
+
+def _cells(cells) -> list[dict[str, Any]]:
+    return [
+        {
+            "trial": c.trial,
+            "channel": c.channel,
+            "subtask": c.part,
+            "band": list(c.band),
+            "share": c.share,
+            "z": c.z,
+        }
+        for c in cells
+    ]
+
+
+def _remainder_p(found: RobotDiagnosis) -> float:
+    """The chance of sensors' noise alone to leave as much as the causes do."""
+    from scipy.stats import chi2
+
+    return float(chi2.sf(found.verdict.shares.after, found.verdict.shares.floor))
+
+
+def parameters(found: RobotDiagnosis, model: Model, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Of a set's effects: short name, or effect and short name where there are several, to its posterior."""
+    gap, out = found.forms.gap, {}
+    z = gap.nuisance.shape[1]
+    at = z
+    names = [c.name for c in gap.candidates]
+    for j in model.effects:
+        c = gap.candidates[j]
+        mean = c.neutral + c.scale * model.x[at : at + c.at.size]
+        sd = c.scale * np.sqrt(np.maximum(np.diag(model.covariance)[at : at + c.at.size], 0.0))
+        at += c.at.size
+        if names[j] not in effects:
+            continue
+        for k, short in enumerate(c.parameters):
+            key = short if len(effects) == 1 else f"{c.name}.{short}"
+            unit = found.composed.effects[c.name].parameters[short].unit
+            m, s = float(mean[k]), float(sd[k])
+            low, high = max(m - 1.645 * s, float(c.low[k])), min(m + 1.645 * s, float(c.high[k]))
+            out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": unit}
+    return out
+
+
+def _attribution(found: RobotDiagnosis) -> dict[str, Any]:
+    v = found.verdict
+    each = v.shares.each
+    names = [found.forms.gap.candidates[j].name for j in v.model.effects]
+    out = {}
+    for name, chance in sorted(v.chance.items(), key=lambda item: -item[1]):
+        share, interval = 0.0, [0.0, 0.0]
+        if name in names and each.size:
+            own = each[:, names.index(name)]
+            share, interval = float(own.mean()), [float(q) for q in np.percentile(own, (5, 95))]
+        out[name] = {"probability": chance, "share": share, "interval_90": interval}
+    return out
+
+
+def _effects(found: RobotDiagnosis) -> dict[str, Any]:
+    """The set of causes together, each of them, and those that could take a cause's place."""
+    v, f = found.verdict, found.forms
+    names = [c.name for c in f.gap.candidates]
+    plain = fitted(f, ())
+    out: dict[str, Any] = {}
+
+    def entry(effects: tuple[str, ...], model: Model) -> dict[str, Any]:
+        gain = found.shrinkage
+        return {
+            "parameters": parameters(found, model, effects),
+            "log_evidence": model.score - plain.score,
+            "heldout_score": 0.0
+            if gain is None or effects != v.causes
+            else 0.5 * (gain.before - gain.after) * found.linear.residual.size,
+            "property_shift": {},
+        }
+
+    if v.causes:
+        out["+".join(v.causes)] = entry(v.causes, v.model)
+        for name in v.causes if len(v.causes) > 1 else ():
+            out[name] = entry((name,), v.model)
+    for name in v.indistinguishable:
+        if name in names:
+            out[name] = entry((name,), fitted(f, (names.index(name),)))
+    return out
+
+
+def _fitted(found: RobotDiagnosis) -> dict[str, Any]:
+    """What was fitted along: before (nothing else acts) and with the causes."""
+    out = {}
+    for name, before in found.plain.point.items():
+        for short, value in before.items():
+            parameter = found.composed.effects[name].parameters[short]
+            out[name if len(before) == 1 else f"{name}.{short}"] = {
+                "before": value,
+                "after": found.linear.point[name][short],
+                "unit": parameter.unit,
+            }
+    return out
+
+
+def _shrinkage(found: RobotDiagnosis) -> dict[str, Any] | None:
+    far = found.shrinkage
+    if far is None:
+        return None
+    units = {n: c.unit for n, c in found.composed.simulator.channels.items()}
+    return {
+        "evaluated_on": "held-out logs" if len(found.composed.recordings) > 2 else "held-out stretches",
+        "before": far.before,
+        "after": far.after,
+        "noise_floor": far.noise_floor,
+        "fraction": far.fraction,
+        "interval_90": list(far.interval_90),
+        "flexible_ceiling": None,
+        "rms": {n: {"before": a, "after": b, "unit": units[n]} for n, (a, b) in far.rms.items()},
+    }

@@ -1,0 +1,174 @@
+"""What stretches of logs that took no part say: whether they bear a cause out, how far the gap shrinks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from simgap.attribution.posterior import Forms, fitted, forms, sought
+from simgap.attribution.problem import Gap
+from simgap.robots.linear import Linear, base_at
+from simgap.robots.model import Composed, Point
+from simgap.robots.search import Found, moved_to, point_of
+from simgap.robots.whiten import Whitener
+
+FOLDS = 6
+BORNE_OUT = 0.05  # chance of held-out gains as good without any
+
+
+def folds_of(linear: Linear, num_logs: int) -> np.ndarray:
+    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches."""
+    if num_logs >= 3:
+        return linear.rows.log % min(num_logs, FOLDS)
+    stretches = max(2, FOLDS // num_logs)
+    out = np.zeros(linear.rows.log.size, int)
+    for log in range(num_logs):
+        mine = linear.rows.log == log
+        window = linear.rows.window[mine]
+        first, count = int(window.min()), int(np.ptp(window)) + 1
+        out[mine] = log * stretches + (window - first) * stretches // count
+    return np.unique(out, return_inverse=True)[1]
+
+
+def _log_likelihood(f: Forms, gap: Gap, effects: Sequence[int], x: np.ndarray) -> float:
+    """Of held-out rows at parameters x, the background averaged over."""
+    from simgap.attribution.posterior import _taken
+
+    taken = _taken(f, tuple(effects))
+    return float(f.background.marginal(taken.energy(x), f.count, taken.shift)[0].sum())
+
+
+def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> tuple[int, ...]:
+    """Of a set's effects those that held-out rows bear out beside the others; the least one goes first."""
+    kept = tuple(sorted(effects))
+    numbers = np.unique(fold)
+    while kept and numbers.size >= 2:
+        sets = [kept, *(tuple(j for j in kept if j != out) for out in kept)]
+        score = np.zeros((numbers.size, len(sets)))
+        for k, number in enumerate(numbers):
+            inside = fold == number
+            train, judge = forms(gap.taken(~inside)), forms(gap.taken(inside))
+            for i, effects in enumerate(sets):
+                score[k, i] = _log_likelihood(judge, gap, effects, fitted(train, effects).x)
+        gain = score[:, :1] - score[:, 1:]
+        mean, sd = gain.mean(0), np.maximum(gain.std(0, ddof=1), 1e-9) / np.sqrt(numbers.size)
+        chance = student.sf(mean / sd, numbers.size - 1)
+        worst = int(chance.argmax())
+        if chance[worst] < BORNE_OUT:
+            break
+        kept = sets[1 + worst]
+    return kept
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """Mean squares of whitened residuals of held-out stretches `before` and `after` (noise's own: 1), and
+    the gap's `fraction` that is gone with its 90 % interval by fold. `rms`: by channel before and after, in
+    its unit; `found` by fold."""
+
+    before: float
+    after: float
+    noise_floor: float
+    fraction: float
+    interval_90: tuple[float, float]
+    rms: dict[str, tuple[float, float]]
+    found: tuple[tuple[str, ...], ...]
+    residual: np.ndarray
+
+
+def shrinkage(
+    composed: Composed,
+    found: Found,
+    plain: Linear,
+    sensor: Whitener,
+    fold: np.ndarray,
+    causes: Sequence[str],
+    forced: bool = False,
+) -> Shrinkage | None:
+    """Nested: every fold is predicted by a search and a fit that saw the others alone, about the point where
+    the search ended. `plain`: the linear model where only what is fitted along is; `causes` are taken where
+    they are `forced`."""
+    rows, index = found.linear.rows, np.flatnonzero(np.isfinite(found.linear.residual))
+    gap = found.forms.gap
+    after, told = np.full(rows.log.size, np.nan), []
+    whole_logs = all(np.unique(fold[rows.log == log]).size == 1 for log in np.unique(rows.log))
+    for number in np.unique(fold):
+        inside = fold == number
+        seen = ~inside[index]
+        train = forms(gap.taken(seen))
+        if forced:
+            kept = tuple(j for j, n in enumerate(found.names) if n in causes)
+        else:
+            kept = borne_out(gap.taken(seen), sought(train)[0].effects, fold[index][seen])
+        told.append(tuple(found.names[j] for j in kept))
+        point = point_of(composed, train, kept, found.linear.point)
+        if whole_logs:
+            point = _refitted(composed, found, point, np.unique(rows.log[~inside]).tolist())
+        logs = np.unique(rows.log[inside])
+        mine = np.isin(rows.log, logs)
+        predicted = base_at(composed.along(logs.tolist()), point).rows
+        after[mine] = np.where(inside[mine], rows.observed[mine] - predicted, after[mine])
+    return _measured(found.linear, plain, after, sensor, fold, tuple(told))
+
+
+def _measured(
+    linear: Linear,
+    plain: Linear,
+    after: np.ndarray,
+    sensor: Whitener,
+    fold: np.ndarray,
+    told: tuple[tuple[str, ...], ...],
+) -> Shrinkage | None:
+    usable = np.isfinite(after) & np.isfinite(plain.residual) & np.isfinite(linear.residual)
+    numbers = np.unique(fold)
+    white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (plain.residual, after)]
+    square = np.array(
+        [
+            [float(np.sum(w[(fold == n) & usable])) for w in white] + [float(np.sum((fold == n) & usable))]
+            for n in numbers
+        ]
+    )
+    gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]
+    if there.sum() <= 0:
+        return None
+    fraction = min(float(gone.sum() / there.sum()), 1.0)
+    others = (gone.sum() - gone) / np.maximum(there.sum() - there, 1e-9)
+    k = numbers.size
+    sd = float(np.sqrt((k - 1) / k * ((others - others.mean()) ** 2).sum()))  # Tukey's jackknife of a ratio
+    wide = float(student.ppf(0.95, k - 1)) * sd
+    rms = {}
+    for c, name in enumerate(linear.rows.channels):
+        mine = usable & (linear.rows.channel == c)
+        if mine.any():
+            rms[name] = tuple(float(np.sqrt(np.mean(r[mine] ** 2))) for r in (plain.residual, after))
+    total = square.sum(0)
+    return Shrinkage(
+        total[0] / total[2],
+        total[1] / total[2],
+        1.0,
+        fraction,
+        (fraction - wide, min(fraction + wide, 1.0)),
+        rms,
+        told,
+        after,
+    )
+
+
+def _refitted(composed: Composed, found: Found, point: Point, logs: Sequence[int]) -> Point:
+    """The point fitted to some of the logs alone, exactly."""
+    from simgap.robots.linear import linearise
+    from simgap.robots.whiten import covariances
+
+    part = composed.along(logs)
+    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
+    linear = linearise(part, point, [])
+    cov = covariances(linear, part.windows, kinds)
+    numbers = {
+        i: found.discrepancy.multiplier.get(composed.windows.index(w), 1.0)
+        for i, w in enumerate(part.windows)
+    }
+    off = type(found.discrepancy)(found.discrepancy.scale, numbers)
+    return moved_to(part, linear, cov.whitener(off), point)

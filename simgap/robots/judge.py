@@ -1,0 +1,136 @@
+"""The verdict on a robot's logs: none, named, a set, or unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit
+
+from simgap.attribution.attribute import ALARM
+from simgap.attribution.cells import Cell, significant
+from simgap.attribution.detection import Detection, statistic
+from simgap.attribution.posterior import Forms, Model, fitted
+from simgap.attribution.shares import Shares, shares
+from simgap.attribution.verdict import LEAST, MOST, WIDTH
+
+TWENTY = 20.0  # to one: odds from which on a rival is ruled out
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found; `models` and `weights` are the sets compared, `noise` 1 as whitened by sensors."""
+
+    verdict: str
+    causes: tuple[str, ...]
+    indistinguishable: tuple[str, ...]
+    probabilities: dict[str, float]
+    detection: Detection
+    remainder: float
+    where: tuple[Cell, ...]
+    remainder_where: tuple[Cell, ...]
+    shares: Shares
+    model: Model  # the causes' own, discrepancies whitened
+    chance: dict[str, float]  # of each candidate to act
+
+
+def rivals(f: Forms, causes: Sequence[int]) -> list[Model]:
+    """The set of causes, those with one left out or exchanged, and none."""
+    every = range(len(f.gap.candidates))
+    fewer = [tuple(j for j in causes if j != out) for out in causes]
+    sets = {tuple(sorted(causes)), (), *fewer}
+    sets |= {tuple(sorted({*kept, j})) for kept in fewer for j in every}
+    return sorted((fitted(f, effects) for effects in sorted(sets)), key=lambda m: -m.score)
+
+
+def judge(
+    f: Forms,
+    sensor: Forms,
+    causes: tuple[int, ...],
+    twins: Sequence[float],
+    rng: np.random.Generator,
+    forced: bool = False,
+) -> Verdict:
+    """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
+    `causes` were borne out by held-out rows; `twins` are healthy twins' statistics."""
+    gap = f.gap
+    models = rivals(f, causes)
+    score = np.array([m.score for m in models])
+    weight = np.exp(score - np.logaddexp.reduce(score))
+    value = statistic(sensor, [fitted(sensor, causes), fitted(sensor, ())])
+    p = float(np.exp(min(0.0, -value)))
+    exceed = sum(t >= value for t in twins)
+    p = max(p, exceed / len(twins)) if twins else p
+    detection = Detection(value, p, 1 / (len(twins) + 1) if twins else 0.0)
+    one = np.ones(sensor.count.size)
+    explained = shares(sensor, fitted(sensor, causes), one, rng)
+    part = explained.each.mean(0) if causes else np.zeros(0)
+    kept = (
+        causes if forced else tuple(j for j, s in zip(causes, part, strict=True) if s >= LEAST * part.sum())
+    )
+    if kept != causes:
+        explained = shares(sensor, fitted(sensor, kept), one, rng)
+    left = explained.remainder if kept else 1.0
+    none = float(expit((np.log(max(p, 1e-300)) - np.log(ALARM)) / 0.5))
+    known = float(expit(np.log(MOST / max(left, 1e-6)) / WIDTH)) if kept else 0.0
+    name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
+    likely: dict[str, float] = {}
+    for m, w in zip(models, weight, strict=True):
+        if m.effects:
+            key = "+".join(name(m.effects))
+            likely[key] = likely.get(key, 0.0) + float(w)
+    nothing = float(sum(w for m, w in zip(models, weight, strict=True) if not m.effects))
+    probabilities = {"none": none, "unknown": (1 - none) * (nothing + (1 - nothing) * (1 - known))}
+    probabilities |= {k: (1 - none) * known * v for k, v in likely.items() if (1 - none) * known * v > 1e-4}
+    probabilities["other"] = max(0.0, 1.0 - sum(probabilities.values()))
+    verdict, partners = "none", ()
+    if forced:
+        verdict = "named"
+    elif p < ALARM:
+        verdict = "unknown"
+        if kept and left <= MOST:
+            partners = _partners(models, kept)
+            verdict = "set" if partners else "named"
+    told = kept if verdict in ("named", "set") else ()
+    noise = np.ones(len(gap.rows.channels))
+    rows, band = sensor.gap.rows, sensor.spectrum.band
+    before, after = _left(sensor, ()), _left(sensor, told)
+    chance = {
+        c.name: float(sum(w for m, w in zip(models, weight, strict=True) if j in m.effects)) * (1 - none)
+        for j, c in enumerate(gap.candidates)
+    }
+    return Verdict(
+        verdict,
+        name(told),
+        name(partners),
+        probabilities,
+        detection,
+        left if told else 1.0,
+        significant(rows, band, before, noise[rows.channel]) if verdict != "none" else (),
+        significant(rows, band, after, noise[rows.channel]) if verdict != "none" else (),
+        explained,
+        fitted(f, kept),
+        chance,
+    )
+
+
+def _partners(models: Sequence[Model], causes: tuple[int, ...]) -> tuple[int, ...]:
+    """Effects that take a cause's place in sets one in twenty as likely or more."""
+    best = (
+        next(m.score for m in models if m.effects == causes)
+        if any(m.effects == causes for m in models)
+        else models[0].score
+    )
+    found: set[int] = set()
+    for m in models:
+        if m.score > best - np.log(TWENTY) and len(m.effects) <= len(causes):
+            found |= set(m.effects) - set(causes)
+    return tuple(sorted(found))
+
+
+def _left(f: Forms, effects: tuple[int, ...]) -> np.ndarray:
+    """Residual cosines (n,) that a set leaves."""
+    from simgap.attribution.invariance import residual_left
+
+    return residual_left(f, fitted(f, effects))

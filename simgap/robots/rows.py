@@ -1,0 +1,96 @@
+"""The rows that windows give: means over neighbouring samples of every compared channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.errors import InputError
+from simgap.robots.windows import Window
+from simgap.simulators.protocol import Channels
+from simgap.simulators.recording import Recording
+
+RATE_LIMIT = 100.0  # Hz: residuals are means over neighbours down to this rate
+
+
+@dataclass(frozen=True)
+class Rows:
+    """N rows by window, in each by time and then channel: `log`, `channel`, `window` numbers, `time` [s].
+
+    `observed` (N,) in the channel's unit and `variance` (N,) of its sensor noise; `of` are each window's
+    rows; `_picks` says which samples make up which row.
+    """
+
+    channels: tuple[str, ...]
+    log: np.ndarray
+    channel: np.ndarray
+    window: np.ndarray
+    time: np.ndarray
+    since: np.ndarray  # s from the window's first sample
+    observed: np.ndarray
+    variance: np.ndarray
+    of: tuple[slice, ...]
+    _picks: tuple[_Pick, ...]
+
+    def averaged(self, read: Sequence[Channels | None]) -> np.ndarray:
+        """Rows (N,) of simulated channels by window; NaN where a rollout diverged."""
+        out = np.full(self.log.size, np.nan)
+        for pick, mine, channels in zip(self._picks, self.of, read, strict=True):
+            if channels is not None and mine.stop > mine.start:
+                out[mine] = pick.mean(np.array([channels[name] for name in self.channels]))
+        return out
+
+
+@dataclass(frozen=True)
+class _Pick:
+    """Groups of samples: first sample of each, which are `seen` (C, n), and how many of each (C, groups)."""
+
+    first: np.ndarray
+    seen: np.ndarray
+    count: np.ndarray
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Means over groups (rows,) of values (C, n)."""
+        total = np.add.reduceat(np.where(self.seen, values, 0.0), self.first, axis=1)
+        return (total / np.maximum(self.count, 1)).T[(self.count > 0).T]
+
+
+def rows_of(recordings: Sequence[Recording], windows: Sequence[Window], noise: Mapping[str, float]) -> Rows:
+    """Rows of all windows. InputError where there is no sample at all."""
+    names = tuple(noise)
+    picks, parts, of, at = [], [], [], 0
+    for number, window in enumerate(windows):
+        log = recordings[window.log].window(window.begin, window.end)
+        span = max(float(log.t[-1] - log.t[0]), 1e-9)
+        size = max(1, round(len(log) / max(span * RATE_LIMIT, 1.0)))
+        first = np.arange(0, len(log), size)
+        values = np.array([log[n] for n in names])
+        seen = np.isfinite(values)
+        count = np.add.reduceat(seen.astype(int), first, axis=1)
+        pick = _Pick(first, seen, count)
+        kept = (count > 0).T
+        stamps = np.add.reduceat(log.t, first) / np.diff(np.append(first, len(log)))
+        group, channel = np.nonzero(kept)
+        variance = (np.array([noise[n] ** 2 for n in names])[:, None] / np.maximum(count, 1)).T[kept]
+        n = group.size
+        parts.append(
+            (
+                np.full(n, window.log),
+                channel,
+                np.full(n, number),
+                stamps[group],
+                stamps[group] - log.t[0],
+                pick.mean(values),
+                variance,
+            )
+        )
+        picks.append(pick)
+        of.append(slice(at, at + n))
+        at += n
+    if at == 0:
+        raise InputError("recordings", "have no samples of the channels to compare", "numbers")
+    joined = [np.concatenate([p[i] for p in parts]) for i in range(7)]
+    log, channel, window, time, since, observed, variance = joined
+    return Rows(names, log, channel, window, time, since, observed, variance, tuple(of), tuple(picks))

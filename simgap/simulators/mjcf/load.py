@@ -1,0 +1,248 @@
+"""A MuJoCo model and a map, read and checked: the simulator, how to read logs, candidates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmmseg.errors import InputError, nearest
+from simgap.robot_effects.base import RobotEffect
+from simgap.simulators.mjcf.map import Map, Mapped, read_map
+from simgap.simulators.protocol import Channel
+from simgap.simulators.recording import Recording, read_recording
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs."""
+
+    simulator: Any
+    map: Map
+    candidates: Sequence[str]
+    warnings: tuple[str, ...]
+
+    def read(self, path: Path) -> Recording:
+        """A log in SI, as the map has it; InputError where a unit cannot be."""
+        columns = self.map.columns
+        raw = read_recording(path, columns, self.map.time)
+        values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
+        log = Recording(raw.name, raw.t * self.map.time_factor, values)
+        for pose in self.simulator.free.values():
+            log = continuous(log, [pose[a] for a in ("qw", "qx", "qy", "qz")])
+        _check_ranges(self.simulator.model, columns, log, str(path))
+        return log
+
+    def effects(self, recordings: Sequence[Recording]) -> list[RobotEffect]:
+        """Candidates that need the model: those it can set become its parameters, the rest are given."""
+        from simgap.simulators.mjcf.catalogue import offered
+
+        return offered(self.simulator, recordings, self.candidates)
+
+
+def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Loaded:
+    """Read and check a model and its map; InputError names the file and the column or thing at fault."""
+    try:
+        from simgap.simulators.mjcf.engine import mujoco
+    except ImportError:
+        raise InputError("--mjcf", "needs MuJoCo", 'pip install "hmmseg[mujoco]"') from None
+    if mujoco.__version__ == "4.0.0":
+        raise InputError("--mjcf", "MuJoCo 4.0.0 has a solver bug", "another version from 3 on")
+    if not xml.is_file():
+        raise InputError(f"--mjcf {xml}", "no such file", "an MJCF file")
+    described = read_map(map_file)
+    try:
+        spec = mujoco.MjSpec.from_file(str(xml))
+        plain = spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
+    from simgap.simulators.mjcf.settable import names_of, setting_of
+
+    for column in described.columns.values():
+        known = names_of(plain, column.thing)
+        if column.name not in known:
+            raise InputError(
+                f"{map_file}: columns.{column.column}",
+                f"the model has no {column.thing} {column.name}",
+                nearest(column.name, known),
+            )
+    if described.keyframe is not None:
+        keys = [plain.key(i).name for i in range(plain.nkey)]
+        if described.keyframe not in keys:
+            raise InputError(
+                f"{map_file}: keyframe",
+                f"the model has no {described.keyframe}",
+                nearest(described.keyframe, keys),
+            )
+    for name in candidates:
+        setting_of(plain, name)
+    address = _add_sensors(mujoco, spec, described.columns)
+    model = spec.compile()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    simulator, warnings = _simulator(mujoco, model, described, address)
+    return Loaded(simulator, described, candidates, tuple(warnings))
+
+
+def _add_sensors(mujoco: Any, spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[str, int]]:
+    """A sensor for each compared column: column -> (sensor's name, component)."""
+    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    made = {
+        ("joint", "position"): (kinds.mjSENS_JOINTPOS, objects.mjOBJ_JOINT),
+        ("joint", "velocity"): (kinds.mjSENS_JOINTVEL, objects.mjOBJ_JOINT),
+        ("joint", "torque"): (kinds.mjSENS_JOINTACTFRC, objects.mjOBJ_JOINT),
+        ("actuator", "force"): (kinds.mjSENS_ACTUATORFRC, objects.mjOBJ_ACTUATOR),
+    }
+    out: dict[str, tuple[str, int]] = {}
+    for column in columns.values():
+        if column.kind == "command":
+            continue
+        if column.thing == "sensor":
+            axis = {"x": 0, "y": 1, "z": 2, "": 0}.get(column.axis)
+            out[column.column] = (column.name, int(column.axis) if axis is None else axis)
+            continue
+        name = f"hmmseg:{column.column}"
+        if column.thing in ("body", "site"):
+            turning = column.axis.startswith("q")
+            what = objects.mjOBJ_XBODY if column.thing == "body" else objects.mjOBJ_SITE
+            spec.add_sensor(
+                name=name,
+                type=kinds.mjSENS_FRAMEQUAT if turning else kinds.mjSENS_FRAMEPOS,
+                objtype=what,
+                objname=column.name,
+            )
+            at = ("qw", "qx", "qy", "qz").index(column.axis) if turning else "xyz".index(column.axis)
+            out[column.column] = (name, at)
+        else:
+            kind, what = made[column.thing, column.kind]
+            spec.add_sensor(name=name, type=kind, objtype=what, objname=column.name)
+            out[column.column] = (name, 0)
+    return out
+
+
+def _simulator(mujoco: Any, model: Any, described: Map, address: Mapping[str, tuple[str, int]]):
+    from simgap.simulators.mjcf.model import MjcfSimulator
+
+    identity = lambda kind, name: mujoco.mj_name2id(model, kind, name)  # noqa: E731
+    objects = mujoco.mjtObj
+    channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
+    for column in described.columns.values():
+        channels[column.column] = Channel(_unit(mujoco, model, column), column.kind, column.noise)
+        if column.kind == "command":
+            driven[column.column] = identity(objects.mjOBJ_ACTUATOR, column.name)
+            continue
+        sensor, at = address[column.column]
+        number = identity(objects.mjOBJ_SENSOR, sensor)
+        if at >= model.sensor_dim[number]:
+            raise InputError(
+                f"{described.file}: columns.{column.column}.axis",
+                f"sensor {column.name} has no {column.axis}",
+            )
+        sensors[column.column] = int(model.sensor_adr[number]) + at
+        if column.thing == "joint" and column.kind == "position":
+            joint = identity(objects.mjOBJ_JOINT, column.name)
+            if int(model.jnt_type[joint]) not in (
+                int(mujoco.mjtJoint.mjJNT_HINGE),
+                int(mujoco.mjtJoint.mjJNT_SLIDE),
+            ):
+                raise InputError(
+                    f"{described.file}: columns.{column.column}.joint",
+                    f"{column.name} is no hinge or slide",
+                    "the seven columns of its body's pose",
+                )
+            joints[column.column] = joint
+        if column.thing == "body":
+            poses.setdefault(column.name, {})[column.axis] = column.column
+    free = {}
+    for name, pose in poses.items():
+        body = identity(objects.mjOBJ_BODY, name)
+        first = int(model.body_jntadr[body])
+        if first < 0 or int(model.jnt_type[first]) != int(mujoco.mjtJoint.mjJNT_FREE):
+            continue
+        missing = [a for a in ("x", "y", "z", "qw", "qx", "qy", "qz") if a not in pose]
+        if missing:
+            warnings.append(
+                f"{described.file}: the free body {name} has no column for {', '.join(missing)}, so that "
+                "it starts as the model has it"
+            )
+        else:
+            free[first] = pose
+    untold = [n for n in _commands_untold(mujoco, model, driven)]
+    if untold:
+        warnings.append(
+            f"{described.file}: no column drives {', '.join(untold)}; they are left at zero or the keyframe"
+        )
+    touching = bool(np.any((model.geom_contype != 0) | (model.geom_conaffinity != 0))) and not (
+        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )
+    made = MjcfSimulator(model, described, channels, {}, {}, sensors, joints, driven, free, touching)
+    return made, warnings
+
+
+def _commands_untold(mujoco: Any, model: Any, driven: Mapping[str, int]) -> list[str]:
+    told = set(driven.values())
+    return [
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator {i}"
+        for i in range(model.nu)
+        if i not in told
+    ]
+
+
+def _unit(mujoco: Any, model: Any, column: Mapped) -> str:
+    """The SI unit of a column as the model has it."""
+    if column.thing == "joint":
+        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, column.name)
+        turning = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+        return {
+            "position": "rad" if turning else "m",
+            "velocity": "rad/s" if turning else "m/s",
+            "torque": "N m" if turning else "N",
+        }[column.kind]
+    if column.thing == "actuator":
+        return "N m" if column.kind == "force" else "1" if column.unit is None else column.unit
+    if column.thing in ("body", "site"):
+        return "1" if column.axis.startswith("q") else "m"
+    return {"position": "m", "velocity": "m/s", "force": "N", "torque": "N m"}[column.kind]
+
+
+LATITUDE = 0.2  # share of a joint's range by which a log may exceed it
+
+
+def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
+    """InputError where angles are so large that they must be degrees, never guessed."""
+    from simgap.simulators.mjcf.engine import mujoco
+
+    for column in columns.values():
+        if column.thing != "joint" or column.kind != "position":
+            continue
+        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, column.name)
+        turning = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+        values = log[column.column]
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        limited = bool(model.jnt_limited[joint])
+        reach = (
+            (float(model.jnt_range[joint][0]), float(model.jnt_range[joint][1]))
+            if limited
+            else (-math.tau * 4, math.tau * 4)
+        )
+        slack = LATITUDE * (reach[1] - reach[0])
+        if reach[0] - slack <= low and high <= reach[1] + slack:
+            continue
+        told = "rad" if turning else "m"
+        guess = 'unit = "deg" in the map?' if turning else 'unit = "mm" in the map?'
+        raise InputError(
+            f"{file}: column {column.column}",
+            f"{low:.4g} to {high:.4g} {told}, beyond joint {column.name}'s {reach[0]:.4g} to {reach[1]:.4g}",
+            guess,
+        )
+
+
+def continuous(log: Recording, turn: Sequence[str]) -> Recording:
+    """Quaternion columns with signs that do not jump: q and -q are the same turn."""
+    quat = np.array([log[n] for n in turn])
+    dot = np.nansum(quat[:, 1:] * quat[:, :-1], 0)
+    sign = np.cumprod(np.concatenate([[1.0], np.where(dot < 0, -1.0, 1.0)]))
+    return log.with_columns({n: sign * log[n] for n in turn})

@@ -1,0 +1,150 @@
+"""map.toml: which column of a log is which joint, actuator, sensor or body of a MuJoCo model.
+
+[columns.q1]            # the column's name in the log
+joint = "shoulder"      # or actuator, sensor, body, site
+unit = "deg"            # SI where left out
+noise = 0.01            # sd of a sample, in that unit; learned from the log where left out
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hmmseg.errors import InputError, nearest
+from hmmseg.io.units import si_factor
+
+THINGS = ("joint", "actuator", "sensor", "body", "site")
+AXES = {"body": ("x", "y", "z", "qw", "qx", "qy", "qz"), "site": ("x", "y", "z", "qw", "qx", "qy", "qz")}
+KINDS = {
+    "joint": ("position", "velocity", "torque"),
+    "actuator": ("command", "force"),
+    "sensor": ("position", "velocity", "force", "torque"),
+    "body": ("position",),
+    "site": ("position",),
+}
+KEYS = (*THINGS, "kind", "axis", "unit", "noise", "sign", "offset")
+TOP = ("columns", "time", "window", "keyframe")
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """One column: the `thing` of the model (`joint`, ...) by `name`, its `kind`, `axis`; `factor`, `offset`
+    take the column's values to SI, `noise` is in SI."""
+
+    column: str
+    thing: str
+    name: str
+    kind: str
+    axis: str
+    unit: str | None
+    factor: float
+    offset: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class Map:
+    """The columns, the `time` column with its factor to s, windows' `length` [s], the `keyframe` to start
+    what no column tells from."""
+
+    file: str
+    columns: Mapping[str, Mapped]
+    time: str = "t"
+    time_factor: float = 1.0
+    length: float | None = None
+    keyframe: str | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_map(path: Path) -> Map:
+    """The map of a TOML file; InputError names the key at fault."""
+    if not path.is_file():
+        raise InputError(f"--map {path}", "no such file", "a TOML file")
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(str(path), f"is no TOML ({error})") from None
+    for key in raw:
+        if key not in TOP:
+            raise InputError(f"{path}: {key}", "unknown key", nearest(key, TOP))
+    columns = raw.get("columns", {})
+    if not isinstance(columns, dict) or not columns:
+        raise InputError(f"{path}: columns", "missing", "a table [columns.NAME] for each column of the logs")
+    time = raw.get("time", {})
+    time = {"column": time} if isinstance(time, str) else time
+    found = {name: _mapped(name, entry, f"{path}: columns.{name}") for name, entry in columns.items()}
+    if all(m.kind == "command" for m in found.values()):
+        raise InputError(
+            f"{path}: columns", "are all commands: nothing to compare", "a joint, sensor or body"
+        )
+    return Map(
+        str(path),
+        found,
+        time.get("column", "t"),
+        _unit(time.get("unit"), f"{path}: time.unit"),
+        _number(raw, "window", str(path)),
+        raw.get("keyframe"),
+    )
+
+
+def _mapped(column: str, entry: Any, where: str) -> Mapped:
+    if not isinstance(entry, dict):
+        raise InputError(where, "is no table", '{joint = "..."}')
+    for key in entry:
+        if key not in KEYS:
+            raise InputError(f"{where}.{key}", "unknown key", nearest(key, KEYS))
+    things = [t for t in THINGS if t in entry]
+    if len(things) != 1:
+        raise InputError(
+            where,
+            "names no thing of the model" if not things else f"names {' and '.join(things)}",
+            f"one of {', '.join(THINGS)}",
+        )
+    thing = things[0]
+    kind = entry.get("kind", KINDS[thing][0])
+    if kind not in KINDS[thing]:
+        raise InputError(f"{where}.kind", f"{kind!r} of a {thing}", f"one of {', '.join(KINDS[thing])}")
+    axis = str(entry.get("axis", ""))
+    if thing in AXES and axis not in AXES[thing]:
+        raise InputError(
+            f"{where}.axis", f"{axis!r}" if axis else "missing", f"one of {', '.join(AXES[thing])}"
+        )
+    unit = entry.get("unit")
+    factor = _unit(unit, f"{where}.unit") * _number(entry, "sign", where, 1.0)
+    noise = _number(entry, "noise", where, math.nan)
+    if noise <= 0:
+        raise InputError(f"{where}.noise", f"{noise:g}", "above 0")
+    return Mapped(
+        column,
+        thing,
+        str(entry[thing]),
+        kind,
+        axis,
+        unit,
+        factor,
+        _number(entry, "offset", where, 0.0),
+        abs(factor) * noise,
+    )
+
+
+def _unit(unit: Any, where: str) -> float:
+    if unit is None:
+        return 1.0
+    try:
+        return si_factor(unit)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(where, f"{unit!r} is no known unit", str(error)) from None
+
+
+def _number(entry: Mapping[str, Any], key: str, where: str, default: Any = None) -> Any:
+    if key not in entry:
+        return default
+    value = entry[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}.{key}", f"{value!r}", "a number")
+    return float(value)
