@@ -91,7 +91,7 @@ def parameters(found: RobotDiagnosis, model: Model, effects: tuple[str, ...]) ->
 def _attribution(found: RobotDiagnosis) -> dict[str, Any]:
     v = found.verdict
     each = v.shares.each
-    names = [found.forms.gap.candidates[j].name for j in v.model.effects]
+    names = v.shared
     out = {}
     for name, chance in sorted(v.chance.items(), key=lambda item: -item[1]):
         share, interval = 0.0, [0.0, 0.0]

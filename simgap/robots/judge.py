@@ -31,7 +31,8 @@ class Verdict:
     where: tuple[Cell, ...]
     remainder_where: tuple[Cell, ...]
     shares: Shares
-    model: Model  # the causes' own, discrepancies whitened
+    shared: tuple[str, ...]  # effects that the shares are of, in their order
+    model: Model  # of all that was borne out, too small to be told or not, discrepancies whitened
     chance: dict[str, float]  # of each candidate to act
 
 
@@ -75,12 +76,13 @@ def judge(
     none = float(expit((np.log(max(p, 1e-300)) - np.log(ALARM)) / 0.5))
     known = float(expit(np.log(MOST / max(left, 1e-6)) / WIDTH)) if kept else 0.0
     name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
+    small = set(causes) - set(kept)
     likely: dict[str, float] = {}
     for m, w in zip(models, weight, strict=True):
-        if m.effects:
-            key = "+".join(name(m.effects))
+        if set(m.effects) - small:
+            key = "+".join(name(set(m.effects) - small))
             likely[key] = likely.get(key, 0.0) + float(w)
-    nothing = float(sum(w for m, w in zip(models, weight, strict=True) if not m.effects))
+    nothing = float(sum(w for m, w in zip(models, weight, strict=True) if not set(m.effects) - small))
     probabilities = {"none": none, "unknown": (1 - none) * (nothing + (1 - nothing) * (1 - known))}
     probabilities |= {k: (1 - none) * known * v for k, v in likely.items() if (1 - none) * known * v > 1e-4}
     probabilities["other"] = max(0.0, 1.0 - sum(probabilities.values()))
@@ -90,7 +92,7 @@ def judge(
     elif p < ALARM:
         verdict = "unknown"
         if kept and left <= MOST:
-            partners = _partners(models, kept)
+            partners = _partners(models, causes, kept)
             verdict = "set" if partners else "named"
     told = kept if verdict in ("named", "set") else ()
     noise = np.ones(len(gap.rows.channels))
@@ -110,21 +112,19 @@ def judge(
         significant(rows, band, before, noise[rows.channel]) if verdict != "none" else (),
         significant(rows, band, after, noise[rows.channel]) if verdict != "none" else (),
         explained,
-        fitted(f, kept),
+        tuple(gap.candidates[j].name for j in kept),
+        fitted(f, causes),
         chance,
     )
 
 
-def _partners(models: Sequence[Model], causes: tuple[int, ...]) -> tuple[int, ...]:
-    """Effects that take a cause's place in sets one in twenty as likely or more."""
-    best = (
-        next(m.score for m in models if m.effects == causes)
-        if any(m.effects == causes for m in models)
-        else models[0].score
-    )
+def _partners(models: Sequence[Model], causes: tuple[int, ...], told: tuple[int, ...]) -> tuple[int, ...]:
+    """Effects that take the place of a cause that is told in sets one in twenty as likely or more."""
+    best = next(m.score for m in models if m.effects == causes)
     found: set[int] = set()
     for m in models:
-        if m.score > best - np.log(TWENTY) and len(m.effects) <= len(causes):
+        gone = set(causes) - set(m.effects)
+        if gone and gone <= set(told) and m.score > best - np.log(TWENTY):
             found |= set(m.effects) - set(causes)
     return tuple(sorted(found))
 
