@@ -12,7 +12,7 @@ FIGURES = ROOT / "docs" / "figures"
 
 
 def load(name: str) -> dict[str, Any]:
-    """The results that `python -m experiments.paper` saved under this name, without the commit of its code."""
+    """The results that `python -m experiments.paper` saved under this name, less its commit."""
     found = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     return {key: value for key, value in found.items() if key != "made_by"}
 

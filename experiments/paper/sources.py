@@ -66,7 +66,7 @@ def qualitative(case: Case) -> list[Segmentation]:
 
 
 def save(name: str, document: dict[str, Any]) -> None:
-    """Write a result with this code's commit: floats of six significant digits, lists of numbers on a line."""
+    """Write a result with this code's commit; floats to six digits, lists of numbers on one line."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     text = _text({**document, "made_by": commit_of()})
     (RESULTS / f"{name}.json").write_text(text + "\n", encoding="utf-8")
