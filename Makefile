@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap
+.PHONY: before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -42,6 +42,13 @@ docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are error
 
 constants: $(INSTALLED)  ## docs/constants.md: every numeric constant with its kind and reason
 	$(BIN)/python -m experiments.constants
+
+BEFORE := build/before
+before-after: $(INSTALLED)  ## published numbers of release 0.1.0's code and of this code, on RECORDINGS (default recordings)
+	test -d $(BEFORE) || git worktree add $(BEFORE) c02f51d
+	$(BIN)/python -m experiments.before_after measure before --root $(BEFORE) --package commands $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.before_after measure after $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.write_tables
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
