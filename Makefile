@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap
+.PHONY: before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -57,6 +57,12 @@ results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills th
 	$(BIN)/python -m experiments.misfits recordings
 	$(BIN)/python -m experiments.benchmarks.moves
 	$(BIN)/python -m experiments.benchmarks.identify
+	$(BIN)/python -m experiments.write_tables
+
+calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds that differ, NUTS beside the sampler; resumable
+	$(BIN)/python -m experiments.sbc
+	$(BIN)/python -m experiments.calibration_worlds
+	$(BIN)/python -m experiments.reference_posteriors
 	$(BIN)/python -m experiments.write_tables
 
 paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills docs/reproduction.md

@@ -31,6 +31,7 @@ from estimation.observations import CHANNELS
 
 NUM_CHANNELS = len(CHANNELS)
 STEP = 0.25  # of the table, in log r: cubic interpolation is then exact to some 1e-5
+FARTHEST = 9.0  # of any scale from its prior median, all logarithms
 REACH = (-18.0, 26.0)  # of the table about the prior median of log r; priors leave nothing beyond
 
 
@@ -90,11 +91,15 @@ class Posterior:
     def log_prior(self, theta: np.ndarray) -> np.ndarray:
         """Log prior (W,) of scales (W, 6), up to a constant."""
         out = -0.5 * ((theta[:, :NUM_CHANNELS] / self.scale_sd) ** 2).sum(axis=1)
-        z2, tail = (theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD) ** 2, priors.SCATTER_TAIL
-        return out - (tail + 1) / 2 * np.log1p(z2 / tail).sum(axis=1)
+        return out - 0.5 * ((theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD) ** 2).sum(axis=1)
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
-        """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant."""
+        """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant.
+
+        -inf beyond FARTHEST, where priors leave nothing and digits would run out.
+        """
+        near = (np.abs(theta) <= FARTHEST).all(axis=1)
+        theta = np.clip(theta, -FARTHEST, FARTHEST)
         num = len(self.design.nuisances)
         size, log_s = num + 2 * NUM_CHANNELS, theta[:, :NUM_CHANNELS]
         common = self.common(theta)
@@ -115,7 +120,8 @@ class Posterior:
             out -= 0.5 * (2 * table.count * log_s[:, c] + log_det + weight * squares)
         chol = np.linalg.cholesky(precision)
         white = np.linalg.solve(chol, gradient[..., None])[..., 0]
-        return out + 0.5 * (white**2).sum(axis=1) - np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
+        out += 0.5 * (white**2).sum(axis=1) - np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
+        return np.where(near, out, -np.inf)
 
     def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (W, Q + N + 6) and Cholesky factor of the precision of (q, z, e, f) given scales (W, 6).

@@ -18,8 +18,7 @@ PROPERTY_LOG_SD = {"weight": 1.5, "width": 1.0, "height": 1.0}
 
 CHANNEL = {"weight": 0, "width": 1, "height": 2}  # by which each property is observed
 SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.04])  # share that differs from grip to grip
-SCATTER_LOG_SD = 1.0  # of log(share / its prior median), Student-t
-SCATTER_TAIL = 3.0  # degrees of freedom: pads stated wrong by a factor do occur, and are no wonder
+SCATTER_LOG_SD = 1.0  # normal prior of log(share / its prior median): of heavier tails no sd would be left
 COMMON = np.array([5e-4, 1e-3, 0.05])  # standard deviation of the share that all grips have alike
 
 

@@ -18,7 +18,9 @@ from estimation.posterior import NUM_CHANNELS, Posterior
 
 TAIL = 5.0  # degrees of freedom for the noise: proposals need heavier tails than the posterior
 WIDEN = 1.1  # of the Laplace covariance, likewise
-FROM_PRIOR = 0.1  # share of proposals whose scatter comes from its prior, whose tails are the heaviest
+FROM_PRIOR = (
+    0.1  # share of proposals whose scatter is a t about its prior's median, heavier than any posterior
+)
 STEP, REACH = 0.25, (-10.0, 10.0)  # of the grid, in log(share / its prior median)
 
 
@@ -40,7 +42,7 @@ class Proposal:
         cumulative = np.cumsum(self.cells, axis=1)
         chosen = [np.searchsorted(row / row[-1], random.uniform(size=num)) for row in cumulative]
         scatter = REACH[0] + STEP * (np.stack(chosen, axis=1) + random.uniform(size=(num, NUM_CHANNELS)))
-        prior = priors.SCATTER_LOG_SD * random.standard_t(priors.SCATTER_TAIL, size=scatter.shape)
+        prior = priors.SCATTER_LOG_SD * random.standard_t(TAIL, size=scatter.shape)
         from_prior = random.uniform(size=scatter.shape) < FROM_PRIOR
         return np.concatenate([noise, np.where(from_prior, prior, scatter)], axis=1)
 
@@ -53,7 +55,7 @@ class Proposal:
         inside = (cell >= 0) & (cell < self.cells.shape[1])
         drawn = self.cells[np.arange(NUM_CHANNELS), np.where(inside, cell, 0)] / STEP
         z2 = (scatter / priors.SCATTER_LOG_SD) ** 2
-        prior = np.exp(_log_student(z2, priors.SCATTER_TAIL, 1)) / priors.SCATTER_LOG_SD
+        prior = np.exp(_log_student(z2, TAIL, 1)) / priors.SCATTER_LOG_SD
         return out + np.log((1 - FROM_PRIOR) * np.where(inside, drawn, 0.0) + FROM_PRIOR * prior).sum(axis=1)
 
 

@@ -59,7 +59,7 @@ def drawn(design, seed, properties=None, scales=None):
     rng = np.random.default_rng([seed, 99])
     d, sd = design, 1 / np.sqrt(2 * design.scale_count)
     if scales is None:
-        scatter = priors.SCATTER_LOG_SD * rng.standard_t(priors.SCATTER_TAIL, size=3)
+        scatter = priors.SCATTER_LOG_SD * rng.normal(size=3)
         scales = np.concatenate([sd * rng.normal(size=3), scatter])
     properties = TRUE[: len(d.unknowns)] if properties is None else properties
     share = priors.SCATTER_MEDIAN * np.exp(scales[3:])

@@ -1,0 +1,159 @@
+"""Simulation-based calibration of the posterior: where true values rank among the draws.
+
+    python -m experiments.sbc [--sets 1000]
+
+The cheap configuration: designs of one to six blocks and one to twenty trials, without a simulator in
+between. Each data set is drawn from the model that the posterior stands for, properties from their own
+priors, scales from theirs; the ranks of the true properties among the posterior's draws are then uniform
+(Talts et al. 2018). Writes experiments/results/sbc.json and docs/figures/sbc.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from estimation import priors
+from estimation.compliance import SLOPE_SD
+from estimation.design import PROPERTIES, Design, Unknown
+from estimation.nuisance import Nuisance
+from estimation.posterior import posterior
+from estimation.sampler import sample
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "results" / "sbc.json"
+SETS, DRAWS, BINS, SEED = 1000, 99, 20, 7
+MEAN_SD = np.array([4e-3, 5e-6, 1e-5])  # of one mean, by channel [N, m, m]: as at 20 Hz
+UNIT = np.array([0.5, 1.4e-3, 2e-4])  # what shares of model error are taken of [N, m, m]
+BIAS, WIDER = 0.02, 3e-5  # of one sd of two deviations: a bias of force [N], a shift of width [m]
+
+
+def design_of(blocks: int, trials: int, rng: np.random.Generator) -> Design:
+    """One grip a block and trial, each with its means and slopes; the data are still to be drawn."""
+    unknowns = tuple(Unknown(prop, {f"b{k}": 1}) for k in range(blocks) for prop in PROPERTIES)
+    rows = [(t, m, c, s) for s in (0, 1) for t in range(trials) for m in range(blocks) for c in range(3)
+            if s == 0 or c > 0]  # fmt: skip
+    trial, move, channel, slope = np.array(rows).T
+    slope = slope.astype(bool)
+    coefficients = np.zeros((len(rows), len(unknowns)))
+    tilt = 1 + 0.02 * rng.normal(size=len(rows))
+    coefficients[np.arange(len(rows)), 3 * move + channel] = np.where(
+        slope, 0.0, np.where(channel, 1.0, tilt)
+    )
+    sd = np.where(slope, 0.15, MEAN_SD[channel] * np.sqrt(rng.uniform(0.5, 2.0, size=len(rows))))
+    shifts = np.stack([np.where((channel == 0), BIAS, 0.0), np.where((channel == 1) & ~slope, WIDER, 0.0)], 1)
+    free_shifts = np.zeros((trials, 4, 2))
+    free_shifts[:, 1, 0] = BIAS
+    unit = np.where(slope, 1.0, UNIT[channel] * (1 + 0.1 * rng.normal(size=len(rows))))
+    deviations = tuple(Nuisance(name, 1.0, 1.0, _unread) for name in ("bias", "wider"))
+    return Design(
+        unknowns=unknowns, nuisances=deviations, mean=np.zeros(len(rows)), variance=sd**2,
+        coefficients=coefficients, shifts=shifts, channel=channel, unit=unit, trial=trial, move=move,
+        slope=slope, free_mean=np.zeros((trials, 4)), free_variance=np.full((trials, 4), 2e-3**2),
+        free_shifts=free_shifts, scale_count=np.full(3, 60.0),
+    )  # fmt: skip
+
+
+def _unread(trial: Any, rig: Any, size: float) -> Any:
+    raise AssertionError("designs made here are complete")
+
+
+def drawn(design: Design, rng: np.random.Generator) -> tuple[Design, np.ndarray]:
+    """The design with data drawn from the model, and the properties (Q,) they were drawn of."""
+    d = design
+    mean, sd = priors.property_priors([(u.name[0], u.prop) for u in d.unknowns])
+    true = np.exp(mean + sd * rng.normal(size=mean.size))
+    log_s = rng.normal(size=3) / np.sqrt(2 * d.scale_count)
+    share = priors.SCATTER_MEDIAN * np.exp(priors.SCATTER_LOG_SD * rng.normal(size=3))
+    common = np.hypot(priors.COMMON, share) * rng.normal(size=3)
+    slopes = np.hypot(SLOPE_SD, share) * rng.normal(size=3)
+    z = rng.normal(size=len(d.nuisances))
+    grips, grip = np.unique(np.stack([d.trial, d.move, d.channel], 1), axis=0, return_inverse=True)
+    own = (share[grips[:, 2]] * rng.normal(size=len(grips)))[grip.ravel()]
+    other = np.where(d.slope, share[d.channel] * rng.normal(size=d.mean.size) + slopes[d.channel], 0.0)
+    noise = np.exp(log_s[d.channel]) * np.sqrt(d.variance) * rng.normal(size=d.mean.size)
+    data = d.coefficients @ true + d.shifts @ z + d.unit * (common[d.channel] + own) + other + noise
+    free = d.free_shifts @ z + np.sqrt(d.free_variance) * rng.normal(size=d.free_mean.shape)
+    return replace(d, mean=data, free_mean=free), true
+
+
+def ranks_of(number: int) -> tuple[np.ndarray, list[str], str]:
+    """Ranks (Q,) in 0 .. DRAWS of one data set's properties, their kinds, and how they were sampled."""
+    rng = np.random.default_rng([SEED, number])
+    blocks, trials = int(rng.integers(1, 7)), int(rng.choice([1, 2, 4, 20]))
+    design, true = drawn(design_of(blocks, trials, rng), rng)
+    found = sample(posterior(design), seed=number)
+    chosen = rng.permutation(len(found.flat))[:DRAWS]  # the chain's draws are nearly independent
+    ranks = (found.flat[chosen] < true).sum(axis=0)
+    return ranks, [u.prop for u in design.unknowns], found.method if found.converged else "not converged"
+
+
+def summary(ranks: np.ndarray) -> dict[str, Any]:
+    """Counts by bin, the chi-square p-value of uniformity, coverages of central intervals."""
+    counts, _ = np.histogram(ranks, bins=BINS, range=(-0.5, DRAWS + 0.5))
+    place = (ranks + 0.5) / (DRAWS + 1)
+    return {
+        "count": int(ranks.size), "bins": counts.tolist(), "p_value": float(stats.chisquare(counts).pvalue),
+        "coverage_68": float(np.mean(np.abs(place - 0.5) < 0.34)),
+        "coverage_95": float(np.mean(np.abs(place - 0.5) < 0.475)),
+    }  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line of this experiment."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sets", type=int, default=SETS)
+    options = parser.parse_args(arguments)
+    began, one = time.process_time(), {prop: [] for prop in PROPERTIES}
+    methods: dict[str, int] = {}
+    for number in range(options.sets):
+        ranks, props, method = ranks_of(number)
+        methods[method] = methods.get(method, 0) + 1
+        if method == "not converged":
+            continue
+        for prop in PROPERTIES:  # one a data set: blocks of one share their deviations
+            one[prop].append(int(ranks[props.index(prop)]))
+        if number % 100 == 99:
+            print(f"{number + 1} data sets, {time.process_time() - began:.0f} s", flush=True)
+    document = {
+        "sets": options.sets, "draws": DRAWS, "methods": methods, "seconds": time.process_time() - began,
+        "properties": {prop: summary(np.array(ranks)) for prop, ranks in one.items()},
+    }  # fmt: skip
+    for prop, s in document["properties"].items():
+        print(f"{prop:7} {s['count']} ranks, p {s['p_value']:.3f}, 68 %: {100 * s['coverage_68']:.1f}, "
+              f"95 %: {100 * s['coverage_95']:.1f}")  # fmt: skip
+    RESULTS.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    draw(document, HERE.parent / "docs" / "figures" / "sbc.png")
+
+
+def draw(document: dict[str, Any], path: Path) -> None:
+    """Rank histograms with the band that holds all bins of a uniform one in 99 % of figures."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(9, 2.4), sharey=True, layout="constrained")
+    for ax, (prop, s) in zip(axes, document["properties"].items(), strict=True):
+        level = 1 - 0.99 ** (1 / (3 * BINS))  # all bins of all panels together
+        low, high = stats.binom.ppf([level / 2, 1 - level / 2], s["count"], 1 / BINS)
+        ax.axhspan(low, high, color="0.88", lw=0)
+        ax.stairs(s["bins"], np.linspace(0, 1, BINS + 1), fill=True, alpha=0.7)
+        ax.set_title(f"{prop}, p {s['p_value']:.2f}", fontsize=9)
+        ax.set_xlabel("rank of the true value", fontsize=8)
+    axes[0].set_ylabel("data sets", fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
