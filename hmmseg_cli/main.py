@@ -24,6 +24,7 @@ from hmmseg_cli import (
     identify,
     inspect,
     new,
+    play,
     segment,
     simulate,
     watch,
@@ -47,6 +48,7 @@ for _command in (
     diagnose.diagnose,
     inspect.inspect,
     new.new,
+    play.play,
     effects.effects,
     demo.demo,
 ):

@@ -144,11 +144,10 @@ class VirtualModel:
         """Blocks and contacts now."""
         return self._unravel(self._state)
 
-    @double_precision
     def block_positions(self) -> np.ndarray:
         """Centres of the blocks (num_blocks, 2) [m] now."""
-        state = self.state
-        return np.stack([np.asarray(state.x), np.asarray(state.y)], axis=1)
+        n = len(self.objects)
+        return np.asarray(self._state)[: 2 * n].reshape(2, n).T  # a State begins with x and y
 
     def _advance(self, before: np.ndarray, after: np.ndarray, dt: float) -> tuple[Array, Array]:
         if dt not in self._substeps:

@@ -1,0 +1,150 @@
+"""The session served to one browser on this machine: a page, and a socket for the hand and the blocks.
+
+Sixty times a second the physics is advanced by the milliseconds that have passed and what the page draws is
+sent. Only loopback is listened to, only the page's own origin may open the socket, and only one does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from http import HTTPStatus
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from hmmseg.errors import InputError
+from simgap.play.felt import effect_values, felt_effects
+from simgap.play.session import Session
+
+HOST = "127.0.0.1"
+FRAME = 1 / 60  # s
+BEHIND = 50  # ms; a machine that cannot keep up lets the played time run slower
+LONGEST_MESSAGE = 4096  # bytes
+
+
+class PlayServer:
+    """Serves a session; `output` is the folder that the page's button saves into."""
+
+    def __init__(self, session: Session, output: Path) -> None:
+        self.session, self.output = session, output
+        self.busy = False
+        self.saved: list[Path] = []
+        self._server: Server | None = None
+
+    async def start(self, port: int = 0) -> str:
+        """Listen on a port of this machine (0: any that is free); the page's address."""
+        page = files("simgap.play").joinpath("page.html").read_bytes()
+
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
+            host = request.headers.get("Host", "").rpartition(":")[0]
+            if host not in (HOST, "localhost"):
+                return connection.respond(HTTPStatus.FORBIDDEN, "only this machine\n")
+            if request.path == "/socket":
+                return None
+            if request.path != "/":
+                return connection.respond(HTTPStatus.NOT_FOUND, "the page is at /\n")
+            headers = Headers({"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page)),
+                               "Connection": "close", "X-Content-Type-Options": "nosniff"})  # fmt: skip
+            return Response(200, "OK", headers, page)
+
+        self._server = await serve(self._play, HOST, port, process_request=answer, max_size=LONGEST_MESSAGE,
+                                   compression=None)  # fmt: skip
+        port = next(iter(self._server.sockets)).getsockname()[1]
+        self.origins = (f"http://{HOST}:{port}", f"http://localhost:{port}")
+        return f"http://{HOST}:{port}/"
+
+    async def stop(self) -> None:
+        """Close the socket and stop listening."""
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    async def _play(self, connection: ServerConnection) -> None:
+        origin = connection.request.headers.get("Origin") if connection.request is not None else None
+        if origin not in self.origins:
+            await connection.close(4003, "another page")
+            return
+        if self.busy:
+            await connection.close(4001, "somebody plays already")
+            return
+        self.busy = True
+        try:
+            await connection.send(json.dumps(self._scene()))
+            drawing = asyncio.create_task(self._draw(connection))
+            try:
+                async for message in connection:
+                    answer = await self._told(message)
+                    if answer is not None:
+                        await connection.send(json.dumps(answer))
+            finally:
+                drawing.cancel()
+                with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                    await drawing
+        except ConnectionClosed:
+            pass
+        finally:
+            self.busy = False
+
+    def _scene(self) -> dict[str, Any]:
+        return self.session.scene() | {"offered": sorted(felt_effects())}
+
+    async def _draw(self, connection: ServerConnection) -> None:
+        last, due = time.monotonic(), 0.0
+        while True:
+            now = time.monotonic()
+            due = min(due + 1e3 * (now - last), BEHIND)
+            last = now
+            steps = int(due)
+            due -= steps
+            self.session.advance(steps)
+            await connection.send(json.dumps(self.session.frame()))
+            await asyncio.sleep(max(FRAME - (time.monotonic() - now), 0.001))
+
+    async def _told(self, message: str | bytes) -> dict[str, Any] | None:
+        """What a message of the page does; what cannot be read is told and changes nothing."""
+        try:
+            told = json.loads(message)
+            kind = told["kind"]
+            if kind == "aim":
+                grip = float(told.get("grip", 3.0))
+                self.session.aim(float(told["x"]), float(told["y"]), told["closed"] is True, grip)
+            elif kind == "touch":
+                self.session.touch(np.array(told["tips"], float))
+            elif kind == "reset":
+                self.session.reset()
+            elif kind == "effect":
+                return await self._change(told["name"])
+            elif kind == "save":
+                return self._save()
+            else:
+                raise ValueError(kind)
+        except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
+            return {"kind": "said", "text": "a message that says nothing"}
+        return None
+
+    async def _change(self, name: str | None) -> dict[str, Any]:
+        """Switch an effect on beside the nominal world, or off."""
+        if name is not None and (not isinstance(name, str) or name not in felt_effects()):
+            return {"kind": "said", "text": "no such effect"}
+        world = None
+        if name is not None:  # compiled beside the page's frames
+            world = await asyncio.to_thread(self.session.world_with, {name: effect_values(name)})
+        self.session.beside(world)
+        return self._scene()
+
+    def _save(self) -> dict[str, Any]:
+        try:
+            written = self.session.save(self.output)
+        except (OSError, ValueError, InputError) as error:
+            return {"kind": "said", "text": str(error)}
+        self.saved.append(written[-1])
+        return {"kind": "saved", "file": str(written[-1])}

@@ -1,0 +1,175 @@
+"""A session: one hand's commands in one or two worlds side by side, and what it records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask, parse_task
+from simgap.play.world import STIFFNESS, PlayedWorld
+from simgap.world.layout import lay_out
+from simgap.world.performance import CONTROL_PERIOD
+from simgap.world.properties import Blocks
+from simgap.world.sensors import record
+from simgap.world.writing import scene_files, trial_csv
+
+RATE = 100.0  # Hz of the recording where the rig says none
+CLEARANCE = 0.012  # m that the open hand is wider than the widest block
+CLOSING = 0.1  # m/s at which the hand closes and opens
+FOLLOWING = 14.0  # 1/s: how quickly the command follows the mouse (critically damped)
+FASTEST = 0.4  # m/s
+LOWEST = 0.004  # m above the ground for the commanded fingertips
+GRIP = 3.0  # N
+LONGEST = 600.0  # s of a recording
+
+
+def default_rig() -> Rig:
+    """Fingertips on foam pads as the project's recordings have them, recorded without joints."""
+    pads = {"normal_stiffness": 4000.0, "shear_stiffness": 2500.0}
+    return Rig.read(
+        {"rate": RATE, "fingertip": pads, "noise": {"position": 2e-5, "velocity": 3e-3, "force": 0.01}}
+    )
+
+
+def default_task(objects: list[str]) -> BlockTask:
+    """All on the ground; the first goes onto the second, or down again where there is none."""
+    to = objects[1] if len(objects) > 1 else "ground"
+    task = parse_task(
+        {"objects": {name: {"on": "ground"} for name in objects}, "moves": [{"object": objects[0], "to": to}]}
+    )
+    assert isinstance(task, BlockTask)
+    return task
+
+
+class Session:
+    """The nominal world, another beside it if wanted, and the hand that both follow.
+
+    Aim with `aim` (the hand's middle, closed or open) or `touch` (each finger by itself), let time pass
+    with `advance`, read `frame`, `save` what was recorded since `reset`.
+    """
+
+    def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, seed: int = 0) -> None:
+        self.task, self.rig, self.blocks, self.seed = task, rig, blocks, seed
+        table = lay_out(task, blocks, 0.03, (0.0, 0.0), np.random.default_rng(seed))
+        self.x = dict(table.x)
+        self.open = max(block.width for block in blocks.values()) + CLEARANCE
+        self.top = sum(block.height for block in blocks.values()) + 0.03
+        middle = float(np.mean(list(self.x.values())))
+        self.home = np.array([middle, self.top])
+        start = np.array([[middle - self.open / 2, self.top], [middle + self.open / 2, self.top]])
+        self.nominal = PlayedWorld(task, rig, blocks, self.x, start)
+        self.other: PlayedWorld | None = None
+        self.reset()
+
+    def world_with(self, effects: Mapping[str, Mapping[str, float]]) -> PlayedWorld:
+        """Another world with these effects, ready to stand beside the nominal one."""
+        return PlayedWorld(self.task, self.rig, self.blocks, self.x, self.nominal.start, effects)
+
+    def beside(self, world: PlayedWorld | None) -> None:
+        """Put another world beside the nominal one, or none; both begin anew."""
+        self.other = world
+        self.reset()
+
+    @property
+    def worlds(self) -> list[PlayedWorld]:
+        """The nominal world, then the other where there is one."""
+        return [self.nominal] if self.other is None else [self.nominal, self.other]
+
+    def reset(self) -> None:
+        """Everything back to the start; the recording begins anew."""
+        for world in self.worlds:
+            world.reset()
+        self.command, self.rate = self.nominal.start.copy(), np.zeros((2, 2))
+        self.gap, self.grip, self.closed, self.speed = self.open, GRIP, False, np.zeros(2)
+        self.target, self.fingers = self.home.copy(), None
+        self._rows: list[np.ndarray] = []
+
+    def aim(self, x: float, y: float, closed: bool, grip: float = GRIP) -> None:
+        """The hand's middle [m] and whether it closes, with so much force [N]; other numbers are ignored."""
+        if np.isfinite([x, y, grip]).all():
+            self.target = np.clip([x, y], [-0.2, LOWEST], [0.5, 0.4])
+            self.closed, self.grip, self.fingers = bool(closed), float(np.clip(grip, 0.5, 8.0)), None
+
+    def touch(self, places: np.ndarray) -> None:
+        """Both fingers by themselves, (2, 2) [m]: two touches."""
+        if places.shape == (2, 2) and np.isfinite(places).all():
+            ordered = places[np.argsort(places[:, 0])]
+            self.fingers = np.clip(ordered, [-0.2, LOWEST], [0.5, 0.4])
+
+    def advance(self, steps: int) -> None:
+        """So many milliseconds."""
+        for _ in range(steps):
+            self._follow()
+            for world in self.worlds:
+                world.advance(self.command, self.rate)
+            if self.nominal.t < LONGEST:
+                tips = self.nominal
+                self._rows.append(
+                    np.concatenate([tips.position.ravel(), tips.velocity.ravel(), tips.force.ravel()])
+                )
+
+    def _follow(self) -> None:
+        """The command goes after the mouse as a hand does: smoothly, no faster than it can."""
+        if self.fingers is not None:
+            self.rate = self._drawn(self.fingers - self.command, self.rate)
+            self.command = self.command + CONTROL_PERIOD * self.rate
+            return
+        tips, before = self.nominal.position, self.command
+        between = float(tips[1, 0] - tips[0, 0])
+        least = max(between - 2 * self.grip / STIFFNESS, 0.0) if self.closed else self.open
+        step = CLOSING * CONTROL_PERIOD
+        self.gap = float(np.clip(least, self.gap - step, self.gap + step))
+        self.speed = self._drawn((self.target - before.mean(axis=0))[None], self.speed[None])[0]
+        middle = before.mean(axis=0) + CONTROL_PERIOD * self.speed
+        self.command = middle + np.array([[-self.gap / 2, 0.0], [self.gap / 2, 0.0]])
+        self.rate = (self.command - before) / CONTROL_PERIOD
+
+    @staticmethod
+    def _drawn(way: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """Rates (n, 2) [m/s] a millisecond on, drawn along ways (n, 2) [m] that are left."""
+        rate = rate + CONTROL_PERIOD * (FOLLOWING**2 * way - 2 * FOLLOWING * rate)
+        speed = np.linalg.norm(rate, axis=1, keepdims=True)
+        return rate * np.minimum(1.0, FASTEST / np.maximum(speed, 1e-9))
+
+    def scene(self) -> dict[str, Any]:
+        """What does not change: the blocks' sizes and the effect beside."""
+        sizes = {name: [block.width, block.height, block.weight] for name, block in self.blocks.items()}
+        effects = {} if self.other is None else self.other.effects
+        return {"kind": "scene", "blocks": sizes, "effects": effects, "home": self.home.tolist(),
+                "open": self.open, "stiffness": STIFFNESS}  # fmt: skip
+
+    def frame(self) -> dict[str, Any]:
+        """What the page draws now."""
+        worlds = [
+            {"tips": world.position.tolist(), "force": world.felt.tolist(),
+             "blocks": world.model.block_positions().tolist()}
+            for world in self.worlds
+        ]  # fmt: skip
+        return {"kind": "frame", "t": self.nominal.t, "command": self.command.tolist(), "worlds": worlds}
+
+    def save(self, folder: Path) -> list[Path]:
+        """The nominal world's recording as the next trial_NN.csv beside rig, task and true properties.
+
+        ValueError where there is less than a second of it.
+        """
+        rows = np.array(self._rows)
+        if len(rows) < 1000:
+            raise ValueError("less than a second has been recorded")
+        rate = self.rig.rate or RATE
+        t = np.arange(int(len(rows) * CONTROL_PERIOD * rate)) / rate
+        fine = np.arange(1, len(rows) + 1) * CONTROL_PERIOD
+        at = np.stack([np.interp(t, fine, column) for column in rows.T], axis=1).reshape(t.size, 3, 2, 2)
+        number = 1 + len(list(folder.glob("trial_*.csv")))
+        rng = np.random.default_rng([self.seed, number])
+        trial = record(t, at[:, 0], at[:, 1], at[:, 2], self.rig, rng, f"played {number}")
+        texts = scene_files(self.task, self.rig, self.blocks) | {f"trial_{number:02d}.csv": trial_csv(trial)}
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            written = folder / f".{name}.part"
+            written.write_text(text, encoding="utf-8")
+            written.replace(folder / name)
+        return [folder / name for name in texts]

@@ -1,0 +1,248 @@
+"""A played session: the hand on springs, worlds side by side, the server, and a browser that stacks."""
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from estimation.identification import identify_aligned
+from experiments.play_session import browser, find_browser, save, served, stack
+from hmmseg.errors import InputError
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segmentation.align import align
+from hmmseg_cli.main import main
+from hmmseg_cli.play import diagnosed
+from simgap.play.felt import effect_values, felt_effects, scene_with, sensed
+from simgap.play.server import PlayServer
+from simgap.play.session import Session, default_rig, default_task
+from simgap.world.properties import PAPER_BLOCKS
+
+
+@pytest.fixture(scope="module")
+def made() -> Session:
+    return Session(default_task(list(PAPER_BLOCKS)), default_rig(), dict(PAPER_BLOCKS))
+
+
+@pytest.fixture
+def session(made):
+    made.beside(None)
+    return made
+
+
+def perform(session):
+    """Pick block1 up and set it onto block2, as a mouse would."""
+    (x1, x2), top = (session.x[name] for name in ("block1", "block2")), session.top
+    half, rest = PAPER_BLOCKS["block1"].height / 2, PAPER_BLOCKS["block2"].height
+    for x, y, closed, ms in (
+        (x1, top, False, 900), (x1, half, False, 900), (x1, half, True, 1000), (x1, top, True, 900),
+        (x2, top, True, 900), (x2, rest + half + 0.004, True, 800), (x2, rest + half - 0.003, True, 800),
+        (x2, rest + half - 0.003, False, 700), (x2, top, False, 900),
+    ):  # fmt: skip
+        session.aim(x, y, closed)
+        session.advance(ms)
+
+
+def check_identified(folder):
+    """The saved trial identifies to the blocks' own properties within its intervals."""
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    aligned = align([read_trial(folder / "trial_01.csv", rig)], task, rig)
+    assert aligned.segmentations[0].failed is None
+    found = identify_aligned(aligned)
+    for obj, prop in (("block1", "weight"), ("block1", "width"), ("block2", "height")):
+        low, high = np.percentile(found.of(obj, prop), [2.5, 97.5])
+        assert low < getattr(PAPER_BLOCKS[obj], prop) < high
+
+
+@pytest.mark.slow
+def test_a_session_stacks_and_its_trial_identifies_the_blocks(session, tmp_path):
+    perform(session)
+    (x1, y1), (x2, _) = session.nominal.model.block_positions()
+    assert y1 == pytest.approx(PAPER_BLOCKS["block2"].height + PAPER_BLOCKS["block1"].height / 2, abs=2e-4)
+    assert abs(x1 - x2) < 2e-3
+    session.save(tmp_path)
+    check_identified(tmp_path)
+    assert [path.name for path in session.save(tmp_path)][-1] == "trial_02.csv"
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_spring_shows_the_force(session):
+    session.aim(session.x["block1"], 0.008, False)
+    session.advance(1500)
+    session.aim(session.x["block1"], 0.008, True, grip=2.0)
+    session.advance(1200)
+    assert session.nominal.force[0, 0] == pytest.approx(2.0, rel=0.05)
+    stretch = session.command[0, 0] - session.nominal.position[0, 0]
+    assert 450.0 * stretch == pytest.approx(2.0, rel=0.05)
+
+
+def test_two_touches_move_each_finger(session):
+    session.touch(np.array([[0.17, 0.04], [0.12, 0.05]]))
+    session.advance(2000)
+    np.testing.assert_allclose(session.nominal.position, [[0.12, 0.05], [0.17, 0.04]], atol=1e-3)
+
+
+def test_numbers_that_are_none_change_nothing(session, tmp_path):
+    before = session.target.copy()
+    session.aim(float("nan"), 0.1, True)
+    session.touch(np.array([[np.inf, 0.0], [0.0, 0.0]]))
+    np.testing.assert_array_equal(session.target, before)
+    assert session.fingers is None
+    with pytest.raises(ValueError, match="less than a second"):
+        session.save(tmp_path)
+
+
+def test_an_effect_beside_is_felt(session):
+    session.beside(session.world_with({"force_gain": {"gain": 0.5}}))
+    session.aim(session.x["block1"], 0.008, False)
+    session.advance(1500)
+    session.aim(session.x["block1"], 0.008, True)
+    session.advance(1000)
+    nominal, other = session.frame()["worlds"]
+    assert other["force"][0][0] == pytest.approx(1.5 * nominal["force"][0][0], rel=1e-6)
+    np.testing.assert_allclose(other["blocks"], nominal["blocks"], atol=1e-9)
+    assert session.scene()["effects"] == {"force_gain": {"gain": 0.5}}
+
+
+def test_scene_effects_change_the_scene():
+    effects = {"grip_slip": {"mu": 0.1}, "table_compliance": {"stiffness": 900.0},
+               "fingertip_compliance": effect_values("fingertip_compliance")}  # fmt: skip
+    rig, blocks, around = scene_with(effects, default_rig(), PAPER_BLOCKS)
+    assert {block.friction for block in blocks.values()} == {0.1}
+    assert around.support_stiffness == 900.0
+    assert rig.fingertip.normal_stiffness == 800.0
+
+
+@pytest.mark.parametrize("name", sorted(felt_effects()))
+def test_every_offered_effect_can_be_felt(name):
+    t = np.arange(400) * 1e-3
+    force = np.ones((400, 2, 2)) * np.linspace(0, 2, 400)[:, None, None]
+    place = np.zeros((400, 2, 2))
+    out = sensed({name: effect_values(name)}, t, place, place, force, default_rig())
+    assert out.shape == force.shape
+    assert np.isfinite(out).all()
+
+
+def test_a_diagnosis_names_what_stands_beside(tmp_path):
+    path = tmp_path / "d.json"
+    document = {"format": "hmmseg.diagnose/1", "verdict": "named", "causes": ["force_lowpass"],
+                "effects": {"force_lowpass": {"parameters": {"time_constant": {"mean": 0.04}}}}}  # fmt: skip
+    path.write_text(json.dumps(document))
+    assert diagnosed(path) == {"force_lowpass": {"time_constant": 0.04}}
+    path.write_text(json.dumps(document | {"causes": [], "verdict": "none"}))
+    with pytest.raises(InputError, match="a diagnosis that names a cause"):
+        diagnosed(path)
+    path.write_text(json.dumps(document | {"causes": ["backlash"]}))
+    with pytest.raises(InputError, match="backlash cannot be felt"):
+        diagnosed(path)
+    path.write_text(json.dumps({"format": "hmmseg.identify/1"}))
+    assert diagnosed(path) == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["nowhere.json"], "nowhere.json: no such file"),
+        (["--effect", "gravity"], "effect gravity: cannot be felt in a played world"),
+        (["--rig", "nowhere.toml"], "nowhere.toml: no such file"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(arguments, line, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["play", *arguments, "--no-open"]) == 2
+    assert line in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+NONSENSE = (
+    "", "[]", "null", '{"kind": "aim"}', '{"kind": "aim", "x": "a", "y": 0, "closed": 1}', "[" * 3000,
+    '{"kind": "effect", "name": ["x"]}', '{"kind": "touch", "tips": [[1]]}', b"\xff",
+)  # fmt: skip
+
+
+@pytest.fixture
+def server(session, tmp_path):
+    """A running server, its address without the scheme, and its output folder."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    served_session = PlayServer(session, tmp_path / "out")
+    address = asyncio.run_coroutine_threadsafe(served_session.start(), loop).result(30)
+    yield address.removeprefix("http://"), tmp_path / "out"
+    asyncio.run_coroutine_threadsafe(served_session.stop(), loop).result(30)
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join(30)
+    loop.close()
+
+
+def answers(socket, kind):
+    """The next message of a kind."""
+    while (told := json.loads(socket.recv(timeout=30)))["kind"] != kind:
+        pass
+    return told
+
+
+def test_the_socket_plays_and_shrugs_at_nonsense(server):
+    where, folder = server
+    with connect(f"ws://{where}socket", origin=f"http://{where.rstrip('/')}") as socket:
+        scene = answers(socket, "scene")
+        assert set(scene["blocks"]) == set(PAPER_BLOCKS)
+        for nonsense in NONSENSE:
+            socket.send(nonsense)
+            if "touch" not in str(nonsense):
+                assert answers(socket, "said")["text"]
+        socket.send(json.dumps({"kind": "aim", "x": 0.1, "y": 0.05, "closed": False}))
+        start = answers(socket, "frame")["t"]
+        while answers(socket, "frame")["t"] < start + 1.2:
+            pass
+        assert abs(np.mean(answers(socket, "frame")["worlds"][0]["tips"], axis=0)[0] - 0.1) < 0.01
+        with (
+            pytest.raises(ConnectionClosed, match="somebody plays already"),
+            connect(f"ws://{where}socket", origin=f"http://{where.rstrip('/')}") as second,
+        ):
+            second.recv(timeout=30)
+        socket.send(json.dumps({"kind": "save"}))
+        assert answers(socket, "saved")["file"] == str(folder / "trial_01.csv")
+
+
+def test_another_page_is_refused(server):
+    where, _ = server
+    with (
+        pytest.raises(ConnectionClosed, match="another page"),
+        connect(f"ws://{where}socket", origin="http://evil.example") as socket,
+    ):
+        socket.recv(timeout=30)
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://{where}socket", additional_headers={"Host": "evil.example"}).close()
+
+
+@pytest.mark.slow
+def test_a_mouse_in_a_real_browser_stacks_the_blocks(tmp_path):
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    with served(tmp_path) as address, browser(address) as page:
+        stack(page, "block1", "block2")
+        (x1, y1), (x2, _) = page.value("frame.worlds[0].blocks")
+        assert save(page).endswith("trial_01.csv")
+    assert y1 == pytest.approx(PAPER_BLOCKS["block2"].height + PAPER_BLOCKS["block1"].height / 2, abs=3e-4)
+    assert abs(x1 - x2) < 3e-3
+    check_identified(tmp_path)
+
+
+def test_the_command_ends_with_its_terminal(tmp_path):
+    command = [sys.executable, "-m", "hmmseg_cli.main", "play", "--no-open", "--output", str(tmp_path / "o")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        next(line for line in process.stdout if "http://127.0.0.1:" in line)
+        process.send_signal(2)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert err == ""
+    assert not (tmp_path / "o").exists()
