@@ -186,6 +186,10 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
     from hmmseg.io.trial import read_trial
 
     found = [read_trial(path, rig, task) for path in paths]
+    if rig is not None and rig.effects and out.command != "simulate":
+        out.warn(
+            f"rig.toml's [effects] ({', '.join(rig.effects)}) act in simulate alone; they are left out here"
+        )
     for trial in found:
         for warning in trial.warnings:
             out.warn(warning)

@@ -125,6 +125,8 @@ def diagnose(
         if task is None:
             raise InputError("--task", "missing", "the task's description, or --simulator or --mjcf")
         description = read_task(task)
+        if against and patch is not None:
+            raise InputError("--patch", "does not go with --against: no rig.toml is diagnosed")
         if against:
             if calibrate:
                 raise InputError("--calibrate", "does not go with --against: no virtual model is used")
@@ -142,7 +144,27 @@ def diagnose(
         if hand.gripper is not None:
             problem = "a wrist sensor does not feel each finger, which the effects act on"
             raise InputError(f"{rig}: [gripper]", problem, "a hand with forces at both fingertips")
-        out.finish(run(out, paths, description, hand, actual, effect or [], calibrate))
+        if patch is not None:
+            check_folder("--patch", patch)
+        body = run(out, paths, description, hand, actual, effect or [], calibrate)
+        if patch is not None:
+            _patch(out, body, rig, patch)
+        out.finish(body)
+
+
+def _patch(out: Output, body: dict[str, Any], rig: Path, folder: Path) -> None:
+    """Write the corrected model; a warning where there is no cause to correct."""
+    from simgap.patch import files
+
+    if (folder / "rig.toml").resolve() == rig.resolve():
+        raise InputError(f"--patch {folder}", f"would replace the input {rig}", "another folder")
+    written = files(rig.read_text(encoding="utf-8"), body)
+    if not written:
+        out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
+    for name, text in written.items():
+        out.stage(folder / name).write_text(text, encoding="utf-8")
+    if written:
+        out.print(f"the corrected model is in {folder}: {', '.join(written)}")
 
 
 def run(

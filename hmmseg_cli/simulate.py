@@ -61,6 +61,10 @@ def simulate(
         if animation:
             require_encoder(f".{animation_format.value}")
         description, hand = read_task(task), read_rig(rig)
+        if hand.effects:
+            from simgap.patch.write import checked
+
+            checked(hand.effects, str(rig))
         if not isinstance(description, BlockTask):
             raise InputError(str(task), "is a plain ordered task", "a task of blocks to simulate")
         if replay is not None and (trials != 1 or operator is not None):
@@ -104,7 +108,12 @@ def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, fi
 
     settings = OperatorSettings() if operator is None else read_operator(operator)
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
-    done = simulate_trials(task, rig, [blocks] * count, seeds, settings)
+    if rig.effects:
+        from simgap.patch import performed
+
+        done = performed(task, rig, [blocks] * count, seeds, settings)
+    else:
+        done = simulate_trials(task, rig, [blocks] * count, seeds, settings)
     files, rows = {}, []
     for k, simulated in enumerate(done, 1):
         files |= trial_files(k, simulated.trial, simulated.boundaries, simulated.seed)
@@ -144,7 +153,12 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     if segmentation.failed is not None:
         out.warn(f"{recording.file}: {segmentation.failed}")
     boundaries = np.array([span.start for span in segmentation.spans[1:]])
-    result = replay(recording, task, rig, blocks, boundaries=boundaries)
+    if rig.effects:
+        from simgap.patch import replayed
+
+        result = replayed(recording, task, rig, blocks, boundaries)
+    else:
+        result = replay(recording, task, rig, blocks, boundaries=boundaries)
     names = ("fx1", "fy1", "fx2", "fy2")
     force = dict(zip(names, result.force.reshape(-1, 4).T, strict=True))
     predicted = Trial("trial_01.csv", recording.t, recording.channels | force)

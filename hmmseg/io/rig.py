@@ -14,6 +14,7 @@ from hmmseg.io.schema import (
     Deviation,
     Finite,
     FinitePositive,
+    Name,
     Positive,
     StrictTable,
     read_toml,
@@ -117,6 +118,7 @@ class Rig(StrictTable):
     gripper: Gripper | None = None
     columns: Columns = Field(default={})
     topics: Columns = Field(default={})
+    effects: dict[Name, dict[Name, Finite]] = Field(default={})  # of the virtual model alone: simulate's
 
     @model_validator(mode="after")
     def _two_fingers(self) -> Rig:

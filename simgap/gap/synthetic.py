@@ -13,7 +13,7 @@ from hmmseg.io.trial import Trial
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.world.operator import OperatorSettings
-from simgap.world.properties import Block, Blocks
+from simgap.world.properties import Blocks
 from simgap.world.scene import Surroundings
 from simgap.world.sensors import record
 from simgap.world.simulate import SimulatedTrial, simulate_trials
@@ -30,6 +30,15 @@ def performed(
     operator: OperatorSettings | None = None,
 ) -> list[SimulatedTrial]:
     """Simulated trials in a scene changed by those effects that change scenes (one scene for all)."""
+    hand, around, _ = scene_of(rig, {}, effects)
+    blocks = [scene_of(rig, each, effects)[2] for each in blocks]
+    if "grip_slip" in effects:
+        operator = operator or OperatorSettings(grip=(1.2, 1.8))
+    return simulate_trials(task, hand, blocks, seeds, operator, around)
+
+
+def scene_of(rig: Rig, blocks: Blocks, effects: Values) -> tuple[Rig, Surroundings, Blocks]:
+    """Hand, surroundings and blocks as those effects make them that change scenes."""
     scene: dict[str, float] = {}
     for name, values in effects.items():
         change = effect_named(name).scene
@@ -38,9 +47,8 @@ def performed(
     hand = rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
     around = Surroundings(**{k: scene[k] for k in ("tilt", "support_stiffness") if k in scene})
     if "friction" in scene:
-        blocks = [{n: replace(b, friction=scene["friction"]) for n, b in each.items()} for each in blocks]
-        operator = operator or OperatorSettings(grip=(1.2, 1.8))
-    return simulate_trials(task, hand, blocks, seeds, operator, around)
+        blocks = {n: replace(b, friction=scene["friction"]) for n, b in blocks.items()}
+    return hand, around, blocks
 
 
 def recorded(
@@ -63,7 +71,7 @@ def recorded(
         motion.force,
         simulated.boundaries,
         rig,
-        *_carried(simulated, task),
+        *carried(simulated.t, simulated.boundaries, task, simulated.blocks),
     )
     chosen = [effect_named(n) for n in effects]
     for effect in sorted(chosen, key=lambda e: -e.stage):
@@ -86,14 +94,15 @@ def recorded(
     return trial
 
 
-def _carried(simulated: SimulatedTrial, task: BlockTask) -> tuple[np.ndarray, np.ndarray]:
-    """Weight [N] and width [m] of the block in the air (0 and 1 where there is none)."""
-    weight, width = np.zeros(simulated.t.size), np.ones(simulated.t.size)
+def carried(
+    t: np.ndarray, boundaries: Sequence[float] | np.ndarray, task: BlockTask, blocks: Blocks
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weight [N] and width [m] of the block in the air (0 and 1 where there is none) at times `t` [s]."""
+    weight, width = np.zeros(t.size), np.ones(t.size)
     for m, move in enumerate(task.performed):
-        leave, meet = simulated.boundaries[4 * m + 1 : 4 * m + 3]
-        inside = (simulated.t >= leave) & (simulated.t < meet)
-        block: Block = simulated.blocks[move.object]
-        weight[inside], width[inside] = block.weight, block.width
+        leave, meet = boundaries[4 * m + 1 : 4 * m + 3]
+        inside = (t >= leave) & (t < meet)
+        weight[inside], width[inside] = blocks[move.object].weight, blocks[move.object].width
     return weight, width
 
 
