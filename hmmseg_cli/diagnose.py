@@ -22,6 +22,7 @@ from hmmseg_cli.console import (
     ReportOption,
     SeedOption,
     TrialsArgument,
+    check_folder,
     distinct_trials,
     read_trials,
 )
@@ -34,6 +35,7 @@ from hmmseg_cli.diagnose_robot import (
     SimulatorOption,
     diagnose_robot,
 )
+from hmmseg_cli.finding import sentence
 
 EffectOption = Annotated[
     list[str] | None,
@@ -293,15 +295,6 @@ def _show(
     if out.report is not None:
         setting = Setting(files, names, pads or {}, measured, shows or {}, out.warnings)
         out.stage(out.report).write_text(page(body, setting, draw), encoding="utf-8")
-
-
-def sentence(body: dict[str, Any], pads: dict[str, float] | None = None) -> str:
-    """The verdict in words."""
-    from hmmseg_cli.finding import headline, remains, sentences
-
-    told = " ".join([*sentences(body, pads), *remains(body)])
-    causes = f" ({', '.join(body['causes'])})" if body["causes"] else ""
-    return f"{headline(body, pads)}{causes}. {told}"
 
 
 def cells_title(body: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg_cli.console import Output, check_folder
+from hmmseg_cli.finding import sentence
 
 if TYPE_CHECKING:
     from simgap.robots.diagnose import RobotDiagnosis
@@ -129,39 +130,14 @@ def diagnose_robot(
             warn=out.warn,
         )
     document = body(found)
-    told = sentence(document)
-    out.print(told, *tables(document, found))
+    out.print(sentence(document), *tables(document, found))
     if out.figures is not None or out.report is not None:
-        _draw(out, found, document, told)
+        _draw(out, found, document)
     if own.patch is not None:
         from simgap.robots.patch import write_patch
 
         write_patch(found, document, own.mjcf, lambda name: out.stage(own.patch / name))  # type: ignore[operator]
     out.finish(document)
-
-
-def sentence(document: Mapping[str, Any]) -> str:
-    """The verdict in a sentence or two."""
-    from hmmseg_cli.diagnose import p_text
-
-    p = p_text(document["detection"]["p_value"])
-    if document["verdict"] == "none":
-        return f"No gap beyond the sensors' noise was found ({p})."
-    if document["verdict"] == "unknown":
-        return f"There is a gap ({p}) the larger part of which none of the candidate effects explains."
-    shrinkage, far = document["shrinkage"], ""
-    if shrinkage is not None:
-        percent = f"{100 * shrinkage['fraction']:.0f} %"
-        far = f"; with it in the model the gap shrinks by {percent} on {shrinkage['evaluated_on']}"
-    causes = " and ".join(document["causes"])
-    left = document["remainder"]["share"]
-    rest = f" {100 * left:.0f} % of the gap remain unexplained." if left > 0.02 else ""
-    if document["verdict"] == "set":
-        others = ", ".join(document["indistinguishable"])
-        return (
-            f"The gap is caused by {causes}, or by what these logs cannot tell from it: {others}{far}.{rest}"
-        )
-    return f"The gap is caused by {causes}{far}.{rest}"
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
@@ -195,17 +171,21 @@ def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     return out
 
 
-def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any], told: str) -> None:
+def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any]) -> None:
     """Figures where asked for, and the page with the same figures inside."""
-    from hmmseg_cli.figures.gap_robot import Drawn, draw_all
+    from hmmseg_cli.figures.gap_robot import Drawn, draw_all, draw_page
 
     drawn = Drawn(found, document, found.warnings)
     if out.figures is not None:
         draw_all(drawn, out.figure)
     if out.report is not None:
-        from hmmseg_cli.gap_report import rendered
+        from hmmseg_cli.gap_report import Setting, page
 
-        says = {n: e.says for n, e in found.composed.effects.items()}
-        files = [r.name for r in found.composed.recordings]
-        page = rendered(drawn, told, "where the gap is largest", None, draw_all, files, says)
-        out.stage(out.report).write_text(page, encoding="utf-8")
+        setting = Setting(
+            files=[r.name for r in found.composed.recordings],
+            subtasks=sorted({cell["subtask"] for cell in document["where"]}),
+            shows={n: e.says for n, e in found.composed.effects.items()},
+            warnings=out.warnings,
+        )
+        text = page(document, setting, lambda path: draw_page(drawn, path))
+        out.stage(out.report).write_text(text, encoding="utf-8")

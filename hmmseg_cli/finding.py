@@ -93,6 +93,13 @@ def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
     return out
 
 
+def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
+    """The whole finding in a paragraph, for a terminal."""
+    told = " ".join([*sentences(body, rig), *remains(body)])
+    causes = f" ({', '.join(body['causes'])})" if body["causes"] else ""
+    return f"{headline(body, rig)}{causes}. {told}"
+
+
 def explained(body: Body) -> str:
     """Share of the gap that the causes explain, where the body tells it."""
     parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]

@@ -32,6 +32,12 @@ def draw_all(drawn: Drawn, path: Callable[[str], Path]) -> None:
     draw_before_after(drawn, path("gap_before_after.png"))
 
 
+def draw_page(drawn: Drawn, path: Callable[[str], Path]) -> None:
+    """Those that a page shows beside its own tables."""
+    draw_signal(drawn, path("gap_signal.png"))
+    draw_before_after(drawn, path("gap_before_after.png"))
+
+
 def draw_where(drawn: Drawn, path: Path) -> None:
     """Root mean square residual of every channel in every log, in noise's standard deviations."""
     found = drawn.found
