@@ -7,15 +7,15 @@ is read off the fitted means; the order of the subtasks plays no part until the 
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
 from hmmseg.hand.signals import Signals
-from hmmseg.hmm.dense import log_evidence, viterbi
-from hmmseg.hmm.padding import bucket
+from hmmseg.hmm.banded import log_sum_exp
+from hmmseg.hmm.dense import viterbi
 from hmmseg.segmentation.features import noise_sd, thin
 from hmmseg.segmentation.fit import otsu
 from hmmseg.segmentation.thresholds import NUMBERS, StateLabels
@@ -25,8 +25,23 @@ STATES = 3
 START = np.log(np.array([0.98, 0.01, 0.01]))  # a recording begins with the hand free
 STICKY = 20.0  # prior counts of staying, against 1 of each change
 
+MIN_LENGTH = 256  # samples; recordings are padded to powers of two, so that few programs are compiled
+
+
+def _log_evidence(ll, log_initial, log_transition, num_valid):
+    """hmmseg.hmm.dense.log_evidence in JAX, to be differentiated; rows from `num_valid` on are padding."""
+
+    def step(alpha, inputs):
+        ll, real = inputs
+        moved = log_sum_exp(alpha[:, None] + log_transition, 0) + ll
+        return jnp.where(real, moved, alpha), None
+
+    real = jnp.arange(1, ll.shape[0]) < num_valid
+    return log_sum_exp(lax.scan(step, log_initial + ll[0], (ll[1:], real))[0], 0)
+
+
 # Derivatives of the log evidence are the posterior state and transition counts of EM.
-_expectation = jax.jit(jax.value_and_grad(partial(log_evidence), argnums=(0, 2)))
+_expectation = jax.jit(jax.value_and_grad(_log_evidence, argnums=(0, 2)))
 
 
 def observations(signals: Signals) -> np.ndarray:
@@ -51,7 +66,7 @@ def label_freely(signals: Signals) -> tuple[Signals, StateLabels]:
             break
         before = evidence
     ll = _log_likelihoods(z, mean, sd)
-    path = np.asarray(viterbi(_padded(ll), START, np.log(transition), len(ll)).path)[: len(ll)]
+    path = viterbi(ll, START, np.log(transition)).path
     return thinned, StateLabels(_contact_states(mean)[path], np.zeros(len(path), dtype=bool))
 
 
@@ -83,7 +98,8 @@ def _posterior(z: np.ndarray, mean: np.ndarray, sd: np.ndarray, transition: np.n
 
 
 def _padded(ll: np.ndarray) -> np.ndarray:
-    return np.pad(ll, ((0, bucket(len(ll)) - len(ll)), (0, 0)))
+    length = max(MIN_LENGTH, 1 << (len(ll) - 1).bit_length())
+    return np.pad(ll, ((0, length - len(ll)), (0, 0)))
 
 
 def _contact_states(mean: np.ndarray) -> np.ndarray:

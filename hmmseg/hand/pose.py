@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
 from hmmseg.errors import InputError
@@ -111,6 +110,8 @@ def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WI
     Savitzky and Golay 1964, Anal. Chem. 36; samples that are not evenly spaced are read as if on the
     even grid of as many.
     """
+    from scipy.signal import savgol_filter  # slow to import: it loads scipy.stats
+
     flat = values.reshape(len(t), -1)
     even = np.linspace(t[0], t[-1], len(t))
     period = float(even[1] - even[0])

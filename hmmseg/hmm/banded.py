@@ -33,20 +33,9 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
+from hmmseg.hmm.chain import InfeasibleAlignment
+
 Skip = Shaped[ArrayLike, "*_"] | tuple[Shaped[ArrayLike, "*_"], ...] | None
-
-
-class InfeasibleAlignment(ValueError):
-    """No path through the subtasks has any probability.
-
-    `subtask` (0-based) is the one that starves: the first that no path reaches, or the last one
-    where it is reached but cannot be held to the end.
-    """
-
-    def __init__(self, subtask: int, reason: str) -> None:
-        super().__init__(f"no alignment: subtask {subtask} starves ({reason})")
-        self.subtask = subtask
-        self.reason = reason
 
 
 class Path(NamedTuple):

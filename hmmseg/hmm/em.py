@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from hmmseg.hmm.padding import Alignment, Bands, align_many
+from hmmseg.hmm.alignment import Alignment, Bands, align_many
 
 S = TypeVar("S")
 
@@ -94,7 +94,7 @@ def em(
 ) -> Fit[E, D]:
     """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
 
-    The last step is an expectation. Raises `hmmseg.hmm.banded.InfeasibleAlignment` where a trial is too
+    The last step is an expectation. Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too
     short for its states, ValueError on NaN.
     """
     before = -np.inf

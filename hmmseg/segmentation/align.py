@@ -12,7 +12,6 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
 from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
 from hmmseg.segmentation.crossings import NEAREST, Contacts, contacts
@@ -87,7 +86,6 @@ class _Piece:
     last: float
 
 
-@double_precision
 def align(
     trials: Sequence[Trial],
     task: BlockTask,

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, height_equations, subtasks
-from hmmseg.hmm.padding import align
+from hmmseg.hmm.alignment import align
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.departure import column, departing, leaving, scored, settled
 from hmmseg.segmentation.emissions import Features

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+from hmmseg.hmm.alignment import Alignment, Bands
 from hmmseg.hmm.em import em
-from hmmseg.hmm.padding import Alignment, Bands
 from hmmseg.segmentation.emissions import TAIL, Features, Parameters, log_likelihoods
 
 
@@ -105,7 +105,7 @@ def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Para
     """Fit emissions and durations to the given trials, pooled, within the forced order.
 
     EM begins with `start`, or else with what `initial_parameters` makes of the trials.
-    Raises `hmmseg.hmm.banded.InfeasibleAlignment` where a trial is too short for its subtasks.
+    Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too short for its subtasks.
     """
     parameters = start or initial_parameters(features, subtasks)
     emission = ContactEmission(tuple(features), subtasks, parameters)

@@ -17,7 +17,6 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
-from hmmseg.hmm.padding import bucket
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, log_student
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
@@ -29,7 +28,6 @@ SAME_WEIGHT = 0.25  # ... and, relatively, in weight are grips of one block
 APART = 10  # noise sds of the grip force between free and gripped
 RAISED, ENDS = 3e-3, 3  # m from the heights at a grip's ends (medians of so many samples) to be lifted
 ROUNDS = 8
-STATES = 16  # columns are padded to multiples of it, so that few programs are compiled
 IMPOSSIBLE = -1e3  # log-likelihood of a state that the trial never shows
 
 
@@ -125,12 +123,12 @@ def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Param
 
 def most_probable(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> np.ndarray:
     """Most probable path (num_timesteps,) of a dense model."""
-    return np.asarray(ergodic.viterbi(*_padded(table, log_initial, log_transition)).path)[: len(table)]
+    return ergodic.viterbi(table, log_initial, log_transition).path
 
 
 def log_evidence(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> float:
     """Log evidence of a dense model."""
-    return float(ergodic.log_evidence(*_padded(table, log_initial, log_transition)))
+    return ergodic.log_evidence(table, log_initial, log_transition)
 
 
 def switching(states: tuple[tuple[str, int | None], ...], leave: float) -> np.ndarray:
@@ -149,17 +147,6 @@ def switching(states: tuple[tuple[str, int | None], ...], leave: float) -> np.nd
 
 def _any_order(states: tuple[tuple[str, int | None], ...], n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.full(len(states), -np.log(len(states))), switching(states, min(0.5, 10.0 / n))
-
-
-def _padded(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> tuple:
-    n, k = table.shape
-    rows, columns = bucket(n) - n, -k % STATES
-    return (
-        np.pad(table, ((0, rows), (0, columns))),
-        np.pad(log_initial, (0, columns), constant_values=-np.inf),
-        np.pad(log_transition, (0, columns), constant_values=-np.inf),
-        n,
-    )
 
 
 def _states(blocks: tuple[Block, ...], sliding: bool) -> tuple[tuple[str, int | None], ...]:

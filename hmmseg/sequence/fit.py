@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.padding import Alignment, align_many
+from hmmseg.hmm.alignment import Alignment, align_many
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence import misfit as sequence_misfit

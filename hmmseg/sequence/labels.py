@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.padding import Alignment, align_many
+from hmmseg.hmm.alignment import Alignment, align_many
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.detectors import Detectors, learn

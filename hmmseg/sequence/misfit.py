@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.hmm import dense as ergodic
-from hmmseg.hmm.padding import Alignment, bucket
+from hmmseg.hmm.alignment import Alignment
 from hmmseg.segmentation.spans import Failure
 
 SPREADS = 6.0  # a trial this far outside the others does not fit
@@ -25,7 +25,7 @@ SQUEEZED = 0.03  # of the typical duration
 def scores(log_likelihoods: np.ndarray, mean_cells: np.ndarray, alignment: Alignment) -> np.ndarray:
     """(2,): log evidence of free switching over forced order [nats], minus log evidence per cell."""
     return np.array([
-        float(ergodic.log_evidence(*_free(log_likelihoods, mean_cells))) - alignment.log_evidence,
+        ergodic.log_evidence(*_free(log_likelihoods, mean_cells)) - alignment.log_evidence,
         -alignment.log_evidence / len(log_likelihoods),
     ])  # fmt: skip
 
@@ -55,7 +55,7 @@ def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.nda
             return Failure(k, names[k], None, "is squeezed to almost nothing: it does not happen")
     worse, poorer = (scores(log_likelihoods, mean_cells, alignment) - misfit[:, 0]) / misfit[:, 1]
     if worse > SPREADS:
-        path = np.asarray(ergodic.viterbi(*_free(log_likelihoods, mean_cells)).path)[: len(log_likelihoods)]
+        path = ergodic.viterbi(*_free(log_likelihoods, mean_cells)).path
         k, reason = _first_departure(path, names, optional)
         return Failure(k, names[k], None, reason)
     if poorer > SPREADS:
@@ -66,13 +66,12 @@ def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.nda
 
 
 def _free(log_likelihoods: np.ndarray, mean_cells: np.ndarray) -> tuple:
-    """Arguments of the ergodic model: same durations, any state next; padded."""
-    n, num_states = log_likelihoods.shape
+    """Arguments of the ergodic model: same durations, any state next."""
+    num_states = log_likelihoods.shape[1]
     leave = 1 / np.maximum(mean_cells, 1.5)
     transition = np.tile(np.log(leave / max(num_states - 1, 1))[:, None], (1, num_states))
     np.fill_diagonal(transition, np.log1p(-leave) if num_states > 1 else 0.0)
-    padded = np.pad(log_likelihoods, ((0, bucket(n) - n), (0, 0)))
-    return padded, np.full(num_states, -np.log(num_states)), transition, n
+    return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
 
 
 def _first_departure(path: np.ndarray, names: Sequence[str], optional: Sequence[bool]) -> tuple[int, str]:

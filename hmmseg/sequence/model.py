@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.padding import Alignment, Bands, align_many
+from hmmseg.hmm.alignment import Alignment, Bands, align_many
 from hmmseg.io.task import SequenceTask
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions

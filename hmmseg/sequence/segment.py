@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.banded import InfeasibleAlignment
-from hmmseg.hmm.padding import Alignment
+from hmmseg.hmm.alignment import Alignment
+from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Segmentation, Span

@@ -39,14 +39,15 @@ def test_matches_enumeration(size):
     np.testing.assert_allclose(log_evidence(ll, initial, transition), np.logaddexp.reduce(weights))
 
 
-def test_padding_changes_nothing():
-    ll, initial, transition = problem(5, 3)
-    padded = np.pad(ll, ((0, 4), (0, 0)), constant_values=np.inf)
-    np.testing.assert_allclose(
-        log_evidence(padded, initial, transition, 5), log_evidence(ll, initial, transition)
-    )
-    best = viterbi(padded, initial, transition, 5)
-    assert best.path[:5].tolist() == viterbi(ll, initial, transition).path.tolist()
+def test_states_of_almost_no_likelihood_keep_their_evidence():
+    """Where the only path leads through them, their weights do not underflow to nothing."""
+    ll, initial, transition = problem(40, 3)
+    ll[:, 1] = -1e3
+    initial[[0, 2]] = -np.inf
+    transition[1, [0, 2]] = -np.inf
+    alone = initial[1] + ll[:, 1].sum() + 39 * transition[1, 1]
+    np.testing.assert_allclose(log_evidence(ll, initial, transition), alone)
+    assert (viterbi(ll, initial, transition).path == 1).all()
 
 
 def test_refusals():

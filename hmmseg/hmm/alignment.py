@@ -1,0 +1,59 @@
+"""Most probable path and posterior of whole recordings, in logs, as EM and the segmentation take them.
+
+On the host kernels of hmmseg.hmm: nothing is compiled when it is called. hmmseg.hmm.banded has the same
+recursions in JAX, to be differentiated or run on an accelerator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.hmm.chain import Chain, not_numbers
+from hmmseg.hmm.inference import table, tables_of, viterbi
+
+Bands = tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Posterior of one recording's alignment, NumPy arrays; fields as in hmmseg.hmm.banded.
+
+    `path` (num_timesteps,) is the most probable one, `log_prob` its log weight.
+    """
+
+    path: np.ndarray
+    log_prob: float
+    log_evidence: float
+    log_smoothed: np.ndarray  # (num_timesteps, num_subtasks)
+    log_advance: np.ndarray  # (num_timesteps - 1, num_subtasks - 1)
+    log_skip: Bands = ()
+
+
+def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.ndarray,
+          log_skip: Bands = (), *, log_initial: np.ndarray | None = None,
+          log_final: np.ndarray | None = None) -> Alignment:  # fmt: skip
+    """Viterbi path and posterior of one recording, arguments as in hmmseg.hmm.banded.
+
+    Raises InfeasibleAlignment (which subtask starves) and ValueError (NaN, wrong shapes).
+    """
+    chain = Chain(log_stay, log_advance, log_skip or None, log_initial=log_initial, log_final=log_final)
+    ll = table(log_likelihoods, chain)
+    missing = np.isnan(ll)
+    if missing.any():
+        raise not_numbers(ll, int(missing.any(axis=1).argmax()))
+    best = viterbi(ll, chain)
+    log_evidence, _, smoothed, moves = tables_of(ll, chain, True, False, True)
+    return Alignment(best.path, best.log_prob, log_evidence, smoothed, moves[0], tuple(moves[1:]))
+
+
+def align_many(log_likelihoods: Sequence[np.ndarray], bands: Sequence[Bands], *,
+               log_initial: np.ndarray | None = None,
+               log_final: np.ndarray | None = None) -> list[Alignment]:  # fmt: skip
+    """`align` for several recordings; `bands` holds (log_stay, log_advance, further skips ...) of each."""
+    return [
+        align(ll, b[0], b[1], tuple(b[2:]), log_initial=log_initial, log_final=log_final)
+        for ll, b in zip(log_likelihoods, bands, strict=True)
+    ]
