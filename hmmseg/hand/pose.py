@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hmmseg.errors import InputError
 from hmmseg.io.gripper import AXES, Gripper, direction
@@ -100,6 +99,7 @@ def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
 
 def bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values (num_timesteps,) with missing samples interpolated."""
+
     there = np.isfinite(values)
     return values if there.all() else np.interp(t, t[there], values[there])
 
