@@ -66,6 +66,8 @@ def _window(t: np.ndarray, position: np.ndarray) -> float:
 
 
 def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
+    from scipy.spatial.transform import Rotation  # slow to import
+
     t = trial.t
     if gripper.quaternion is not None:
         q = np.stack([trial.channels[name] for name in gripper.quaternion], axis=1)
