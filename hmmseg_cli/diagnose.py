@@ -60,12 +60,13 @@ ModelFile = Annotated[
     Path | None,
     typer.Option("--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit."),
 ]
-CalibrateOption = Annotated[
-    bool,
+HealthyOption = Annotated[
+    list[Path] | None,
     typer.Option(
-        "--calibrate",
-        help="Learn what healthy recordings of this rig and task look like from simulations of them "
-        "(a minute or two, once).",
+        "--healthy",
+        metavar="TRIAL",
+        help="Recordings known to be healthy, the best null there is, up to the next option; "
+        "healthy twins are simulated otherwise.",
     ),
 ]
 TaskFile = Annotated[
@@ -74,24 +75,19 @@ TaskFile = Annotated[
         "--task", metavar="T", help="Task description (TOML); not needed with --simulator or --mjcf."
     ),
 ]
-BANKS = {
-    "nominal": "Judged by healthy simulations of the paper's hand.",
-    "bootstrap": "Judged by healthy simulations of the paper's hand, thresholds moved to this rig and task "
-    "by a linearised bootstrap, which may raise false alarms with soft pads or another task; "
-    "--calibrate simulates them instead.",
-    "calibrated": "Judged by healthy simulations of this rig and task.",
-}
+LISTS = ("--against", "--healthy")  # options that take several files
 
 
 def spread_against(args: list[str]) -> list[str]:
-    """Arguments with `--against A B` written `--against A --against B`, as the parser takes one a time."""
+    """Arguments with `--against A B` written `--against A --against B`, as the parser takes one a time; the
+    same of `--healthy`."""
     out: list[str] = []
-    taking = False
+    taking = ""
     for arg in args:
         if arg.startswith("-"):
-            taking = arg == "--against"
-        elif taking and out[-1] != "--against":
-            out.append("--against")
+            taking = arg if arg in LISTS else ""
+        elif taking and out[-1] != taking:
+            out.append(taking)
         out.append(arg)
     return out
 
@@ -104,7 +100,7 @@ def diagnose(
     effect: EffectOption = None,
     against: AgainstOption = None,
     model: ModelFile = None,
-    calibrate: CalibrateOption = False,
+    healthy: HealthyOption = None,
     simulator: SimulatorOption = None,
     mjcf: MjcfOption = None,
     map_file: MapOption = None,
@@ -130,8 +126,8 @@ def diagnose(
         if against and patch is not None:
             raise InputError("--patch", "does not go with --against: no rig.toml is diagnosed")
         if against:
-            if calibrate:
-                raise InputError("--calibrate", "does not go with --against: no virtual model is used")
+            if healthy:
+                raise InputError("--healthy", "does not go with --against: those are the null")
             _against(out, paths, against, description, rig, actual, effect or [], model)
             return
         if not isinstance(description, BlockTask):
@@ -148,7 +144,7 @@ def diagnose(
             raise InputError(f"{rig}: [gripper]", problem, "a hand with forces at both fingertips")
         if patch is not None:
             check_folder("--patch", patch)
-        body = run(out, paths, description, hand, actual, effect or [], calibrate)
+        body = run(out, paths, description, hand, actual, effect or [], healthy or [])
         if patch is not None:
             _patch(out, body, rig, patch)
         out.finish(body)
@@ -176,7 +172,7 @@ def run(
     rig: Rig,
     actual: Path | None,
     effect: Sequence[str],
-    calibrate: bool = False,
+    healthy: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Diagnose, put table, figures and page where `out` has them go, and give the document."""
     from estimation.actual import read_actual
@@ -187,24 +183,16 @@ def run(
     measured = None if actual is None else read_actual(actual, task.objects)
     forced = [effect_named(name).name for name in dict.fromkeys(effect)]
     recordings = read_trials(out, paths, rig)
-    bank = _own_bank(out, recordings, task, rig) if calibrate else None
+    well = read_trials(out, distinct_trials(list(healthy)), rig) if healthy else []
     with out.progress("diagnosing", total=STAGES) as advance:
-        found = find(recordings, task, rig, measured, forced, out.seed, lambda text: advance(1), bank)
+        tell = lambda text: advance(1)  # noqa: E731
+        found = find(recordings, task, rig, measured, forced, out.seed, tell, healthy=well)
     for warning in found.warnings:
         out.warn(warning)
     pads = rig.fingertip.model_dump()
-    out.print(sentence(found.body, pads), BANKS[found.body["detection"]["bank"]], *tables(found.body))
+    out.print(sentence(found.body, pads), *tables(found.body))
     _draw(out, found, recordings, task, rig, measured)
     return found.body
-
-
-def _own_bank(out: Output, recordings, task: BlockTask, rig: Rig):
-    """The bank learned on this rig and task, now or before."""
-    from simgap.gap.calibrate import steps
-    from simgap.gap.own_bank import own_bank
-
-    with out.progress("simulating healthy recordings", total=steps()) as advance:
-        return own_bank(recordings, task, rig, lambda text: advance(1))
 
 
 def _against(

@@ -9,17 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
+from simgap.attribution.posterior import fitted, forms, squares_left
+from simgap.attribution.problem import Candidate, Gap
 from simgap.effects import catalogue
-from simgap.gap import judge
-from simgap.gap.candidates import best_fits, deterministic, starts
 from simgap.gap.diagnose import Diagnosis
-from simgap.gap.fit import Fitted, Problem, slots, whitened
-from simgap.gap.spread import spreads
 
 LEVEL = 0.01  # chance of a healthy recording to be called otherwise, by each rival's own white-noise theory
 
@@ -30,108 +26,87 @@ def rival_verdicts(found: Diagnosis, excluded: Sequence[str]) -> tuple[dict[str,
     Gains are those of the whole catalogue, effects taken out of it included: they tell no rival anything,
     and the scorer needs them to say which effects lie above the detection floor.
     """
-    given = found.problem
-    known = [n for n, e in catalogue().items() if e.chosen]
-    if not given.frame.rig.jointed:
-        known = [n for n in known if catalogue()[n].acts_on != "kinematics"]
-    fits = {f.effects[0]: f for f in best_fits(given, [(n,) for n in deterministic(known)], found.healthy)}
-    names = [n for n in fits if n not in excluded]
-    verdicts = {
-        "bic": _bic(found, [fits[n] for n in names]),
-        "all_at_once": _together(found, names),
-        "cosine": _cosine(found, names),
-    }
-    return verdicts, _gains(found, list(fits.values()))
+    gap = found.search.gap
+    known = [c for c in gap.candidates if c.name in catalogue() and c.variance is None and c.name != "actual"]
+    mine = [c for c in known if c.name not in excluded]
+    verdicts = {"bic": _bic(gap, mine), "all_at_once": _together(gap, mine), "cosine": _cosine(gap, mine)}
+    return verdicts, _gains(gap)
 
 
-def _gains(found: Diagnosis, fits: Sequence[Fitted]) -> dict[str, float]:
-    """Gain of held-out log-likelihood over the healthy model, trials left out one at a time.
+def _gains(gap: Gap) -> dict[str, float]:
+    """Gain of held-out log-likelihood over the healthy model, trials left out one at a time; the best form of
+    each effect. A spread's gain is that of its variance, which is not held out."""
+    out: dict[str, float] = {}
+    trials = np.unique(gap.rows.trial)
+    folds = []
+    for trial in trials:
+        inside = gap.rows.trial == trial
+        folds.append((forms(gap.taken(~inside)), forms(gap.taken(inside))))
+    for j, c in enumerate(gap.candidates):
+        gain = 0.0
+        for train, judge in folds:
+            plain, with_it = (fitted(train, effects) for effects in ((), (j,)))
+            one = np.ones(judge.count.size)
+            before = squares_left(judge, (), one, plain.x)[:-1].sum()
+            after = squares_left(judge, (j,), one, with_it.x)[:-1].sum()
+            gain += 0.5 * float(before - after) - 0.5 * float(judge.count @ judge.shift((j,)))
+        out[c.name] = max(out.get(c.name, -np.inf), gain + c.evidence * (c.variance is not None))
+    return out
 
-    A spread's gain is that of its variance at the best value, which is not held out: one number for
-    hundreds of samples costs half a nat.
-    """
-    given = found.problem
-    n = given.frame.num_trials
-    moves = np.array([s.move if s.move is not None else 0 for s in given.frame.steps])
 
-    def left(f: Fitted) -> float:
-        return float(judge.heldout(given, f, judge.folds(f, n, moves), n).sum())
-
-    before = left(found.healthy)
-    gains = {f.effects[0]: 0.5 * (before - left(f)) for f in fits}
-    return gains | {s.effect: s.evidence for s in spreads(given, found.healthy)}
+def _columns(c: Candidate) -> tuple[np.ndarray, np.ndarray]:
+    """A candidate's constant shift (n,) at neutral, and its derivatives."""
+    return c.shift - c.jacobian @ (c.at - c.neutral), c.jacobian
 
 
-def _bic(found: Diagnosis, fits: Sequence[Fitted]) -> str:
+def _least(residual: np.ndarray, push: np.ndarray) -> float:
+    """Least sum of squares with standard normal coordinates."""
+    bend = push.T @ push + np.eye(push.shape[1])
+    pull = push.T @ residual
+    return float(residual @ residual - pull @ np.linalg.solve(bend, pull))
+
+
+def _bic(gap: Gap, known: Sequence[Candidate]) -> str:
     """Least sum of squares + parameters x log(number of residuals)."""
-    given = found.problem
-    n = int((given.whitening.weight > 0).sum())
-    score = {"none": float(found.healthy.square.sum())}
-    for f in fits:
-        more = len(f.columns) - given.num_properties
-        score[f.effects[0]] = float(f.square.sum()) + more * np.log(n)
-    return min(score, key=lambda k: score[k])
-
-
-@jax.jit
-def _derivatives(world, arrays, w, centre, spread, u, on):
-    """Whitened residuals (T, N, C) and their derivatives by all coordinates (K, T, N, C)."""
-    z, push = jax.linearize(lambda v: whitened(world, arrays, w, centre, spread, v, on)[0], u)
-    return z, jax.vmap(push)(jnp.eye(u.size))
-
-
-def _linearised(given: Problem, u: np.ndarray, on: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n,) and derivatives (n, K) at coordinates u with the effects in `on` switched on."""
-    tree = jax.tree.map(
-        jnp.asarray, (given.frame.world, given.frame.arrays, given.whitening, given.centre, given.spread)
-    )
-    switches = np.array([float(s.effect.name in on) for s in slots(given.num_properties)[0]])
-    z, push = _derivatives(*tree, jnp.asarray(np.append(u, 0.0)), jnp.asarray(switches))
-    there = given.whitening.weight > 0
-    return np.asarray(z)[there], np.asarray(push)[:-1, there].T
-
-
-def _together(found: Diagnosis, names: list[str]) -> str:
-    """One linear fit of all effects from the healthy optimum; the largest joint t statistic."""
-    given = found.problem
-    smooth = [n for n in names if not catalogue()[n].switched]
-    z, push = _linearised(given, found.healthy.u, smooth)
-    places = [s for s in slots(given.num_properties)[0] if s.effect.name in smooth]
-    columns = np.concatenate([np.arange(given.num_properties), *[np.arange(s.start, s.stop) for s in places]])
-    j = push[:, columns]
-    inverse = np.linalg.inv(j.T @ j + np.eye(columns.size))
-    value = -inverse @ (j.T @ z)
-    best, least = "none", LEVEL / len(smooth)
-    at = given.num_properties
-    for s in places:
-        mine = np.arange(at, at + s.stop - s.start)
-        at = int(mine[-1]) + 1
-        square = float(value[mine] @ np.linalg.solve(inverse[np.ix_(mine, mine)], value[mine]))
-        p = chi2.sf(square, mine.size)
-        if p < least or (p == least == 0.0):
-            best, least = s.effect.name, p
+    n, best, least = gap.residual.size, "none", _least(gap.residual, gap.nuisance)
+    for c in known:
+        constant, push = _columns(c)
+        square = _least(gap.residual - constant, np.concatenate([gap.nuisance, push], 1))
+        if square + c.at.size * np.log(n) < least:
+            best, least = c.name, square + c.at.size * np.log(n)
     return best
 
 
-def _cosine(found: Diagnosis, names: list[str]) -> str:
+def _together(gap: Gap, known: Sequence[Candidate]) -> str:
+    """One linear fit of all effects from the healthy optimum; the largest joint t statistic."""
+    smooth = [c for c in known if np.abs(_columns(c)[0]).max() < 1e-6 or not catalogue()[c.name].switched]
+    j = np.concatenate([gap.nuisance, *(c.jacobian for c in smooth)], 1)
+    inverse = np.linalg.inv(j.T @ j + np.eye(j.shape[1]))
+    value = inverse @ (j.T @ gap.residual)
+    best, least, at = "none", LEVEL / max(len(smooth), 1), gap.nuisance.shape[1]
+    for c in smooth:
+        mine = np.arange(at, at + c.at.size)
+        at += c.at.size
+        square = float(value[mine] @ np.linalg.solve(inverse[np.ix_(mine, mine)], value[mine]))
+        p = chi2.sf(square, mine.size)
+        if p < least or (p == least == 0.0):
+            best, least = c.name, p
+    return best
+
+
+def _cosine(gap: Gap, known: Sequence[Candidate]) -> str:
     """The largest share of the residual's length that lies in an effect's signature, properties aside."""
-    given = found.problem
-    z, push = _linearised(given, found.healthy.u, [])
-    own, _ = np.linalg.qr(push[:, : given.num_properties])
-    rest = z - own @ (own.T @ z)
-    if chi2.sf(float(rest @ rest), rest.size - given.num_properties) > LEVEL:
+    own, _ = np.linalg.qr(gap.nuisance)
+    rest = gap.residual - own @ (own.T @ gap.residual)
+    if chi2.sf(float(rest @ rest), rest.size - gap.nuisance.shape[1]) > LEVEL:
         return "none"
-    score = {}
-    places = {s.effect.name: s for s in slots(given.num_properties)[0]}
-    for name in names:
-        start = starts(given, (name,), found.healthy.u)[0]
-        moved, signature = _linearised(given, start.u, [name])
-        slot = places[name]
-        basis = signature[:, slot.start : slot.stop]
-        if not np.allclose(moved, z):
-            basis = np.column_stack([basis, moved - z])
+    score: dict[str, float] = {}
+    for c in known:
+        constant, push = _columns(c)
+        basis = np.column_stack([push, constant]) if np.abs(constant).max() > 1e-9 else push
         basis = basis - own @ (own.T @ basis)
         left, size, _ = np.linalg.svd(basis, full_matrices=False)
-        left = left[:, size > 1e-8 * max(size.max(), 1e-30)]
-        score[name] = float(np.linalg.norm(left.T @ rest) / np.linalg.norm(rest))
+        left = left[:, size > 1e-8 * max(float(size.max()), 1e-30)]
+        share = float(np.linalg.norm(left.T @ rest) / np.linalg.norm(rest))
+        score[c.name] = max(score.get(c.name, 0.0), share)
     return max(score, key=lambda k: score[k])

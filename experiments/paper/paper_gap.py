@@ -14,7 +14,7 @@ from experiments.paper.sources import PRINTED, recorded, save
 from experiments.recordings import Case
 from hmmseg.io.rig import Rig
 from simgap.gap.diagnose import Diagnosis, diagnose
-from simgap.gap.judge import joined
+from simgap.generic.verdict import joined
 
 TRIALS = 4
 SLIP = "grip_slip"

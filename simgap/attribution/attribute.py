@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.special import expit
@@ -18,6 +19,7 @@ from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import LEAST, POSITIVE, alike, known, named_part
 
 ALARM = 0.01  # chance of a healthy recording to be called otherwise
+LISTED = 1e-4  # probability below which a set is one of the others
 STATED = (0.6, 1.7)  # bounds of a channel's noise over the stated one, in standard deviations
 
 
@@ -33,13 +35,15 @@ class ParameterPosterior:
 @dataclass(frozen=True)
 class EffectPosterior:
     """One effect: `probability` to act, `share` of the gap it explains with its 90 % interval (0 where it
-    does not act), parameters, and whether they are the same in all trials."""
+    does not act), parameters, whether they are the same in all trials, and which of the gap's candidates (an
+    effect may have several forms) they are of."""
 
     probability: float
     share: float
     share_90: tuple[float, float]
     parameters: dict[str, ParameterPosterior]
     invariance: Invariance | None
+    candidate: int
 
 
 @dataclass(frozen=True)
@@ -53,11 +57,14 @@ class Remainder:
 
 @dataclass(frozen=True)
 class SmallGap:
-    """A gap below the smallest that matters: `size` over that, of the `channel` and `part` with the most."""
+    """A gap below the smallest that matters: `size` over that, of the `channel` and `part` with the most;
+    `amount` and what is `tolerated` there in sds of the noise, for the caller to turn into units."""
 
     size: float
     channel: str
     part: str
+    amount: float = float("nan")
+    tolerated: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -84,25 +91,29 @@ class Attribution:
 
 def attribute(
     gap: Gap,
-    twins: Iterable[float] | None = None,
+    twins: Iterable[float] | Callable[[float], Iterable[float]] | None = None,
     tolerance: np.ndarray | None = None,
     forced: tuple[str, ...] = (),
     seed: int = 0,
     nested: bool = True,
+    models: list[Model] | None = None,
+    absorbed: np.ndarray | None = None,
 ) -> Attribution:
     """Attribute a gap to its candidates.
 
-    `twins`: the `statistic` of healthy twins, taken one by one; without them stated noise is the null.
-    `tolerance` (n,): smallest shift of each row that matters, in sds of its noise. `forced` names effects
-    that act for certain, and no others. `nested`: whether how far the gap shrinks is asked.
+    `twins`: the `statistic` of healthy twins, taken one by one, or what gives them for the gap's own; without
+    them stated noise is the null. `tolerance` (n,): smallest shift of each row that matters, in sds of its
+    noise; `absorbed`: by how much the first nuisances may be off without it mattering. `forced` names effects
+    that act for certain, and no others. `nested`: whether how far the gap shrinks is asked. `models`: the
+    sets that `sought` finds, where they are known already.
     """
     rng = np.random.default_rng(seed)
     f = forms(gap)
-    models = sought(f)
+    models = sought(f) if models is None else models
     if forced:
-        wanted = tuple(j for j, c in enumerate(gap.candidates) if c.name in forced)
-        models = [fitted(f, wanted), *[m for m in models if not m.effects]]
-    found = detected(statistic(f, models), twins)
+        models = [_forced(f, forced), *[m for m in models if not m.effects]]
+    value = statistic(f, models)
+    found = detected(value, twins(value) if callable(twins) else twins)
     w = weights(models)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[_channel_of(f)]
@@ -113,11 +124,15 @@ def attribute(
         likely[parts[m.effects]] = likely.get(parts[m.effects], 0.0) + float(weight)
     ranked = sorted((p for p in likely if p), key=lambda p: -likely[p])
     judged = {part: _judged(f, part, by_group, rng) for part in ranked[:6]}
-    sure = {part: j.known for part, j in judged.items()}
-    causes_of = judged[ranked[0]] if ranked else _judged(f, (), by_group, rng)
-    probability = _probabilities(f, likely, sure, found.p_value)
+    probability = _probabilities(f, likely, judged, found.p_value)
+    causes_of = _leading(f, ranked, judged, likely) or _judged(f, (), by_group, rng)
     gone = bool(found.p_value >= ALARM) and not forced
-    small = None if tolerance is None or gone else _small(f, models[0], by_group, tolerance)
+    small = None if tolerance is None or gone else _small(f, models[0], np.minimum(by_group, 1.0), tolerance)
+    if small is not None and absorbed is not None:
+        moved = np.abs(models[0].x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+        small = None if (moved > absorbed).any() else small
+    if small is not None:
+        probability = _probabilities(f, likely, judged, 1.0)
     verdict, causes, partners = "none", (), ()
     if forced:
         verdict, causes = "named", causes_of.effects
@@ -127,7 +142,7 @@ def attribute(
             causes = causes_of.causes
             partners = alike(f, models, w, causes)
             verdict = "set" if partners else "named"
-    name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
+    name = lambda effects: tuple(sorted({gap.candidates[j].name for j in effects}))  # noqa: E731
     told = fitted(f, causes)
     left, before = residual_left(f, told), residual_left(f, fitted(f, ()))
     sd = noise[gap.rows.channel]
@@ -139,10 +154,17 @@ def attribute(
         verdict, name(causes), name(partners), probability,
         _effects(f, models, w, judged, rng, by_group), found,
         Remainder(explained.remainder, p_rest, rest),
-        significant(gap.rows, f.spectrum.band, before, sd) if verdict != "none" else (),
+        significant(gap.rows, f.spectrum.band, before, sd) if verdict != "none" or small is not None else (),
         far, small, dict(zip(gap.rows.channels, noise.tolist(), strict=True)), tuple(models), explained,
         before, left,
     )  # fmt: skip
+
+
+def _forced(f: Forms, names: tuple[str, ...]) -> Model:
+    """The best set of these effects, one form of each."""
+    forms_of = [[j for j, c in enumerate(f.gap.candidates) if c.name == name] for name in names]
+    sets = {tuple(sorted(each)) for each in product(*(mine for mine in forms_of if mine))}
+    return max((fitted(f, each) for each in sets), key=lambda m: m.score)
 
 
 @dataclass(frozen=True)
@@ -163,7 +185,7 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
     same = {j: invariance(f, model, j, f.gap.rows.trial) for j in effects}
     part = explained.each.mean(0) if effects else np.zeros(0)
     least = LEAST * float(part.sum())
-    scattering = {j for j in effects if f.gap.candidates[j].variance is not None}
+    scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(
         j for j, p in zip(effects, part, strict=True)
         if j in scattering or (p >= least and same[j].log_bayes_factor > POSITIVE)
@@ -173,18 +195,38 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
     return _Judged(effects, model, explained, same, causes, sure)
 
 
+def _leading(
+    f: Forms, ranked: list[tuple[int, ...]], judged: dict[tuple[int, ...], _Judged],
+    likely: dict[tuple[int, ...], float],
+) -> _Judged | None:  # fmt: skip
+    """The likeliest set of those whose causes, together, are likeliest."""
+    chance: dict[tuple[str, ...], float] = {}
+    names = {
+        part: tuple(sorted(f.gap.candidates[j].name for j in one.causes)) for part, one in judged.items()
+    }
+    for part, one in judged.items():
+        chance[names[part]] = chance.get(names[part], 0.0) + one.known * likely[part]
+    if not judged:
+        return None
+    best = max(chance, key=lambda name: chance[name])
+    return next(judged[part] for part in ranked if part in judged and names[part] == best)
+
+
 def _probabilities(
-    f: Forms, likely: dict[tuple[int, ...], float], sure: dict[tuple[int, ...], float], p_value: float
+    f: Forms, likely: dict[tuple[int, ...], float], judged: dict[tuple[int, ...], _Judged], p_value: float
 ) -> dict[str, float]:
-    """Of none, unknown and every set of named effects; they sum to one."""
+    """Of none, unknown and every set of causes; they sum to one. Sets with the same causes are one."""
     none = float(expit((np.log(max(p_value, 1e-300)) - np.log(ALARM)) / 0.5))
     out = {"none": none, "unknown": 0.0}
     for part, weight in likely.items():
-        right = sure.get(part, 0.0) * weight if part else 0.0
+        found = judged.get(part)
+        right = found.known * weight if found is not None else 0.0
         out["unknown"] += (weight - right) * (1 - none)
-        if part and right > 1e-4:
-            out["+".join(sorted(f.gap.candidates[j].name for j in part))] = right * (1 - none)
-    out["other"] = max(0.0, 1.0 - sum(out.values()))
+        if found is not None and right > 0:
+            name = "+".join(sorted(f.gap.candidates[j].name for j in found.causes))
+            out[name] = out.get(name, 0.0) + right * (1 - none)
+    out["other"] = sum(v for n, v in out.items() if v < LISTED and n not in ("none", "unknown"))
+    out = {n: v for n, v in out.items() if v >= LISTED or n in ("none", "unknown", "other")}
     total = sum(out.values())
     return {name: value / total for name, value in out.items()}
 
@@ -194,12 +236,22 @@ def _effects(
     rng: np.random.Generator, by_group: np.ndarray,
 ) -> dict[str, EffectPosterior]:  # fmt: skip
     """The posterior of every candidate: from the best set that holds it, or by itself."""
-    out = {}
+    out: dict[str, EffectPosterior] = {}
+    forms_of: dict[str, list[int]] = {}
     for j, c in enumerate(f.gap.candidates):
-        inside = [(m, float(p)) for m, p in zip(models, w, strict=True) if j in m.effects]
+        forms_of.setdefault(c.name, []).append(j)
+    for name, mine in forms_of.items():
+        inside = [(m, float(p)) for m, p in zip(models, w, strict=True) if {*mine} & {*m.effects}]
         chance = sum(p for _, p in inside)
-        found = next((one for part, one in judged.items() if j in part), None)
-        model = found.model if found is not None else inside[0][0] if inside else fitted(f, (j,))
+        found = next((one for part, one in judged.items() if {*mine} & {*part}), None)
+        if found is not None:
+            model = found.model
+        elif inside:
+            model = inside[0][0]
+        else:
+            model = max((fitted(f, (j,)) for j in mine), key=lambda m: m.score)
+        j = next(iter({*mine} & {*model.effects}))
+        c = f.gap.candidates[j]
         share, low, high = 0.0, 0.0, 0.0
         if found is not None:
             each = found.shares.each[:, found.effects.index(j)]
@@ -209,10 +261,10 @@ def _effects(
         mean = c.neutral + c.scale * model.x[z : z + c.at.size]
         same = None if found is None else found.invariance[j]
         wide = np.hypot(sd, _wander(same) * np.abs(mean - c.neutral))
-        out[c.name] = EffectPosterior(
+        out[name] = EffectPosterior(
             chance, share, (float(low), float(high)),
             {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))
-             for n, m, s in zip(c.parameters, mean, wide, strict=True)}, same)  # fmt: skip
+             for n, m, s in zip(c.parameters, mean, wide, strict=True)}, same, j)  # fmt: skip
     return out
 
 
@@ -253,9 +305,12 @@ def _small(f: Forms, model: Model, by_group: np.ndarray, tolerance: np.ndarray) 
     noise = by_group[f.spectrum.group]
     excess = np.maximum(np.bincount(inverse, before**2) - np.bincount(inverse, noise), 0.0) / count
     spread = np.sqrt(2 / count) * np.bincount(inverse, noise) / count
-    size = np.sqrt(np.maximum(excess - 2 * spread, 0.0)) / (np.bincount(inverse, tolerance) / count)
+    amount = np.sqrt(np.maximum(excess - 2 * spread, 0.0))
+    least = np.bincount(inverse, tolerance) / count
+    size = amount / least
     most = int(size.argmax())
     if size[most] >= 1.0:
         return None
     channel, part = divmod(int(key[most]), len(rows.parts))
-    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part])
+    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]),
+                    float(least[most]))  # fmt: skip

@@ -16,7 +16,8 @@ from simgap.attribution.background import Background
 from simgap.attribution.posterior import Forms, Model, fitted, sought
 
 RARE = (0.002, 0.01, 0.03)  # shares of groups off beside the usual one: a gap may be in one place alone
-ENOUGH = 10  # twins as extreme after which a p-value is clear (Besag & Clifford's h)
+ENOUGH = 4  # twins as extreme after which a p-value is clear (Besag & Clifford's h)
+FEW, SURE = 4, 1e-6  # twins after which so small a chance is clear, if none is as extreme
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,11 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
     wider = [m for m in models if {*acting} <= {*m.effects}]
     wider += [] if any(m.effects == acting for m in wider) else [fitted(f, acting)]
     null = fitted(replace(f, background=Background.usual(off=1e-9)), acting).score
-    usual = [f.background.marginal(m.energy, f.count, f.shift(m.effects))[0].sum() for m in wider]
+    usual = [f.marginal(m.effects, m.energy)[0].sum() for m in wider]
     scores = [m.score for m in wider]
     for share in RARE:
         other = Background.usual(off=share)
-        scores += [m.score + float(other.marginal(m.energy, f.count, f.shift(m.effects))[0].sum() - now)
+        scores += [m.score + float(f.marginal(m.effects, m.energy, other)[0].sum() - now)
                    for m, now in zip(wider, usual, strict=True)]  # fmt: skip
     return float(np.logaddexp.reduce(scores) - np.log(len(RARE) + 1) - null)
 
@@ -48,14 +49,25 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
 def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
     """The chance of a healthy recording to show so large a statistic.
 
-    Twins are taken one by one until ENOUGH exceed the recording's, or there are no more.
+    By Markov's inequality healthy recordings exceed s with a probability of exp(-s) at most, times the
+    expectation of their Bayes factor: one by theory, estimated on twins. What twins exceed is as likely as
+    their ranks say; the larger of both counts. Twins are taken one by one until the answer is clear:
+    ENOUGH exceed the recording's, or FEW leave no doubt.
     """
+    p = float(np.exp(min(0.0, -value)))
     if twins is None:
-        return Detection(value, float(np.exp(min(0.0, -value))), 0.0)
-    exceed = number = 0
+        return Detection(value, p, 0.0)
+    taken: list[float] = []
+    exceed = 0
     for twin in twins:
-        number += 1
+        taken.append(float(twin))
         exceed += twin >= value
-        if exceed >= ENOUGH:
-            return Detection(value, exceed / number, 1 / (number + 1))
-    return Detection(value, (exceed + 1) / (number + 1), 1 / (number + 1))
+        expected = float(np.logaddexp.reduce([*taken, 0.0])) - np.log(len(taken) + 1)
+        p = float(np.exp(min(0.0, max(expected, 0.0) - value)))
+        if exceed >= ENOUGH or (len(taken) >= FEW and not exceed and p < SURE):
+            break
+    if not taken:
+        return Detection(value, p, 0.0)
+    if exceed:
+        p = max(p, (exceed + 1) / (len(taken) + 1) if exceed < ENOUGH else exceed / len(taken))
+    return Detection(value, p, 1 / (len(taken) + 1))

@@ -32,7 +32,7 @@ def how_far(gap: Gap, noise: np.ndarray) -> HowFar | None:
     for k, trial in enumerate(trials):
         inside = gap.rows.trial == trial
         train, judge = forms(gap.taken(~inside)), forms(gap.taken(inside))
-        best = next((m for m in sought(train) if any(gap.candidates[j].named for j in m.effects)), None)
+        best = next((m for m in sought(train, 1) if any(gap.candidates[j].named for j in m.effects)), None)
         kept = () if best is None else tuple(j for j in best.effects if gap.candidates[j].named)
         model, empty = fitted(train, kept), fitted(train, ())
         weight = 1 / noise[_channels(judge, gap, inside)]

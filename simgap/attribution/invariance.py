@@ -41,14 +41,19 @@ def invariance(f: Forms, model: Model, effect: int, part: np.ndarray) -> Invaria
     start = z + sum(f.gap.candidates[j].at.size for j in model.effects if j < effect)
     x = model.x[start : start + k]
     loose = ~model.at_bound[start : start + k]
+    shared = np.array([n not in c.hidden for n in c.parameters], bool)
     parts = range(int(part.max()) + 1)
     names = c.neutral + c.scale * np.tile(x, (len(parts), 1))
-    if len(parts) < 2 or not loose.any():
+    if len(parts) < 2 or not (loose & shared).any():
         return Invariance(0.0, 1.0, float("nan"), names, np.full(names.shape, np.nan))
     left = residual_left(f, model)
     weight = model.precision[f.spectrum.group]
     push = f.spectrum.columns[:, f.spectrum.own[effect][1:]][:, loose]
-    usual = np.diag(x[loose] ** 2 + 0.01 * float(x[loose] @ x[loose]) / loose.sum() + 1e-12)
+    usual = x[loose] ** 2 + 0.01 * float(x[loose] @ x[loose]) / loose.sum() + 1e-12
+    if c.size is not None:
+        given = (c.size / c.scale)[loose]
+        usual = np.where(np.isfinite(given), given**2, usual)
+    free = ~shared[loose]
     score, far = np.zeros(WANDER.size), 0.0
     estimates, sds = names.copy(), np.full(names.shape, np.nan)
     for p in parts:
@@ -56,19 +61,20 @@ def invariance(f: Forms, model: Model, effect: int, part: np.ndarray) -> Invaria
         h = (push[mine] * weight[mine, None]).T @ push[mine]
         g = (push[mine] * weight[mine, None]).T @ left[mine]
         for i, wander in enumerate(WANDER):
-            prior = wander**2 * usual
+            prior = np.diag(np.where(free, WANDER[-1], wander) ** 2 * usual)
             inner = np.eye(h.shape[0]) + prior @ h
             score[i] += 0.5 * g @ np.linalg.solve(inner, prior @ g) - 0.5 * np.linalg.slogdet(inner)[1]
         sure = h + 1e-6 * np.eye(h.shape[0]) * max(float(np.trace(h)), 1e-12)
         covariance = np.linalg.inv(sure)
         step = covariance @ g
-        far += float(step @ np.linalg.solve(covariance + c.form**2 * usual, step))
+        off = np.diag(np.where(free, WANDER[-1], c.form) ** 2 * usual)
+        far += float(step @ np.linalg.solve(covariance + off, step))
         estimates[p, loose] += c.scale[loose] * step
         sds[p, loose] = c.scale[loose] * np.sqrt(np.diag(covariance))
     weight_of = np.exp(score - np.logaddexp.reduce(score))
     same, other = (c.form >= WANDER), (OTHER <= WANDER)
     one, several = (np.logaddexp.reduce(score[k]) - np.log(k.sum()) for k in (same, other))
-    freedom = (len(parts) - 1) * int(loose.sum())
+    freedom = (len(parts) - 1) * int((loose & shared).sum())
     return Invariance(
         float(one - several), float(chi2.sf(far, freedom)), float(weight_of @ WANDER), estimates, sds
     )

@@ -23,6 +23,7 @@ SCREEN, REFINED = 3, 5  # steps by which neighbours of a set are screened, how m
 WINDOW = 12.0  # nats behind the best set within which a set is kept
 BEAM = 5  # sets of each size that are extended
 MOST = 6  # effects of a set at most
+FREED = 0.9  # chance of a group to be off where an effect that acts gives it a variance of its own
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,31 @@ class Forms:
         return np.log1p(self.extra[list(effects)].sum(0))
 
     @cached_property
+    def freed(self) -> np.ndarray:
+        """Which groups (J, G) each candidate gives a variance of their own."""
+        out = np.zeros((len(self.gap.candidates), self.count.size), bool)
+        for j, c in enumerate(self.gap.candidates):
+            if c.frees is not None:
+                out[j] = np.bincount(self.spectrum.group, c.frees, self.count.size) > 0.5 * self.count
+        return out
+
+    def marginal(
+        self, effects: tuple[int, ...], energy: np.ndarray, background: Background | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Log density (G,) of groups with these squares under a set of effects, and expected precisions."""
+        shift = self.shift(effects)
+        density, precision = (background or self.background).marginal(energy, self.count, shift)
+        freed = self.freed[list(effects)].any(0)
+        if freed.any():
+            own = Background.usual(off=FREED).marginal(energy, self.count, shift)
+            density, precision = np.where(freed, own[0], density), np.where(freed, own[1], precision)
+        return density, precision
+
+    @cached_property
     def log_odds(self) -> float:
         """Prior log odds of one effect to act."""
-        share = min(self.gap.expected / max(len(self.gap.candidates), 1), 0.5)
+        number = len({c.name for c in self.gap.candidates})
+        share = min(self.gap.expected / max(number, 1), 0.5)
         return float(np.log(share / (1 - share)))
 
 
@@ -94,7 +117,7 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
         for j, mine in taken.blocks:
             c = f.gap.candidates[j]
             x[mine] = (c.at - c.neutral) / c.scale
-        found.append(_mode(f, taken, f.background.marginal(taken.energy(x), f.count, taken.shift)[1], x))
+        found.append(_mode(f, taken, f.marginal(effects, taken.energy(x))[1], x))
     return max(found, key=lambda m: m.score)
 
 
@@ -143,7 +166,7 @@ def _mode(
         matrix = np.tensordot(precision, taken.bend, 1) + np.diag(prior)
         x, held = _bounded(matrix, precision @ taken.pull, x, taken.low, taken.high)
         energy = taken.energy(x)
-        density, precision = f.background.marginal(energy, f.count, taken.shift)
+        density, precision = f.marginal(taken.effects, energy)
         last, value = value, float(density.sum()) + _log_prior(x, z, taken.blocks)
         if abs(value - last) < CLOSE:
             break
@@ -205,27 +228,30 @@ def _log_prior(x: np.ndarray, z: int, blocks: list[tuple[int, np.ndarray]]) -> f
     return float(out)
 
 
-def sought(f: Forms) -> list[Model]:
+def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     """All sets found within the window of the best, best first; the empty set is always one.
 
     Neighbours of a set are screened from its mode in a few steps; those that lead are fitted to the end.
+    `beam`: how many sets of the window are extended.
     """
-    every = range(len(f.gap.candidates))
     empty = fitted(f, ())
-    seen: dict[tuple[int, ...], Model] = {(): empty, **{(j,): fitted(f, (j,)) for j in every}}
+    seen: dict[tuple[int, ...], Model] = {
+        (): empty,
+        **{(j,): fitted(f, (j,)) for j in range(len(f.gap.candidates))},
+    }
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
     while True:
         best = max(m.score for m in seen.values())
         ranked = sorted(seen.values(), key=lambda m: -m.score)
-        leading = [m for m in ranked if m.score > best - WINDOW][:BEAM]
-        leading += [m for m in ranked if len(m.effects) == 1][:2]
+        leading = [m for m in ranked if m.score > best - WINDOW][:beam]
+        leading += [m for m in ranked if len(m.effects) == 1][: 2 if beam > 1 else 0]
         todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
         if not todo:
             break
         for m in todo:
             opened.add(m.effects)
-            new = [e for e in _neighbours(m.effects, every) if e not in seen and e not in rough]
+            new = [e for e in _neighbours(f, m.effects) if e not in seen and e not in rough]
             first = sorted(new, key=lambda e: -_mode(f, _taken(f, e), m.precision, steps=SCREEN).score)
             seen |= {e: fitted(f, e) for e in first[:REFINED]}
             rough |= set(first[REFINED:])
@@ -234,10 +260,16 @@ def sought(f: Forms) -> list[Model]:
     return sorted(kept, key=lambda m: -m.score)
 
 
-def _neighbours(effects: tuple[int, ...], every: range) -> list[tuple[int, ...]]:
-    """Sets with one effect more, one left out, or one exchanged."""
+def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Sets with one effect more, one left out, or one exchanged; of one name's forms only one acts."""
+    names = [c.name for c in f.gap.candidates]
     fewer = [tuple(j for j in effects if j != out) for out in effects]
-    more = [tuple(sorted({*e, j})) for e in (effects, *fewer) for j in every if j not in effects]
+    more = [
+        tuple(sorted({*e, j}))
+        for e in (effects, *fewer)
+        for j, name in enumerate(names)
+        if j not in effects and name not in {names[i] for i in e}
+    ]
     return list(dict.fromkeys([*more, *fewer]))
 
 
@@ -265,4 +297,6 @@ def squares_left(
             prior[mine] = 1e-3
         matrix = np.tensordot(weight, taken.bend, 1) + np.diag(prior)
         x, _ = _bounded(matrix, weight @ taken.pull, np.zeros(prior.size), taken.low, taken.high)
-    return np.append(weight * taken.energy(x), x[:z] @ x[:z])
+    squares = weight * taken.energy(x)
+    freed = f.freed[list(effects)].any(0)
+    return np.append(np.where(freed, np.minimum(squares, f.count), squares), x[:z] @ x[:z])

@@ -52,7 +52,11 @@ class Candidate:
     2008). `shift` (n,): by how much the effect at `at` shifts the residual, `jacobian` (n, k) its derivatives
     there. `variance` (n,) is what it adds to each row's variance instead, at `at`; `evidence` [nats] what
     else speaks for it. What is not `named` fits anything, and may only win the verdict "unknown". `form`: by
-    which share the effect's own form is usually off from one part of a recording to another.
+    which share the effect's own form is usually off from one part of a recording to another. `hidden`:
+    parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
+    a parameter is a share of; its deviation from neutral where that is not given, or not finite.
+    `frees` (n,): mask of the cosine coefficients of cells that have a variance of their own where it acts,
+    whatever that is.
     """
 
     name: str
@@ -68,13 +72,17 @@ class Candidate:
     evidence: float = 0.0
     named: bool = True
     form: float = 0.1
+    hidden: tuple[str, ...] = ()
+    size: Float[np.ndarray, " k"] | None = None
+    frees: np.ndarray | None = None
 
     def taken(self, rows: np.ndarray) -> Candidate:
         """The candidate on some rows."""
         variance = None if self.variance is None else self.variance[rows]
         return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
                          self.jacobian[rows], self.low, self.high, variance, self.evidence, self.named,
-                         self.form)  # fmt: skip
+                         self.form, self.hidden, self.size,
+                         None if self.frees is None else self.frees[rows])  # fmt: skip
 
 
 @dataclass(frozen=True)

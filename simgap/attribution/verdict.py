@@ -34,9 +34,10 @@ def alike(f: Forms, models: list[Model], weights: np.ndarray, causes: tuple[int,
     first = max(
         (w for m, w in zip(models, weights, strict=True) if set(causes) <= set(m.effects)), default=0.0
     )
-    found: set[int] = set()
+    known_names, found = {f.gap.candidates[j].name for j in causes}, set[int]()
     for m, w in zip(models, weights, strict=True):
         mine = set(named_part(f, m))
-        if w > first / 20 and mine - set(causes) and len(mine) <= len(causes):
-            found |= mine - set(causes)
+        others = {j for j in mine if f.gap.candidates[j].name not in known_names}
+        if w > first / 20 and others and len(mine) <= len(causes):
+            found |= others
     return tuple(sorted(found))

@@ -45,3 +45,19 @@ def effect_named(name: str) -> Effect:
     if name not in known:
         raise InputError(f"effect {name!r}", "unknown effect", nearest(name, list(known)))
     return known[name]
+
+
+def name_of(key: str) -> str:
+    """The effect that a key means: its name, or name/1, name/2, .. for its other forms."""
+    return key.split("/")[0]
+
+
+def free_parameters(key: str) -> tuple[str, ...]:
+    """Parameters that are free in a form of an effect."""
+    effect, _, form = fitted()[name_of(key)], *key.partition("/")[1:]
+    return effect.forms[int(form or 0)] if effect.forms else tuple(p.name for p in effect.parameters)
+
+
+def forms_of(name: str) -> list[str]:
+    """Keys of all forms of an effect."""
+    return [name, *(f"{name}/{k}" for k in range(1, len(fitted()[name].forms)))]

@@ -27,7 +27,7 @@ class World(NamedTuple):
     (tip positions and velocities of a Cartesian hand), forces fx1, fy1, fx2, fy2. `load` (T, N, 4) [N]: what
     of them acts between the contact and the sensor, in time with the contact. `link` (4,)
     relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
-    `delay`, `smoothing` [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
+    `delay`, `smoothing` (4,) [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
     the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
     yields with that delay (a spring beside a damper). `inertia`: factor of the mass times acceleration.
     `couple` [m]: how far the mass lies right of the middle.
@@ -74,6 +74,7 @@ class World(NamedTuple):
     events: Array
 
 
+GROSS = 100.0  # times the usual size: a fault so large has been seen on the bench
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 
@@ -132,10 +133,11 @@ class Parameter:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Bounds of the standard normal coordinate; five standard deviations at most."""
-        low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -5.0
-        high = self.coordinate(self.high) if np.isfinite(self.high) else 5.0
-        return max(low, -5.0), min(high, 5.0)
+        """Bounds of the coordinate: five standard deviations of a logarithm, GROSS of others, at most."""
+        low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -np.inf
+        high = self.coordinate(self.high) if np.isfinite(self.high) else np.inf
+        most = 5.0 if self.log else GROSS
+        return max(low, -most), min(high, most)
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,8 @@ class Effect:
     """One mechanism. `stage` orders corrections: what is nearest to the recorded number comes first.
 
     `correct(world, values, on)` takes the recording back; `on` is 1 where the effect is in the
-    candidate and 0 elsewhere, for parameters that have no neutral value. `spread(world, values)`
-    gives standard deviations of a random disturbance instead (see `simgap.gap.spread`).
+    candidate and 0 elsewhere, for parameters that have no neutral value. `scatter(problem, residual)`
+    gives the variance of a random disturbance instead (a `simgap.gap.spread.Spread`).
     `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
     scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
     `chosen` is false for effects that only
@@ -153,7 +155,10 @@ class Effect:
     effects act between samples: their form holds to a per cent or so, the others' to far less. `form` is the
     share, `blur` the amount, by which parameters of real parts are off what our own simulator can show.
     `ties`: patterns (rows that span a space of amplitudes) that independent parts fall into by chance alone.
-    `resolved(values, rig)`: whether the sensors can show so small an effect.
+    `resolved(values, rig)`: whether the sensors can show so small an effect. `forms`: sets of parameters of
+    which one is free and the others neutral, the usual one first; all are free where none is listed.
+    `admitted(rig)`: key of a form, and standard deviations by parameter, as rig.toml has them under
+    [systematic].
     """
 
     name: str
@@ -175,6 +180,9 @@ class Effect:
     coarse: bool = False
     ties: tuple[tuple[tuple[float, ...], ...], ...] = ()
     resolved: Callable[[dict[str, float], Rig], bool] | None = None
+    forms: tuple[tuple[str, ...], ...] = ()
+    scatter: Callable[[Any, np.ndarray], Any] | None = None
+    admitted: Callable[[Rig], tuple[str, dict[str, float]]] | None = None
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""

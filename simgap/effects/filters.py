@@ -7,7 +7,11 @@ import jax.numpy as jnp
 
 
 def lowpass(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
-    """First-order low-pass of (T, N, C) along N, started at rest; linear between samples."""
+    """First-order low-pass of (T, N, C) along N, started at rest; linear between samples.
+
+    `time` [s]: one of all channels, or (C,).
+    """
+    time = jnp.reshape(time, (1, 1, -1))
     ratio = step / jnp.maximum(time, 1e-4)
     keep = jnp.exp(-ratio)
     new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep

@@ -7,21 +7,33 @@ import numpy as np
 
 from simgap.effects.base import CONTACT, Effect, Parameter, World
 
+FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
+
 
 def _correct(world: World, values, on) -> World:
     normal, shear = jnp.asarray(values["give_normal"], float), jnp.asarray(values["give_shear"], float)
+    each = jnp.stack([jnp.asarray(values[n], float) for n in FINGERS])
     return world._replace(
-        give_normal=world.give_normal + normal[None], give_shear=world.give_shear + shear[None]
+        give_normal=world.give_normal + normal[None] + each[:2],
+        give_shear=world.give_shear + shear[None] + each[2:],
     )
 
 
 def _report(draws, rig):
     """True stiffnesses [N/m] from the additional compliances; a pad is never stiffer than 1e6 N/m."""
-    tip = rig.fingertip
-    return {
-        "normal_stiffness": (1 / np.maximum(1 / tip.normal_stiffness + draws["give_normal"], 1e-6), "N/m"),
-        "shear_stiffness": (1 / np.maximum(1 / tip.shear_stiffness + draws["give_shear"], 1e-6), "N/m"),
-    }
+    tip, out = rig.fingertip, {}
+    for name, give in draws.items():
+        kind, finger = name[5:].rstrip("12"), name[-1] if name[-1] in "12" else ""
+        nominal = getattr(tip, f"{kind}_stiffness")
+        out[f"{kind}_stiffness{finger}"] = 1 / np.maximum(1 / nominal + give, 1e-6), "N/m"
+    return out
+
+
+def _admitted(rig):
+    """Deviations of pads' stiffness [1], as those of their compliances [m/N]."""
+    tip, sds = rig.fingertip, rig.systematic.pad_stiffness
+    give = {"normal": 1 / tip.normal_stiffness, "shear": 1 / tip.shear_stiffness}
+    return "fingertip_compliance/1", {f"give_{k}{i + 1}": give[k] * sds[i] for k in give for i in (0, 1)}
 
 
 EFFECT = Effect(
@@ -33,10 +45,13 @@ EFFECT = Effect(
     parameters=(
         Parameter("give_normal", "m/N", 4e-4, low=-2.4e-4),
         Parameter("give_shear", "m/N", 4e-4, low=-3.8e-4),
+        *(Parameter(n, "m/N", 4e-4, low=-2.4e-4 if "normal" in n else -3.8e-4) for n in FINGERS),
     ),
+    forms=(("give_normal", "give_shear"), FINGERS),
     stage=CONTACT,
     form=0.035,  # real pads are no linear springs: their secant changes with the grip
     correct=_correct,
     report=_report,
+    admitted=_admitted,
     scene=lambda v: {"normal_stiffness": v["normal_stiffness"], "shear_stiffness": v["shear_stiffness"]},
 )

@@ -14,5 +14,6 @@ EFFECT = Effect(
     stage=READOUT,
     ties=FORCE_TIES,
     correct=lambda w, v, on: w._replace(force=w.force - per_channel(v, FORCES)),
+    admitted=lambda rig: ("force_bias", dict(zip(FORCES, rig.systematic.force_bias, strict=True))),
     apply=lambda p, v, rng: with_force(p, flat(p) + [v[c] for c in FORCES]),
 )

@@ -1,19 +1,42 @@
-"""Force channels that read too much or too little, in proportion."""
+"""Force channels that read too much or too little, in proportion: all alike, a finger's, or each its own."""
 
 from __future__ import annotations
 
-from simgap.effects.base import SCALE, Effect, Parameter, flat, with_force
+import jax.numpy as jnp
+import numpy as np
+
+from simgap.effects.base import FORCES, SCALE, Effect, Parameter, World, flat, with_force
+
+FINGERS = ("finger1", "finger2")
+EVERY = ("gain", *FINGERS, *FORCES)
+OWN = {c: ("gain", f"finger{c[-1]}", c) for c in FORCES}  # what gains make up that of a channel
+
+
+def _gains(values, xp):
+    return xp.stack([sum((values.get(n, 0.0) for n in OWN[c]), xp.zeros(())) for c in FORCES])
+
+
+def _correct(world: World, values, on) -> World:
+    factor = 1 + _gains(values, jnp)
+    # Recorded noise over that of corrected forces, of a sum (or difference) of both fingers' channels.
+    one, two = factor[:2], factor[2:]
+    loud = jnp.sqrt(2 / (one**-2 + two**-2))
+    return world._replace(
+        force=world.force / factor[None, None, :],
+        loudness=world.loudness * jnp.concatenate([loud, loud])[None, None, :],
+    )
+
 
 EFFECT = Effect(
     name="force_gain",
     acts_on="sensing",
-    says="recorded F = (1 + gain) F, common to all channels",
+    says="recorded F = (1 + gain) F, common to all channels, of a finger, or of each channel",
     shows="every load, in proportion",
     mistaken_for=("weight", "fingertip_compliance"),
-    parameters=(Parameter("gain", "1", 0.1, low=-0.5, high=0.5),),
+    parameters=tuple(Parameter(n, "1", 0.1, low=-0.5, high=0.5) for n in EVERY),
+    forms=(("gain",), FINGERS, FORCES),
+    admitted=lambda rig: ("force_gain/2", dict(zip(FORCES, rig.systematic.force_gain, strict=True))),
     stage=SCALE,
-    correct=lambda w, v, on: w._replace(
-        force=w.force / (1 + v["gain"]), loudness=w.loudness * (1 + v["gain"])
-    ),
-    apply=lambda p, v, rng: with_force(p, flat(p) * (1 + v["gain"])),
+    correct=_correct,
+    apply=lambda p, v, rng: with_force(p, flat(p) * (1 + _gains(v, np))),
 )

@@ -1,15 +1,26 @@
-"""Forces that arrive late by a constant delay."""
+"""Forces that arrive late by a constant delay: of all channels, or of one finger's sensor."""
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import FILTER, LATE, Effect, Parameter, Performance, flat, with_force, with_mode
 
+STARTS = (0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32)
+
+
+def _delays(values, xp):
+    one, two = (xp.asarray(values.get("delay", 0.0) + values.get(n, 0.0)) for n in ("finger1", "finger2"))
+    return xp.stack([one, one, two, two])
+
 
 def _apply(performance: Performance, values, rng) -> Performance:
-    force, late = flat(performance), performance.t - values["delay"]
-    return with_force(performance, np.stack([np.interp(late, performance.t, f) for f in force.T], 1))
+    t, late = performance.t, _delays(values, np)
+    force = flat(performance).T
+    return with_force(
+        performance, np.stack([np.interp(t - d, t, f) for d, f in zip(late, force, strict=True)], 1)
+    )
 
 
 EFFECT = Effect(
@@ -19,12 +30,13 @@ EFFECT = Effect(
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
     parameters=(
-        Parameter(
-            "delay", "s", 0.1, starts=(0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32), low=0.0, high=0.4
-        ),
+        Parameter("delay", "s", 0.1, starts=STARTS, low=0.0, high=0.4),
+        Parameter("finger1", "s", 0.1, starts=STARTS, low=0.0, high=0.4),
+        Parameter("finger2", "s", 0.1, starts=STARTS, low=0.0, high=0.4),
     ),
     stage=FILTER,
-    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + v["delay"]),
+    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + _delays(v, jnp)),
+    forms=(("delay",), ("finger1",), ("finger2",)),
     apply=_apply,
     coarse=True,
 )

@@ -14,6 +14,7 @@ EFFECT = Effect(
     shows="positions, widths, heights, by pose",
     mistaken_for=("link_length",),
     parameters=tuple(Parameter(q, "rad", 0.012) for q in JOINTS),
+    admitted=lambda rig: ("joint_offset", dict(zip(JOINTS, rig.systematic.joint_offset, strict=True))),
     stage=KINEMATICS,
     ties=JOINT_TIES,
     blur=8e-4,  # all joints turned alike hardly show, and take up what the model lacks

@@ -5,6 +5,46 @@ from __future__ import annotations
 import numpy as np
 
 from simgap.effects.base import READOUT, Effect, Parameter
+from simgap.gap.frame import CHANNELS
+
+REPEATED = 0.5  # share of repeated values that only a lattice has
+WRITTEN = 1e-5  # N; how finely forces are written that were not rounded before
+SHARES = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}  # of one sensor's variance, in net forces
+
+
+def _scatter(given, residual: np.ndarray):
+    """Whether forces repeat the same values: levels of a lattice through zero.
+
+    Written to 1e-5 N, as files are, one sample in ten repeats another's value by chance; on a lattice
+    most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
+    were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each.
+    """
+    from simgap.gap.spread import Spread
+
+    frame = given.frame
+    force = frame.world.force[: frame.num_trials]
+    values = np.concatenate([force[r, :n].ravel() for r, n in enumerate(frame.lengths)])
+    levels = np.unique(np.round(np.abs(values), 6))
+    if 1 - levels.size / values.size < REPEATED or levels.size < 4:
+        return None
+    step = float(np.median(np.diff(levels)))
+    for reach in (4, 16, 64, 256):  # farther levels tell the step ever more closely
+        count = np.round(values / step)
+        near = (np.abs(count) <= reach) & (count != 0)
+        if near.any():
+            step = float(values[near] @ count[near] / (count[near] @ count[near]))
+    off = np.abs(values / step - np.round(values / step))
+    if np.mean(off < 0.1) < 0.9:
+        return None
+    weight = given.whitening.weight
+    variance = np.zeros_like(weight)
+    for channel, share in SHARES.items():
+        c = CHANNELS.index(channel)
+        variance[..., c] = share * step**2 / 12 * weight[..., c] ** 2
+    return Spread(
+        "quantisation", step, 1e-3, variance[weight > 0], float(values.size * np.log(step / WRITTEN))
+    )
+
 
 EFFECT = Effect(
     name="quantisation",
@@ -14,5 +54,6 @@ EFFECT = Effect(
     mistaken_for=("noise",),
     parameters=(Parameter("step", "N", 1.0, neutral=0.05, log=True, low=1e-3, high=0.5),),
     stage=READOUT,
+    scatter=_scatter,
     finish=lambda force, v: v["step"] * np.round(force / v["step"]),
 )

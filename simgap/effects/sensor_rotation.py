@@ -30,7 +30,7 @@ EFFECT = Effect(
     says="recorded F = R(angle) F, per finger",
     shows="both axes, antisymmetric",
     mistaken_for=("force_crosstalk", "table_tilt"),
-    parameters=(Parameter("angle1", "rad", 0.06), Parameter("angle2", "rad", 0.06)),
+    parameters=tuple(Parameter(n, "rad", 0.06, low=-0.6, high=0.6) for n in ("angle1", "angle2")),
     stage=MIX,
     correct=_correct,
     apply=_apply,

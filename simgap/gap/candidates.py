@@ -1,4 +1,4 @@
-"""Where to start a search: every candidate's grid of start values, screened before it is refined."""
+"""Every candidate effect fitted by itself: all starts of its shape parameters screened, the best refined."""
 
 from __future__ import annotations
 
@@ -7,92 +7,75 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simgap.effects import fitted
-from simgap.gap.fit import STEPS, Fitted, Problem, Start, fit, limits, neutral, slots
+from hmmseg.io.rig import Rig
+from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
+from simgap.gap.fit import STEPS, Fitted, Problem, Start, fit, limits, slots
 
-SCREEN = 2  # steps before the best start of an effect is chosen
-LEADERS = 4  # starts screened, of those whose amplitudes are found first
+SCREEN = 2  # steps before the best start of a form is chosen
+LEADERS = 3  # starts screened
+PROMISING = 2.0  # nats that a linear step must gain for a form to be fitted
 
 
-def starts(
-    given: Problem, effects: tuple[str, ...], base: np.ndarray | None = None, keep: tuple[str, ...] = ()
-) -> list[Start]:
-    """Starts of a candidate; effects in `keep` stay where `base` (all columns) has them."""
-    base = neutral(given) if base is None else base
-    places = {s.effect.name: s for s in slots(given.num_properties)[0]}
-    grids = []
-    for name in effects:
-        if name in keep:
-            continue
-        slot = places[name]
-        for j, p in enumerate(slot.effect.parameters):
-            if p.gridded:
-                grids.append([(slot.start + j, p.coordinate(value)) for value in p.starts])
+def candidate_names(rig: Rig, excluded: Sequence[str] = ()) -> list[str]:
+    """The effects to choose from, decoys included: a Cartesian hand has no joints."""
+    chosen = {n: e for n, e in catalogue().items() if e.chosen} | decoys()
+    return [n for n, e in chosen.items() if n not in excluded and (rig.jointed or e.acts_on != "kinematics")]
+
+
+def shifting(names: Sequence[str]) -> list[str]:
+    """Keys of all forms of those effects that shift signals (the others only spread them)."""
+    return [key for n in names if fitted()[n].correct is not None for key in forms_of(n)]
+
+
+def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
+    """Starts of one form of an effect, from other coordinates `base` (all columns)."""
+    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
+    grids = [
+        [(slot.start + j, p.coordinate(value)) for value in p.starts]
+        for j, p in enumerate(slot.effect.parameters)
+        if p.gridded and p.name in free_parameters(key)
+    ]
     out = []
     for chosen in itertools.product(*grids):
         u = base.copy()
         for column, value in chosen:
             u[column] = value
-        out.append(Start(effects, u))
+        out.append(Start((key,), u))
     return out
 
 
-def deterministic(names: Sequence[str]) -> list[str]:
-    """Those of the named effects that shift signals (the others only spread them)."""
-    return [n for n in names if fitted()[n].correct is not None]
+def best_fit(given: Problem, key: str, healthy: Fitted, steps: int = STEPS) -> Fitted:
+    """The best fit of one form of an effect, properties refitted; not refined where that promises nothing.
 
-
-def best_fits(
-    given: Problem,
-    wanted: Sequence[tuple[str, ...]],
-    healthy: Fitted,
-    bases: Sequence[Fitted] | None = None,
-    steps: int = STEPS,
-) -> list[Fitted]:
-    """The best fit of every candidate: all starts for a few steps, then the better ones to the end.
-
-    `bases[k]` is a fit of fewer effects that candidate k extends.
+    Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
+    what swings with it has no size.
     """
-    jobs: list[tuple[int, Start]] = []
-    for k, effects in enumerate(wanted):
-        base = bases[k] if bases is not None else healthy
-        kept = base.effects if bases is not None else ()
-        found = starts(given, effects, base.u, kept)
-        jobs += [(k, s) for s in _with_amplitudes(given, found, kept)]
-    many = {k for k, _ in jobs if sum(j == k for j, _ in jobs) > 1}
-    screened = fit(given, [s for k, s in jobs if k in many], SCREEN) if many else []
-    best: dict[int, Start] = dict(reversed(jobs))  # the first start of each, until a better one is known
-    cost: dict[int, float] = {}
-    for (k, _), found in zip([job for job in jobs if job[0] in many], screened, strict=True):
-        if found.cost < cost.get(k, np.inf):
-            cost[k], best[k] = found.cost, Start(found.effects, found.u)
-    return fit(given, [best[k] for k in range(len(wanted))], steps)
+    ranked = sorted((_ranked(given, start) for start in starts(given, key, healthy.u)), key=lambda r: r[0])
+    if healthy.cost - ranked[0][0] < PROMISING:
+        return ranked[0][2]
+    leading = [start for _, start, _ in ranked[:LEADERS]]
+    if len(leading) > 1:
+        screened = sorted((fit(given, s, SCREEN) for s in leading), key=lambda f: f.cost)
+        leading = [Start((key,), screened[0].u)]
+    return fit(given, leading[0], steps)
 
 
-def _with_amplitudes(given: Problem, found: list[Start], kept: tuple[str, ...]) -> list[Start]:
-    """The leading starts with the best amplitudes of their start values: those that are nothing without.
-
-    A frequency cannot be sought while what swings with it has no size.
-    """
+def _ranked(given: Problem, start: Start) -> tuple[float, Start, Fitted]:
+    """A start's cost after a linear step of all but its gridded parameters, the start there, and its fit."""
+    (key,) = start.effects
+    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     fixed = [
         slot.start + j
-        for slot in slots(given.num_properties)[0]
-        if slot.effect.name in found[0].effects and slot.effect.name not in kept
-        if any(p.amplitude and not p.gridded for p in slot.effect.parameters)
         for j, p in enumerate(slot.effect.parameters)
-        if p.gridded
+        if p.gridded and p.name in free_parameters(key)
     ]
-    if not fixed or len(found) <= LEADERS:
-        return found
     low, high = limits(given)
-    seen = []
-    for one in fit(given, found, 0):
-        free = ~np.isin(one.columns, fixed)
-        columns = one.columns[free]
-        slope = (one.gradient.sum((0, 1)) + one.u[one.columns])[free]
-        bend = (one.hessian.sum((0, 1)) + np.eye(free.size))[np.ix_(free, free)]
-        step = -np.linalg.solve(bend, slope)
-        u = one.u.copy()
-        u[columns] = np.clip(u[columns] + step, low[columns], high[columns])
-        seen.append((one.cost + 0.5 * float(slope @ step), Start(one.effects, u)))
-    return [start for _, start in sorted(seen, key=lambda row: row[0])[:LEADERS]]
+    one = fit(given, start, 0)
+    free = ~np.isin(one.columns, fixed)
+    columns, push = one.columns[free], one.push[:, free]
+    step = -np.linalg.solve(push.T @ push + np.eye(columns.size), push.T @ one.residual + one.u[columns])
+    u = one.u.copy()
+    u[columns] = np.clip(u[columns] + step, low[columns], high[columns])
+    left = one.residual + push @ (u[columns] - one.u[columns])
+    own = u[: given.num_properties]
+    return 0.5 * float(left @ left) + one.doubts + 0.5 * float(own @ own), Start(one.effects, u), one

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,22 +12,22 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
-from simgap.effects import decoys
-from simgap.gap import judge
-from simgap.gap.adapt import adapted
-from simgap.gap.bank import Bank, load_bank
-from simgap.gap.candidate import Candidate, left, remainder
-from simgap.gap.describe import describe, property_values, where
+from simgap.attribution.attribute import ALARM, Attribution, attribute
+from simgap.attribution.posterior import Model, forms, sought
+from simgap.attribution.problem import Gap
+from simgap.effects import free_parameters, name_of
+from simgap.gap.assemble import together
+from simgap.gap.body import body, parameters
 from simgap.gap.experiments import next_experiment
-from simgap.gap.fit import Fitted, Problem, residual_at
-from simgap.gap.locate import ALARM, Cell, cells, together
+from simgap.gap.fit import Fitted, Problem, Start, fit, residual_at
+from simgap.gap.located import Tally, tallies
 from simgap.gap.search import Search, search
-from simgap.gap.shrinkage import shrinkage
-from simgap.gap.verdict import choose, likelihoods, listed
+from simgap.gap.spread import spreads
+from simgap.gap.tolerance import properties_tolerated, tolerated
+from simgap.gap.twins import own_healthy, twin_statistics
 
-STAGES = 6  # that `progress` is told of, at most
-LISTED = 8  # candidates that are described
-CELL = 4.5  # score of a cell that is listed once a gap is established: the largest of most healthy trials
+STAGES = 12  # that `progress` is told of, at most
+NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 Progress = Callable[[str], None]
 
 
@@ -35,20 +35,23 @@ Progress = Callable[[str], None]
 class Diagnosis:
     """Everything found; `body` is the JSON document's. Arrays are for figures and tests.
 
-    `before`, `after` (T, N, C): whitened residuals without and with the verdict's effects;
-    `scores`: what the probabilities were made of.
+    `before`, `after` (T, N, C): whitened residuals without and with the verdict's effects, `cells` the first
+    by trial, channel and subtask; `causes`: the fit of those effects that shift signals.
     """
 
     body: dict[str, Any]
-    problem: Problem
-    healthy: Fitted
-    candidates: tuple[Candidate, ...]
+    search: Search
+    causes: Fitted
+    attribution: Attribution
     before: np.ndarray
     after: np.ndarray
-    cells: tuple[Cell, ...]
-    threshold: float
-    scores: dict[str, Any]
+    cells: tuple[Tally, ...]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def problem(self) -> Problem:
+        """Aligned trials and their whitening."""
+        return self.search.problem
 
 
 @double_precision
@@ -60,113 +63,87 @@ def diagnose(
     forced: Sequence[str] = (),
     seed: int = 0,
     progress: Progress | None = None,
-    bank: Bank | None = None,
+    twins: bool = True,
+    healthy: Sequence[Trial] = (),
     excluded: Sequence[str] = (),
 ) -> Diagnosis:
     """Diagnose recordings of one block task against the nominal model.
 
     `actual` as `estimation.actual.read_actual` gives it; `forced` names effects to be taken instead of
-    choosing; `excluded` effects are not thought of. `bank` is the package's own by default; where it has a
-    reference and that is another rig's, its thresholds are moved. InputError where no trial fits its task.
+    choosing; `excluded` effects are not thought of. The null are `healthy` recordings of the same task and
+    rig if there are any, else simulated `twins`, else the model itself. InputError where no trial fits its
+    task.
     """
     tell = progress or (lambda text: None)
-    bank = bank or load_bank()
-    found = search(trials, task, rig, bank, actual, forced, excluded, tell)
-    bank = adapted(bank, found.problem, found.healthy, trials)
-    tell("held-out trials")
-    given, best = found.problem, found.candidates[0]
-    p = bank.detection.p_values(found.statistics)
-    p_value = together(p)
-    rest, p_left = left(given, best, found.healthy, bank)
-    scores = {
-        "evidence": {c.name: c.evidence for c in found.candidates},
-        "left": rest, "p_left": p_left, "p": p,
-    }  # fmt: skip
-    probability = likelihoods(scores["evidence"], p_value, rest, p_left, bank.calibration)
-    verdict, causes, partners = choose(probability, found, p_value < ALARM, bool(forced))
-    before = residual_at(given, (), found.healthy.u)
-    chosen = next((c for c in found.candidates if causes and c.name == judge.joined(causes)), None)
-    every = cells(given, before)
-    among = {*causes, *partners}
-    alike = [c for c in found.candidates if len(c.effects) == len(causes) and among >= set(c.effects)]
-    named = [c for c in found.candidates if not judge.nameless(c.name)]
-    shown = [c for k, c in enumerate(named) if k < LISTED or c in alike]
-    effects = {c.name: describe(given, c, found.healthy, bank.calibration, seed) for c in shown}
+    found = search(trials, task, rig, actual, excluded, tell)
+    tell("attributing the gap")
+
+    def null(value: float) -> Iterable[float]:
+        if healthy:
+            return own_healthy(found, healthy, task, rig, actual)
+        return twin_statistics(found, task, rig, actual, seed, tell) if twins and value > NIL else ()
+
+    gap, told = attributed(found, tuple(forced), seed, null)
+    causes = _causes(found, gap, told)
     following = None
-    if verdict == "set":
+    if told.verdict == "set":
         tell("the next experiment")
-        following = _following(found, alike, effects, bank, seed, actual)
-    warnings = found.warnings
-    if verdict == "set":
-        warnings = (*warnings, *_inseparable(causes, partners, following))
-    if verdict == "unknown":
-        warnings = (*warnings, *_why_unknown(best))
-    if given.frame.num_trials == 1:
-        warnings = (*warnings, "one trial: held out by moves, which is weaker than by trials")
-    body = {
-        "verdict": verdict,
-        "causes": causes,
-        "indistinguishable": partners,
-        "probabilities": listed(probability),
-        "detection": {"p_value": p_value, "statistic": found.statistics["cell"], "bank": bank.source},
-        "where": where(given, every, CELL, chosen) if p_value < ALARM else [],
-        "effects": effects,
-        "shrinkage": None if chosen is None else shrinkage(given, found.healthy, chosen, before, bank, seed),
-        "next_experiment": following,
-    }
-    residual = before if chosen is None else remainder(given, chosen)
-    return Diagnosis(body, given, found.healthy, found.candidates, before, residual, tuple(every), CELL,
-                     scores, warnings)  # fmt: skip
+        mine = {n: parameters(found, told.effects[n], n, seed) for n in told.causes}
+        values = {n: {k: p["mean"] for k, p in each.items()} for n, each in mine.items()}
+        following = next_experiment(found, values, told.indistinguishable, seed, actual)
+    document = body(found, told, causes, following, seed)
+    warnings = (*found.warnings, *_inseparable(told, following))
+    if found.problem.frame.num_trials == 1:
+        warnings = (*warnings, "one trial: nothing tells an accident of it from an effect")
+    before = residual_at(found.problem, (), found.healthy.u)
+    after = residual_at(found.problem, causes.effects, causes.u)
+    cells = tallies(found.problem, before)
+    return Diagnosis(document, found, causes, told, before, after, cells, warnings)
 
 
-def _why_unknown(best: Candidate) -> list[str]:
-    """What explains the gap better than any effect of the catalogue, if something does."""
-    if best.name.endswith(judge.ALIKE):
-        return [
-            f"{'+'.join(best.effects)} would explain the gap, but both fingers would have to err alike, "
-            "which independent parts do not: the cause is one that the catalogue does not have"
-        ]
-    if best.name in decoys():
-        says = decoys()[best.name].says
-        return [f"{best.name} explains the gap better than any effect of the catalogue: {says}"]
-    return []
-
-
-def _inseparable(
-    causes: Sequence[str], partners: Sequence[str], following: dict[str, Any] | None
-) -> list[str]:
+def _inseparable(told: Attribution, following: dict[str, Any] | None) -> list[str]:
     """What no experiment is expected to tell from the causes, if there is any."""
-    left = sorted(set(partners) - set([] if following is None else following["separates"]))
-    return (
-        [f"no experiment of the list is expected to tell {', '.join(left)} from {' + '.join(causes)}"]
-        if left
-        else []
-    )
+    left = sorted(set(told.indistinguishable) - set([] if following is None else following["separates"]))
+    if not left:
+        return []
+    return [f"no experiment of the list is expected to tell {', '.join(left)} from {' + '.join(told.causes)}"]
 
 
-def _following(
+def attributed(
     found: Search,
-    alike: Sequence[Candidate],
-    effects: dict[str, Any],
-    bank: Bank,
-    seed: int,
-    actual: dict | None,
-) -> dict[str, Any] | None:
-    """The experiment that would best tell the first of some candidates from the others."""
-    cause, *partners = alike
-    values: dict[str, dict[str, float]] = {name: {} for name in cause.effects}
-    for key, p in effects[cause.name]["parameters"].items():
-        *prefix, name = key.split(".")  # those of a pair are written effect.parameter
-        values[prefix[0] if prefix else cause.name][name] = p["mean"]
-    properties = property_values(found.problem, cause.fitted)
-    return next_experiment(
-        found.problem,
-        values,
-        [c.effects for c in partners],
-        [cause.evidence - c.evidence for c in partners],
-        properties,
-        bank,
-        seed,
-        actual,
-        found.temperature,
-    )
+    forced: tuple[str, ...] = (),
+    seed: int = 0,
+    twins: Callable[[float], Iterable[float]] | None = None,
+) -> tuple[Gap, Attribution]:
+    """The attribution of a search, effects that act together linearised where they do."""
+    gap = found.gap
+    tolerance = tolerated(found.problem)
+    models: list[Model] | None = sought(forms(gap))
+    leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    if leading and not forced:
+        joint = _together(found, leading)
+        left = spreads(found.problem, joint.residual, [s.effect for s in found.spreads])
+        gap, models = together(found.problem, gap, found.healthy, joint, left), None
+    absorbed = properties_tolerated(found.problem)
+    return gap, attribute(gap, twins, tolerance, forced, seed, models=models, absorbed=absorbed)
+
+
+def _together(found: Search, which: Sequence[int]) -> Fitted:
+    """Some of the fits joined: fitted together from where each is by itself."""
+    u = found.healthy.u.copy()
+    for j in which:
+        own = found.fits[j].columns[found.problem.num_properties :]
+        u[own] = found.fits[j].u[own]
+    return fit(found.problem, Start(tuple(found.fits[j].effects[0] for j in which), u))
+
+
+def _causes(found: Search, gap: Gap, told: Attribution) -> Fitted:
+    """The fit of the verdict's effects that shift signals, in the forms that they were found in."""
+    which = []
+    for name in told.causes:
+        parameters = gap.candidates[told.effects[name].candidate].parameters
+        which += [
+            j for j, f in enumerate(found.fits)
+            if name_of(f.effects[0]) == name and free_parameters(f.effects[0]) == parameters
+        ]  # fmt: skip
+    return _together(found, which) if which else found.healthy

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects import fitted as known_effects
+from simgap.effects import free_parameters, name_of
 from simgap.effects.base import Effect, World, tips
 from simgap.gap.frame import Arrays, Frame
-from simgap.gap.noise import NoiseModel, Whitening, whiten, whitening
 from simgap.gap.residuals import contact, residuals
+from simgap.gap.whitening import Whitening, whitening
 
-SMALL, LARGE = 8, 26  # columns of effects (beyond the properties), two compiled shapes
+ROWS = 8  # coordinates that are evaluated at once, in one compiled program
+STEP = 1e-5  # of a usual deviation, for differences
 STEPS = 12
+CLOSE = 0.02  # nats
 FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # sd of a property that nothing else tells
 
 
@@ -48,12 +51,14 @@ def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
 
 @dataclass(frozen=True)
 class Problem:
-    """A frame with its whitening and the properties' prior: `centre`, `spread` (O, 3)."""
+    """A frame with its whitening and the properties' prior: `centre`, `spread` (O, 3); which of weight, width
+    and height were `measured` (O, 3) apart."""
 
     frame: Frame
     whitening: Whitening
     centre: np.ndarray
     spread: np.ndarray
+    measured: np.ndarray
 
     @property
     def num_properties(self) -> int:
@@ -76,27 +81,28 @@ class Start:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fitted candidate: `columns` (K,) of its free parameters, coordinates `u` (all columns).
+    """A fitted candidate: coordinates `u` (all columns), of which `columns` (K,) were free.
 
-    `blocks`: quadratic forms of the whitened residual about the optimum by trial and subtask:
-    H (T, S, K, K), g (T, S, K), c (T, S), so that the residual's square at u + w is
-    c + 2 g w + w H w; twice the cost of doubts is among the squares. `cost` is half their sum plus prior.
+    `residual` (n,): what it leaves, whitened, in the order of the mask `whitening.weight > 0`; `push` (n, K)
+    its derivatives; `doubts` [nats]: the cost of residuals in doubt; `cost`: these, half the squares and the
+    prior.
     """
 
     effects: tuple[str, ...]
     u: np.ndarray
     columns: np.ndarray
-    hessian: np.ndarray
-    gradient: np.ndarray
-    square: np.ndarray
+    residual: np.ndarray
+    push: np.ndarray
+    doubts: float
     cost: float
 
 
-def problem(frame: Frame, noise: NoiseModel, actual: dict | None = None) -> Problem:
+def problem(frame: Frame, actual: dict | None = None) -> Problem:
     """The problem of a frame; `actual` as `estimation.actual` reads it narrows the prior."""
     a, w, objects = frame.arrays, frame.world, frame.task.objects
     valid = (a.there[..., 6] > 0) & (a.phase[..., 2] > 0)
     centre, spread = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
+    measured = np.zeros((len(objects), 3), bool)
     net = w.force[..., 1] + w.force[..., 3]
     position, _ = tips(jax.tree.map(jnp.asarray, w))
     distance = np.asarray(position[..., 2] - position[..., 0])
@@ -111,17 +117,8 @@ def problem(frame: Frame, noise: NoiseModel, actual: dict | None = None) -> Prob
             if prop in given:
                 value, sd = given[prop]
                 centre[o, k], spread[o, k] = value, np.hypot(sd, (2e-3 * value, 3e-5, 4e-5)[k])
-    return Problem(frame, whitening(frame, noise), centre, spread)
-
-
-def without(given: Problem, samples: np.ndarray) -> Problem:
-    """The problem with some residuals (T, N, C) taken to be missing."""
-    arrays, weight = given.frame.arrays, given.whitening.weight
-    there = np.where(samples, 0.0, arrays.there)
-    frame = replace(given.frame, arrays=arrays._replace(there=there))
-    return replace(
-        given, frame=frame, whitening=given.whitening._replace(weight=np.where(samples, 0, weight))
-    )
+                measured[o, k] = True
+    return Problem(frame, whitening(frame), centre, spread, measured)
 
 
 def corrected(world: World, u: jax.Array, on: jax.Array, num_properties: int) -> World:
@@ -155,32 +152,20 @@ def whitened(
     noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
     raw, factor = residuals(corrected(world, u, on, centre.size), arrays, properties, noise)
     cost = jnp.einsum("tns,tnc->ts", w.member, jnp.where(w.weight > 0, 0.5 * jnp.log(factor), 0.0))
-    return whiten(raw / jnp.sqrt(factor), w), cost
+    return raw / jnp.sqrt(factor) * w.weight, cost
 
 
 @jax.jit
-def _linearised(world, arrays, w, centre, spread, u, on, columns):
-    """Whitened residuals (T, N, C) at u, the cost of doubts (T, S), and their derivatives by the free
-    columns (T, N, C, K), (T, S, K)."""
-
-    def of(step):
-        return whitened(world, arrays, w, centre, spread, u.at[columns].add(step), on)
-
-    step = jnp.zeros(columns.shape[0])
-    now, push = jax.linearize(of, step)
-    return *now, *(jnp.moveaxis(d, 0, -1) for d in jax.vmap(push)(jnp.eye(step.size)))
-
-
-@jax.jit
-def _residual(world, arrays, w, centre, spread, u, on):
-    return whitened(world, arrays, w, centre, spread, u, on)[0]
+def _evaluated_at(world, arrays, w, centre, spread, u, on):
+    """Whitened residuals (B, T, N, C) at B rows of coordinates, and the cost of doubts (B,)."""
+    z, doubts = jax.vmap(lambda row: whitened(world, arrays, w, centre, spread, row, on))(u)
+    return z, doubts.sum((1, 2))
 
 
 def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Whitened residuals (T, N, C) of a candidate at coordinates u."""
-    return np.asarray(
-        _residual(*_constants(given), jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects)))
-    )
+    rows = jnp.tile(jnp.asarray(u), (ROWS, 1))
+    return np.asarray(_evaluated_at(*_constants(given), rows, jnp.asarray(_on(given, effects)))[0][0])
 
 
 @partial(jax.jit, static_argnames="num_properties")
@@ -199,12 +184,12 @@ def _raw(world, arrays, w, centre, spread, u, on):
 def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
     """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
     world, on = _constants(given)[0], jnp.asarray(_on(given, effects))
-    return _without(world, jnp.asarray(_extended(u)), on, given.num_properties)
+    return _without(world, jnp.asarray(u), on, given.num_properties)
 
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Residuals (T, N, C) in units of their channels."""
-    return np.asarray(_raw(*_constants(given), jnp.asarray(_extended(u)), jnp.asarray(_on(given, effects))))
+    return np.asarray(_raw(*_constants(given), jnp.asarray(u), jnp.asarray(_on(given, effects))))
 
 
 def _constants(given: Problem):
@@ -212,12 +197,9 @@ def _constants(given: Problem):
     return jax.tree.map(jnp.asarray, tree)
 
 
-def _extended(u: np.ndarray) -> np.ndarray:
-    return np.concatenate([u, [0.0]])
-
-
 def _on(given: Problem, effects: Sequence[str]) -> np.ndarray:
-    return np.array([float(s.effect.name in effects) for s in slots(given.num_properties)[0]])
+    names = {name_of(e) for e in effects}
+    return np.array([float(s.effect.name in names) for s in slots(given.num_properties)[0]])
 
 
 def neutral(given: Problem) -> np.ndarray:
@@ -232,9 +214,15 @@ def neutral(given: Problem) -> np.ndarray:
 
 
 def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
-    """Columns of the properties and of the named effects."""
-    mine = [np.arange(s.start, s.stop) for s in slots(given.num_properties)[0] if s.effect.name in effects]
-    return np.concatenate([np.arange(given.num_properties), *mine]).astype(int)
+    """Columns of the properties and of the parameters that effects' forms have free."""
+    out = [np.arange(given.num_properties)]
+    places = {s.effect.name: s for s in slots(given.num_properties)[0]}
+    for key in effects:
+        slot, names = places[name_of(key)], free_parameters(key)
+        out.append(
+            np.array([slot.start + j for j, p in enumerate(slot.effect.parameters) if p.name in names])
+        )
+    return np.concatenate(out).astype(int)
 
 
 def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -247,46 +235,75 @@ def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def fit(given: Problem, starts: Sequence[Start], steps: int = STEPS) -> list[Fitted]:
-    """Every start fitted by Levenberg-Marquardt, two at a time, in programs of two widths."""
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(lambda s: _fit_one(given, s, steps), starts))
+def fit(given: Problem, start: Start, steps: int = STEPS) -> Fitted:
+    """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
 
-
-def _fit_one(given: Problem, start: Start, steps: int) -> Fitted:
-    """One candidate; coordinates stay within their limits."""
-    mine = columns_of(given, start.effects)
-    columns = _padded(given, start.effects, mine)
+    Properties have normal priors, an effect's parameters together a Cauchy distribution.
+    """
+    mine, z = columns_of(given, start.effects), given.num_properties
     low, high = (edge[mine] for edge in limits(given))
-    u = _extended(start.u)
+    u = start.u.copy()
     u[mine] = np.clip(u[mine], low, high)
-    constants, there = _constants(given), given.whitening.weight > 0
-    on = jnp.asarray(_on(given, start.effects))
-
-    def evaluate(at):
-        z, doubt, push, lift = _linearised(*constants, jnp.asarray(at), on, jnp.asarray(columns))
-        z, push = np.asarray(z)[there], np.asarray(push)[there][:, : len(mine)]
-        doubt, lift = np.asarray(doubt), np.asarray(lift)[..., : len(mine)]
-        cost = 0.5 * float(z @ z) + float(doubt.sum()) + 0.5 * float(at[mine] @ at[mine])
-        return z, doubt, push, lift, cost
-
-    now, damping = evaluate(u), 1e-3
+    blocks, at = [], z
+    for key in start.effects:
+        blocks.append(np.arange(at, at + len(free_parameters(key))))
+        at += blocks[-1].size
+    now, damping = _evaluated(given, start.effects, u, mine, blocks), 1e-3
     for _ in range(steps):
-        z, _, push, lift, cost = now
-        slope = push.T @ z + lift.sum((0, 1)) + u[mine]
-        step = _bounded_step(u[mine], slope, push.T @ push + np.eye(len(mine)), damping, low, high)
+        prior = np.ones(mine.size)
+        for block in blocks:
+            x = u[mine[block]]
+            prior[block] = (1 + block.size) / (1 + x @ x)
+        slope = now.push.T @ now.residual + now.lift + prior * u[mine]
+        bend = now.push.T @ now.push + np.diag(prior)
+        step = _bounded_step(u[mine], slope, bend, damping, low, high)
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
-        new = evaluate(trial)
-        if np.isfinite(new[-1]) and new[-1] < cost:
-            u, now, damping = trial, new, damping / 5
-            if cost - new[-1] < 0.02:
+        new = _evaluated(given, start.effects, trial, mine, blocks)
+        if np.isfinite(new.cost) and new.cost < now.cost:
+            gained, u, now, damping = now.cost - new.cost, trial, new, damping / 5
+            if gained < CLOSE:
                 break
         else:
             damping *= 8
             if damping > 1e3:
                 break
-    return _fitted(given, start.effects, u[:-1], mine, *now)
+    return Fitted(start.effects, u, mine, now.residual, now.push, now.doubts, now.cost)
+
+
+class _Evaluated(NamedTuple):
+    residual: np.ndarray
+    doubts: float
+    push: np.ndarray
+    lift: np.ndarray
+    cost: float
+
+
+def _evaluated(
+    given: Problem, effects: tuple[str, ...], u: np.ndarray, mine: np.ndarray, blocks: list[np.ndarray]
+) -> _Evaluated:
+    """What a candidate leaves at coordinates u, and its derivatives by the columns `mine`.
+
+    They are differences over a small step: in double precision good to STEP of a usual deviation, and cheaper
+    to compile than derivatives.
+    """
+    there, constants, on = given.whitening.weight > 0, _constants(given), jnp.asarray(_on(given, effects))
+    rows = np.concatenate([u[None], u + STEP * np.eye(u.size)[mine]])
+    z, doubts = [], []
+    for at in range(0, len(rows), ROWS):
+        some = rows[at : at + ROWS]
+        some = np.concatenate([some, np.repeat(some[-1:], ROWS - len(some), 0)])
+        residual, doubt = _evaluated_at(*constants, jnp.asarray(some), on)
+        z.append(np.asarray(residual)[:, there])
+        doubts.append(np.asarray(doubt))
+    z, doubts = np.concatenate(z)[: len(rows)], np.concatenate(doubts)[: len(rows)]
+    push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
+    own = u[mine[: given.num_properties]]
+    cost = 0.5 * float(z[0] @ z[0]) + float(doubts[0]) + 0.5 * float(own @ own)
+    for block in blocks:
+        x = u[mine[block]]
+        cost += 0.5 * (1 + block.size) * float(np.log1p(x @ x))
+    return _Evaluated(z[0], float(doubts[0]), push, lift, cost)
 
 
 def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
@@ -294,60 +311,7 @@ def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
 
     Residuals are those that exist, in the order of the mask `whitening.weight > 0`.
     """
-    mine = columns_of(given, effects)
-    columns = jnp.asarray(_padded(given, effects, mine))
-    on = jnp.asarray(_on(given, effects))
-    push = _linearised(*_constants(given), jnp.asarray(_extended(u)), on, columns)[2]
-    return np.asarray(push)[given.whitening.weight > 0][:, : len(mine)]
-
-
-def _padded(given: Problem, effects: Sequence[str], mine: np.ndarray) -> np.ndarray:
-    """Columns `mine` of a candidate, filled up to one of two widths."""
-    extra = len(mine) - given.num_properties
-    if extra > LARGE:
-        raise ValueError(f"{'+'.join(effects)} has {extra} parameters; {LARGE} are provided for")
-    nothing = slots(given.num_properties)[1]  # the last column, which nothing reads
-    columns = np.full(given.num_properties + (SMALL if extra <= SMALL else LARGE), nothing)
-    columns[: len(mine)] = mine
-    return columns
-
-
-def _fitted(
-    given: Problem,
-    effects: tuple[str, ...],
-    u: np.ndarray,
-    columns: np.ndarray,
-    z: np.ndarray,
-    doubt: np.ndarray,
-    push: np.ndarray,
-    lift: np.ndarray,
-    cost: float,
-) -> Fitted:
-    """Quadratic forms by trial and subtask of a linearised residual, the cost of doubts included."""
-    frame, there = given.frame, given.whitening.weight > 0
-    trials, steps = there.shape[0], len(frame.steps)
-    cell = np.arange(trials)[:, None] * steps + frame.arrays.subtask
-    cell = np.broadcast_to(cell[..., None], there.shape)[there]
-    k = len(columns)
-    hessian, gradient, square = (
-        np.zeros((trials * steps, k, k)),
-        np.zeros((trials * steps, k)),
-        np.zeros(trials * steps),
-    )
-    for at in np.unique(cell):
-        mine = cell == at
-        j = push[mine]
-        hessian[at], gradient[at], square[at] = j.T @ j, j.T @ z[mine], z[mine] @ z[mine]
-    shape = (trials, steps)
-    return Fitted(
-        effects,
-        u,
-        columns,
-        hessian.reshape(*shape, k, k),
-        gradient.reshape(*shape, k) + lift,
-        square.reshape(shape) + 2 * doubt,
-        cost,
-    )
+    return _evaluated(given, tuple(effects), u, columns_of(given, effects), []).push
 
 
 def _bounded_step(

@@ -19,7 +19,6 @@ from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sampl
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
-BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
 PHASES = ("free", "pickup", "carry", "place", "slide")
 MAX_RATE = 30.0  # Hz; finer samples are averaged first
 TOUCHING = 5.0  # sds of a force by which a touch shows
@@ -299,8 +298,8 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, onehot: np.ndarray,
         link=np.ones(4),
         give_normal=np.full(2, 1 / pad.normal_stiffness),
         give_shear=np.full(2, 1 / pad.shear_stiffness),
-        delay=zero,
-        smoothing=zero,
+        delay=np.zeros(4),
+        smoothing=np.zeros(4),
         creep=zero,
         creep_time=np.ones(()),
         tilt=zero,
@@ -319,3 +318,8 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, onehot: np.ndarray,
         move=onehot,
         events=events,
     )
+
+
+def subtask_name(step: Subtask) -> str:
+    """A subtask as the interface names it, as `carry block1`."""
+    return step.name if step.object is None else f"{step.name} {step.object}"

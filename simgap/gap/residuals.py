@@ -171,16 +171,23 @@ def _step(world: World) -> jax.Array:
 
 
 def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
-    """Values (T, N, C) read `steps` samples later (a fraction allowed): cubic Catmull-Rom.
+    """Values (T, N, C) read `steps` samples later (a number or (C,), a fraction allowed): cubic Catmull-Rom.
 
     Where they have a corner between two samples, as at a contact change, both sides go straight on to it:
     before a contact there is no force yet. Sides that would not meet between the two are joined straight.
     """
-    n = values.shape[1]
-    whole = jnp.floor(steps)
-    s = steps - whole
+    return jax.vmap(_shifted, (2, 0), 2)(values, jnp.broadcast_to(steps, values.shape[2:]))
+
+
+def _around(values: jax.Array, steps: jax.Array) -> tuple[jax.Array, ...]:
+    """Four neighbours of (T, N) read `steps` samples later, and the fraction between the middle two."""
+    n, whole = values.shape[1], jnp.floor(steps)
     index = jnp.arange(n) + whole.astype(int)
-    p0, p1, p2, p3 = (values[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2))
+    return *(values[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2)), steps - whole
+
+
+def _shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
+    p0, p1, p2, p3, s = _around(values, steps)
     cubic = ((-p0 + 3 * p1 - 3 * p2 + p3) * s + (2 * p0 - 5 * p1 + 4 * p2 - p3)) * s + (p2 - p0)
     before, across, after = p1 - p0, p2 - p1, p3 - p2
     convex = after > before
@@ -208,7 +215,15 @@ def contact(world: World) -> jax.Array:
     """Forces (T, N, 4) of the contacts: before delay and low-pass, before they rang a mode, without loads."""
     force = _when(world, RINGING, lambda f: _driven(world, f, back=True), world.force)
     force = _when(world, LATE, lambda f: shifted(f, world.delay / _step(world)), force)
-    return _when(world, SMOOTH, lambda f: f + world.smoothing * _slope(world, f)[0], force) - world.load
+    return (
+        _when(world, SMOOTH, lambda f: f + _per_channel(world.smoothing) * _slope(world, f)[0], force)
+        - world.load
+    )
+
+
+def _per_channel(values: jax.Array) -> jax.Array:
+    """Values (C,), or one, to go with (T, N, C)."""
+    return jnp.reshape(values, (1, 1, -1))
 
 
 def _fivepoint(world: World, values: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -236,26 +251,32 @@ def _slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _filtered(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Forces (T, N, C) after low-pass (exact between samples for straight lines) and delay, and the variance
-    of what is read between two samples: a contact may have changed before or after."""
+    """Net force, grip and shear (T, N, 4) after each sensor's low-pass (exact between samples for straight
+    lines) and delay, and the variance of what is read between two samples: a contact may have changed before
+    or after, for both fingers at once."""
 
     def slow(f: jax.Array) -> tuple[jax.Array, jax.Array]:
         return lowpass(f, world.smoothing, _step(world)), _unsure(f, world.smoothing, _step(world))
 
     def late(f: jax.Array) -> tuple[jax.Array, jax.Array]:
         steps = world.delay / _step(world)
-        whole = jnp.floor(steps)
-        share, index = steps - whole, jnp.arange(f.shape[1]) - whole.astype(int)
-        new, old = (f[:, jnp.clip(index - k, 0, f.shape[1] - 1)] for k in (0, 1))
-        return (1 - share) * new + share * old, share * (1 - share) * jnp.square(EITHER * (new - old))
 
-    def prompt(f: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return f, jnp.zeros_like(f)
+        def one(f: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+            _, old, new, _, ahead = _around(f, -steps)  # read (1 - ahead) of a sample after the later one
+            return old + ahead * (new - old), jnp.sqrt(ahead * (1 - ahead) + 1e-12) * EITHER * (new - old)
+
+        return jax.vmap(one, (2, 0), 2)(f, jnp.broadcast_to(steps, f.shape[2:]))
 
     modes = jnp.asarray(world.modes)
-    smooth, jumps = jax.lax.cond(modes[SMOOTH] > 0, slow, prompt, force)
-    delayed, either = jax.lax.cond(modes[LATE] > 0, late, prompt, smooth)
-    return delayed, jumps + either
+    prompt = (force, jnp.zeros_like(force))
+
+    def fingers(net: jax.Array) -> tuple[jax.Array, jax.Array]:
+        each = jnp.concatenate([net[..., :2] / 2 + net[..., 2:], net[..., :2] / 2 - net[..., 2:]], -1)
+        smooth, jumps = jax.lax.cond(modes[SMOOTH] > 0, slow, lambda f: (f, jnp.zeros_like(f)), each)
+        delayed, either = jax.lax.cond(modes[LATE] > 0, late, lambda f: (f, jnp.zeros_like(f)), smooth)
+        return _net(delayed), jumps + jnp.square(_net(either))
+
+    return jax.lax.cond(modes[SMOOTH] + modes[LATE] > 0, fingers, lambda f: prompt, force)
 
 
 def _driven(world: World, force: jax.Array, back: bool) -> jax.Array:
@@ -292,11 +313,13 @@ def _when(world: World, mode: int, change: Callable[[jax.Array], jax.Array], val
 
 
 def _unsure(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
-    """Variance (T, N, C) behind a low-pass of what may have changed at any moment between two samples."""
-    ratio = step / jnp.maximum(time, 1e-4)
+    """Variance (T, N, 4) of net force, grip and shear behind the low-pass of each finger's force (T, N, 4),
+    from what may have changed at any moment between two samples, for both fingers at once."""
+    ratio = step / jnp.maximum(jnp.reshape(time, (1, 1, -1)), 1e-4)
     share = (1 - jnp.exp(-2 * ratio)) / (2 * ratio) - jnp.square((1 - jnp.exp(-ratio)) / ratio)
     change = jnp.concatenate([jnp.zeros_like(values[:, :1]), values[:, 1:] - values[:, :-1]], 1)
-    return faded(share * jnp.square(EITHER * change), 2 * ratio)
+    sd = EITHER * jnp.sqrt(jnp.maximum(share, 1e-12)) * change
+    return faded(jnp.square(_net(sd)), 2 * jnp.mean(ratio))
 
 
 def _relaxed(world: World, force: jax.Array) -> jax.Array:
@@ -316,18 +339,18 @@ def _between(world: World) -> jax.Array:
     """Variance (T, N, 4) [N^2] of forces before delay and low-pass, from how sharply they bend."""
 
     def rough(f: jax.Array) -> jax.Array:
-        steps, n = world.delay / _step(world), f.shape[1]
-        whole = jnp.floor(steps)
-        share = (steps - whole) * (1 - steps + whole)
-        index = jnp.arange(n) + whole.astype(int)
-        p0, p1, p2, p3 = (f[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2))
-        bend = jnp.maximum(jnp.abs(p2 - 2 * p1 + p0), jnp.abs(p3 - 2 * p2 + p1))
-        # A change that neither side goes on with may have come at any moment between the two samples.
-        jump = jnp.maximum(jnp.abs(p2 - p1) - jnp.maximum(jnp.abs(p1 - p0), jnp.abs(p3 - p2)), 0.0)
-        return jnp.square(BETWEEN * share * bend) + share * jnp.square(EITHER * jump)
+        def one(f: jax.Array, steps: jax.Array) -> jax.Array:
+            p0, p1, p2, p3, share = _around(f, steps)
+            share = share * (1 - share)
+            bend = jnp.maximum(jnp.abs(p2 - 2 * p1 + p0), jnp.abs(p3 - 2 * p2 + p1))
+            # A change that neither side goes on with may have come at any moment between the two samples.
+            jump = jnp.maximum(jnp.abs(p2 - p1) - jnp.maximum(jnp.abs(p1 - p0), jnp.abs(p3 - p2)), 0.0)
+            return jnp.square(BETWEEN * share * bend) + share * jnp.square(EITHER * jump)
+
+        return jax.vmap(one, (2, 0), 2)(f, jnp.broadcast_to(world.delay / _step(world), f.shape[2:]))
 
     def steep(f: jax.Array) -> jax.Array:
-        return jnp.square(CURVED * world.smoothing * _slope(world, f)[1])
+        return jnp.square(CURVED * _per_channel(world.smoothing) * _slope(world, f)[1])
 
     force = jnp.asarray(world.force)
     late = jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, rough, jnp.zeros_like, force)

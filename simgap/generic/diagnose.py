@@ -13,7 +13,6 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.model import SequenceModel
-from simgap.gap.judge import Calibration, joined, probabilities
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles
 from simgap.generic.effects import CANDIDATES, Scene, scene
@@ -23,6 +22,7 @@ from simgap.generic.locate import Located, locate
 from simgap.generic.report import effect_entry, listed_cells
 from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
 from simgap.generic.shrinkage import fraction, heldout, shrinkage, sizes
+from simgap.generic.verdict import joined, probabilities
 
 ALARM = 0.01  # chance that two ensembles alike are called different
 MOST = 6  # effects that may act together
@@ -189,7 +189,7 @@ def _conclude(
     left = float(np.clip(left, 0, 1)) if np.isfinite(left) else 0.0
     rest = locate(lay, real - best.shift, sim, seed).p_value
     evidence = {joined(f.effects): f.evidence(temperature) for f in found}
-    probability = probabilities(evidence, left, rest, Calibration(unknown_at=UNKNOWN))
+    probability = probabilities(evidence, left, rest, UNKNOWN)
     p, gap = located.p_value, located.p_value < ALARM
     if gap:
         excess = max(probability["none"] - p, 0.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -55,39 +54,13 @@ def test_a_plain_task_is_refused(tmp_path, shared, capsys):
     assert "virtual model" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("rig", "more", "said"),
-    [
-        ("force = 0.012", [], "key noise.force: missing"),
-        ("", ["--against"], "does not go with --against"),
-    ],
-)
-def test_calibration_is_refused_where_nothing_can_be_simulated(shared, tmp_path, capsys, rig, more, said):
+def test_healthy_recordings_do_not_go_with_simulated_ones(shared, capsys):
     folder = shared / "recordings/none_1"
-    (tmp_path / "rig.toml").write_text((folder / "rig.toml").read_text().replace(rig, ""))
-    args = ["diagnose", str(folder / "trial_01.csv"), "--task", str(folder / "task.toml"), "--rig",
-            str(tmp_path / "rig.toml"), "--calibrate"]  # fmt: skip
-    assert main([*args, *more, *([str(folder / "trial_02.csv")] if more else [])]) == 2
-    assert said in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_calibrated_bank_is_taken_from_the_cache(shared, tmp_path, monkeypatch, capsys):
-    from simgap.gap import own_bank
-    from simgap.gap.bank import load_bank
-
-    asked, bank = [], replace(load_bank(), reference=None)
-    monkeypatch.setattr(own_bank, "learned", lambda *args: asked.append(args) or bank)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = shared / "recordings/none_1"
-    args = ["diagnose", *(str(folder / f"trial_{k:02d}.csv") for k in (1, 2)), "--task",
-            str(folder / "task.toml"), "--rig", str(folder / "rig.toml"), "--calibrate", "--json",
-            str(tmp_path / "d.json")]  # fmt: skip
-    for _ in range(2):
-        assert main(args) == 0
-        assert json.loads((tmp_path / "d.json").read_text())["detection"]["bank"] == "calibrated"
-        assert "Judged by healthy simulations of this rig and task." in capsys.readouterr().out
-    assert len(asked) == 1
+    one, two, three = (str(folder / f"trial_{k:02d}.csv") for k in (1, 2, 3))
+    args = ["diagnose", one, "--task", str(folder / "task.toml"), "--rig", str(folder / "rig.toml"),
+            "--against", two, "--healthy", three]  # fmt: skip
+    assert main(args) == 2
+    assert "does not go with --against" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -39,6 +39,8 @@ CONTRACT = {
     "viscous_drag",
     "structural_vibration",
     "contact_impact",
+    "hand_roll",
+    "actual",
 }
 RIG = Rig(
     fingers={
@@ -92,8 +94,8 @@ def world_of(p: Performance) -> World:
         link=np.ones(4),
         give_normal=np.full(2, 1 / 4000),
         give_shear=np.full(2, 1 / 2500),
-        delay=zero,
-        smoothing=zero,
+        delay=np.zeros(4),
+        smoothing=np.zeros(4),
         creep=zero,
         creep_time=one,
         tilt=zero,

@@ -16,9 +16,6 @@ from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from simgap.effects import catalogue
-from simgap.gap.bank import load_bank
-from simgap.gap.candidate import scored
-from simgap.gap.fit import Start, fit, neutral, problem, slots
 from simgap.gap.frame import CHANNELS, build
 from simgap.gap.residuals import HELD, LOOSE, _firm
 from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
@@ -104,21 +101,3 @@ def test_a_dead_band_narrower_than_an_angles_noise_is_no_evidence():
     assert resolved is not None and rig.noise.angle is not None
     assert resolved({"width": 1.1 * rig.noise.angle}, rig)
     assert not resolved({"width": 0.9 * rig.noise.angle}, rig)
-
-
-def test_a_dead_band_that_no_sensor_resolves_is_no_candidate():
-    rig, task = read_rig(DEMO / "rig.toml"), read_task(DEMO / "task.toml")
-    trials = [read_trial(DEMO / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
-    aligned = align(trials, task, rig)
-    given = problem(build(trials, aligned, rig), load_bank().noise)
-    healthy, found = (fit(given, [Start(e, neutral(given))], steps=1)[0] for e in ((), ("backlash",)))
-    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == "backlash")
-
-    def evidence(width: float) -> float:
-        u = found.u.copy()
-        u[slot.start] = slot.effect.parameters[0].coordinate(width)
-        sure = replace(found, u=u, cost=found.cost - 500.0)  # however much it gains
-        return scored(given, sure, healthy, 1.0).evidence
-
-    assert rig.noise.angle is not None
-    assert evidence(2 * rig.noise.angle) > 100 and evidence(0.5 * rig.noise.angle) <= 0

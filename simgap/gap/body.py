@@ -1,0 +1,161 @@
+"""An attribution in the words of the interface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from simgap.attribution.attribute import Attribution, EffectPosterior
+from simgap.effects import catalogue
+from simgap.effects.base import Effect
+from simgap.gap.fit import Fitted
+from simgap.gap.frame import CHANNELS
+from simgap.gap.located import where
+from simgap.gap.search import Search
+
+PROPERTIES = ("weight", "width", "height")
+UNITS = {"weight": "N", "width": "m", "height": "m"}
+DRAWS = 2000
+LISTED = 8  # effects that are described
+TOLD = 0.5  # sd of the prior below which a property is told by the recordings
+
+
+def body(
+    found: Search, told: Attribution, causes: Fitted | None, following: dict | None, seed: int
+) -> dict[str, Any]:
+    """The JSON document of a diagnosis; `causes`: the joint fit of the named effects that shift signals."""
+    given, posterior = found.problem, told.effects
+    named = {n: e for n, e in posterior.items() if n in catalogue()}
+    ranked = sorted(named, key=lambda n: -named[n].probability)
+    shown = [n for k, n in enumerate(ranked) if k < LISTED or n in told.causes or n in told.indistinguishable]
+    effects = {n: _described(found, told, n, seed) for n in shown}
+    if len(told.causes) > 1:
+        effects["+".join(told.causes)] = {
+            "parameters": {f"{n}.{k}": p for n in told.causes for k, p in effects[n]["parameters"].items()},
+            "log_evidence": _evidence(told, told.causes),
+            "heldout_score": None,
+            "property_shift": _shifts(found, causes),
+        }
+    elif told.causes and causes is not None:
+        effects[told.causes[0]]["property_shift"] = _shifts(found, causes)
+    far = told.how_far
+    share = lambda e: {"probability": e.probability, "share": e.share, "interval_90": list(e.share_90)}  # noqa: E731
+    out = {
+        "verdict": told.verdict,
+        "causes": list(told.causes),
+        "indistinguishable": list(told.indistinguishable),
+        "probabilities": told.probabilities,
+        "detection": {
+            "p_value": told.detection.p_value,
+            "statistic": told.detection.statistic,
+            "resolution": told.detection.resolution,
+        },
+        "remainder": {
+            "share": told.remainder.share,
+            "p_value": told.remainder.p_value,
+            "where": where(given, told.remainder.where, None) if told.verdict != "none" else [],
+        },
+        "attribution": {n: share(e) for n, e in sorted(named.items(), key=lambda i: -i[1].probability)},
+        "where": where(given, told.where, causes) if told.verdict != "none" else [],
+        "effects": effects,
+        "noise": told.noise,
+        "shrinkage": None,
+        "next_experiment": following,
+    }
+    if far is not None:
+        ends = [x if np.isfinite(x) else None for x in far.interval_90]
+        out["shrinkage"] = {
+            "evaluated_on": "held-out trials", "before": far.before, "after": far.after,
+            "noise_floor": far.noise_floor, "fraction": far.fraction, "interval_90": ends,
+            "flexible_ceiling": None,
+        }  # fmt: skip
+    if told.small_gap is not None:
+        small = told.small_gap
+        metres = small.channel in ("x", "y", "distance", "offset")
+        unit = "m" if metres else "m/s" if small.channel in ("vx", "vy") else "N"
+        out["small_gap"] = {
+            "size": small.amount * _unit_of_noise(found, small.channel), "unit": unit,
+            "where": where(given, told.where, None),
+        }  # fmt: skip
+    return out
+
+
+def _unit_of_noise(found: Search, channel: str) -> float:
+    """A residual's usual noise in the channel's unit."""
+    arrays, c = found.problem.frame.arrays, CHANNELS.index(channel)
+    return float(np.median(arrays.sd[..., c][arrays.there[..., c] > 0]))
+
+
+def _described(found: Search, told: Attribution, name: str, seed: int) -> dict[str, Any]:
+    """Parameters and evidence of one effect."""
+    return {
+        "parameters": parameters(found, told.effects[name], name, seed),
+        "log_evidence": _evidence(told, (name,)),
+        "heldout_score": None,
+        "property_shift": {},
+    }
+
+
+def parameters(found: Search, posterior: EffectPosterior, name: str, seed: int) -> dict[str, Any]:
+    """An effect's parameters as the interface names them, from draws of their coordinates."""
+    effect, rng = catalogue()[name], np.random.default_rng(seed)
+    of = {p.name: p for p in effect.parameters}
+    spread = next((s for s in found.spreads if s.effect == name), None)
+    if spread is not None:
+        p = effect.parameters[0]
+        return {p.name: _summary(spread.value * np.exp(spread.log_sd * rng.standard_normal(DRAWS)), p.unit)}
+    draws, out = {}, {}
+    for key, p in posterior.parameters.items():
+        if key not in of:  # a property that was measured apart
+            return {key: _property(found, key, p.mean, p.sd)}
+        low, high = of[key].limits
+        u = np.clip(p.mean + p.sd * rng.standard_normal(DRAWS), low, high)
+        draws[key] = np.asarray(of[key].value(u))
+    for key, (values, unit) in _reported(effect, draws, found).items():
+        out[key] = _summary(values, unit)
+    return out
+
+
+def _reported(effect: Effect, draws: dict[str, np.ndarray], found: Search) -> dict[str, tuple]:
+    if effect.report is not None:
+        return effect.report(draws, found.problem.frame.rig)
+    return {p.name: (draws[p.name], p.unit) for p in effect.parameters if p.name in draws and not p.hidden}
+
+
+def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
+    low, high = np.percentile(values, (5, 95))
+    return {"mean": float(np.median(values)), "sd": float(np.std(values)),
+            "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
+
+
+def _property(found: Search, key: str, mean: float, sd: float) -> dict[str, Any]:
+    """By how much a measured property is off."""
+    name, kind = key.rsplit(".", 1)
+    o, k = found.problem.frame.task.objects.index(name), PROPERTIES.index(kind)
+    one = float(found.problem.spread[o, k])
+    low, high = ((mean + side * 1.645 * sd) * one for side in (-1, 1))
+    return {"mean": mean * one, "sd": sd * one, "interval_90": [low, high], "unit": UNITS[kind]}
+
+
+def _evidence(told: Attribution, names: tuple[str, ...]) -> float:
+    """Log posterior odds of an effect, or of several, to act [nats]."""
+    chance = min((told.effects[n].probability for n in names), default=0.0)
+    chance = float(np.clip(chance, 1e-12, 1 - 1e-12))
+    return float(np.log(chance / (1 - chance)))
+
+
+def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
+    """Properties as fitted without and with the causes, of those that the recordings tell."""
+    given = found.problem
+    if causes is None:
+        return {}
+    k = given.num_properties
+    before, after = (given.centre + given.spread * f.u[:k].reshape(-1, 3) for f in (found.healthy, causes))
+    known = (causes.push[:, :k] ** 2).sum(0).reshape(-1, 3) > 1 / TOLD**2
+    return {
+        f"{name}.{kind}": {"before": float(before[o, j]), "after": float(after[o, j]), "unit": UNITS[kind]}
+        for o, name in enumerate(given.frame.task.objects)
+        for j, kind in enumerate(PROPERTIES)
+        if known[o, j]
+    }

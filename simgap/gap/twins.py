@@ -1,0 +1,166 @@
+"""Healthy twins: this task, rig and pace, these blocks, grips and sensors, simulated and diagnosed alike.
+
+The statistic of a recording is a log Bayes factor; that of a healthy one exceeds s with a probability of
+exp(-s) at most, if the model is right. It is never quite right: twins tell by how much the factor is off for
+recordings like these (`simgap.attribution.detection.detected`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import hmmseg
+from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.jaxconfig import cache_folder
+from simgap.attribution.detection import statistic
+from simgap.attribution.posterior import forms, sought
+from simgap.gap.search import Search, search
+from simgap.gap.synthetic import performed, recorded
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block
+
+MOST = 8  # twins at most
+BATCH = 4  # twins that are simulated at once
+LEAST = 1e-3  # a property below that cannot be simulated [N, m]
+QUANTILES = (0.1, 0.9)  # of what was aligned, the range that an operator's settings are drawn from
+Progress = Callable[[str], None]
+
+
+def twin_statistics(
+    found: Search,
+    task: BlockTask,
+    rig: Rig,
+    actual: dict | None,
+    seed: int,
+    tell: Progress = lambda text: None,
+) -> Iterator[float]:
+    """Statistics of healthy twins of a search, one by one, from the cache where they are known.
+
+    Where this hand or these blocks cannot be simulated there are none.
+    """
+    file = _file(found, task, rig, actual, seed)
+    known: list[float] = []
+    with suppress(OSError, ValueError):
+        known = [float(v) for v in json.loads(file.read_text(encoding="utf-8"))]
+    yield from known
+    for start in range(len(known) - len(known) % BATCH, MOST, BATCH):
+        tell("simulating healthy twins")
+        try:
+            twins = _recorded(found, task, rig, range(start, start + BATCH), seed)
+        except (InputError, ValueError):
+            return
+        for k, trials in enumerate(twins, start):
+            if k < len(known):
+                continue
+            with suppress(InputError):  # a twin that drops its block is none
+                tell("diagnosing healthy twins")
+                known.append(healthy_statistic(trials, task, rig, actual))
+                _keep(file, known)
+                yield known[-1]
+
+
+def healthy_statistic(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None) -> float:
+    """The statistic of one healthy recording, through the whole search."""
+    f = forms(search(trials, task, rig, actual).gap)
+    return statistic(f, sought(f, 1))
+
+
+def own_healthy(
+    found: Search, healthy: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None
+) -> Iterator[float]:
+    """The statistics of a user's own healthy recordings, as many trials at a time as were diagnosed."""
+    size = min(found.problem.frame.num_trials, len(healthy))
+    for start in range(0, len(healthy) - size + 1, size):
+        yield healthy_statistic(healthy[start : start + size], task, rig, actual)
+
+
+def _recorded(found: Search, task: BlockTask, rig: Rig, which: range, seed: int) -> list[list[Trial]]:
+    """Recordings of as many trials each as were searched."""
+    trials, blocks = found.problem.frame.num_trials, blocks_of(found)
+    hand = rig.model_copy(update={"rate": _rate(found.trials)})
+    seeds = [seed + 7_000_000 + 1000 * k + j for k in which for j in range(trials)]
+    task = found.problem.frame.task if task.repeat == "unknown" else task
+    simulated = performed(task, hand, [blocks] * len(seeds), seeds, {}, settings(found))
+    every = [recorded(s, task, hand, {}) for s in simulated]
+    return [every[k : k + trials] for k in range(0, len(every), trials)]
+
+
+def blocks_of(found: Search) -> dict[str, Block]:
+    """The blocks as the fit without any effect has them; ValueError where one cannot be."""
+    given = found.problem
+    values = given.centre + given.spread * found.healthy.u[: given.num_properties].reshape(-1, 3)
+    if not (values > LEAST).all():
+        raise ValueError("a property that no block has")
+    return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}
+
+
+def settings(found: Search) -> OperatorSettings:
+    """An operator who works at the pace, and grips as hard, as was recorded."""
+    frame = found.problem.frame
+    usual, arrays, world = OperatorSettings(), frame.arrays, frame.world
+    grip, spans = [], dict[str, list[float]]()
+    for r in range(frame.num_trials):
+        n = frame.lengths[r]
+        for s, step in enumerate(frame.steps):
+            mine = arrays.subtask[r, :n] == s
+            t = world.t[r, :n][mine]
+            if mine.any():
+                spans.setdefault(step.name, []).append(float(t[-1] - t[0]))
+                if step.name == "carry":
+                    force = world.force[r, :n][mine]
+                    grip.append(float(np.median(force[:, 0] - force[:, 2]) / 2))
+
+    def between(values: Sequence[float], low: float) -> tuple[float, float]:
+        a, b = np.quantile(values, QUANTILES)
+        return float(max(a, low)), float(max(b, low))
+
+    pace = _carrying(usual) / max(float(np.median(spans.get("carry", [_carrying(usual)]))), 0.2)
+    out = replace(usual, pace=(pace, pace))
+    if grip:
+        out = replace(out, grip=between(grip, 0.3))
+    for name, own in (("pickup", "hold"), ("place", "place")):
+        if name in spans:
+            out = replace(out, **{own: between([v * pace for v in spans[name]], 0.02)})
+    return out
+
+
+def _carrying(usual: OperatorSettings) -> float:
+    """How long a carry usually lasts [s]."""
+    return float(
+        np.mean(usual.lift) + np.mean(usual.travel) + np.mean(usual.descend) + 2 * np.mean(usual.air)
+    )
+
+
+def _rate(trials: Sequence[Trial]) -> float:
+    return float(np.median([trial.rate for trial in trials]))
+
+
+def _file(found: Search, task: BlockTask, rig: Rig, actual: dict | None, seed: int) -> Path:
+    """Where statistics are kept: by recordings, task, rig, measurements, seed and version."""
+    digest = hashlib.sha256()
+    for trial in found.trials:
+        for name, values in sorted({"t": trial.t, **trial.channels}.items()):
+            digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    more = (repr(task), rig.model_dump_json(), repr(actual), str(seed), hmmseg.__version__)
+    digest.update("\n".join(more).encode())
+    return cache_folder() / "twins" / f"{digest.hexdigest()[:24]}.json"
+
+
+def _keep(file: Path, values: list[float]) -> None:
+    """A cache that cannot be written costs time and nothing else; nobody reads half a file."""
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside = file.with_name(f".{file.name}.{os.getpid()}")
+        beside.write_text(json.dumps(values), encoding="utf-8")
+        os.replace(beside, file)

@@ -1,0 +1,23 @@
+"""Residuals in units of their sensors' noise."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from simgap.gap.frame import Frame
+
+
+class Whitening(NamedTuple):
+    """Arrays of T trials, N samples, C channels, S subtasks: `weight` (T, N, C): 1 / standard deviation, 0
+    where there is nothing; `member` (T, N, S) one-hot."""
+
+    weight: np.ndarray
+    member: np.ndarray
+
+
+def whitening(frame: Frame) -> Whitening:
+    """The whitening of a frame's residuals."""
+    a = frame.arrays
+    return Whitening(np.where(a.there > 0, 1 / a.sd, 0.0), np.eye(len(frame.steps))[a.subtask])
