@@ -285,13 +285,6 @@ def _show(
         out.stage(out.report).write_text(page(body, setting, draw), encoding="utf-8")
 
 
-def cells_title(body: dict[str, Any]) -> str:
-    """What the cells of `where` are: a named cause's own, judged by a bank, or all that are significant."""
-    if body["causes"] and "bank" in body["detection"]:
-        return f"cells that {' and '.join(body['causes'])} shifted, largest share of the excess first"
-    return "where the gap is largest"
-
-
 def tables(body: dict[str, Any]) -> list[Table]:
     """Probabilities, parameters of the cause and the largest cells, for people to read."""
     likely = Table(title="probabilities", title_justify="left")
@@ -317,7 +310,7 @@ def tables(body: dict[str, Any]) -> list[Table]:
         following.add_row(f"expected to tell {', '.join(told['separates'])} apart, {gain}")
         out.append(following)
     if body["where"]:
-        cells = Table(title=cells_title(body), title_justify="left")
+        cells = Table(title="where the gap is largest", title_justify="left")
         for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
             cells.add_column(head, no_wrap=True)
         for row in body["where"][:8]:
