@@ -50,6 +50,19 @@ def _more(app, docname: str, source: list[str]) -> None:
     source[0] = source[0].replace("@more@", "\n".join(p for p in pages if p not in listed and p != "index"))
 
 
+def _as_rst(app, what, name, obj, options, lines: list[str]) -> None:
+    """Blocks of code in docstrings, indented by four after an empty line, as reStructuredText has them."""
+    out: list[str] = []
+    for line in lines:
+        indented = line.startswith("    ")
+        before = next((each for each in reversed(out) if each.strip()), "")
+        if indented and out and not out[-1].strip() and not before.startswith((" ", ">>>", "-", "::")):
+            out += ["::", ""]
+        out.append(line)
+    lines[:] = out
+
+
 def setup(app) -> None:
     """What Sphinx calls."""
     app.connect("source-read", _more)
+    app.connect("autodoc-process-docstring", _as_rst)

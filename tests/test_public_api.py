@@ -45,16 +45,38 @@ def test_importing_loads_nothing_heavy_and_leaves_jax_alone():
     assert run(code).strip() == "True"
 
 
-def test_a_process_whose_jax_is_single_precision_gets_the_same_answer():
-    code = (
-        "import os; os.environ.pop('JAX_ENABLE_X64', None); import jax, hmmseg; "
-        "assert not jax.config.jax_enable_x64; "
-        f"s = hmmseg.segment({str(STACK / 'trial_01.csv')!r}, {str(STACK / 'task.toml')!r}, "
-        f"{str(STACK / 'rig.toml')!r})[0]; assert not jax.config.jax_enable_x64; "
-        "assert jax.numpy.ones(1).dtype == 'float32'; print(s.log_evidence)"
-    )
-    here = segment(STACK / "trial_01.csv", STACK / "task.toml", STACK / "rig.toml")[0]
-    assert float(run(code)) == pytest.approx(here.log_evidence, rel=1e-12)
+SINGLE = """
+import os
+os.environ.pop("JAX_ENABLE_X64", None)
+import jax
+from estimation import identify
+from hmmseg import Task, align
+from simgap import VirtualModel, simulate
+assert not jax.config.jax_enable_x64
+aligned = align({trial!r}, {task!r}, {rig!r})
+found = identify(aligned)
+made = simulate({task!r}, {rig!r}, found, seed=3)[0]
+model = VirtualModel(aligned.rig, aligned.task, made.blocks, {{"block1": 0.13, "block2": 0.13}})
+force = model.step([[0.10, 0.02], [0.15, 0.02]], [[0.0, 0.0], [0.0, 0.0]], 0.001)
+assert not jax.config.jax_enable_x64 and jax.numpy.ones(1).dtype == "float32"
+print(aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean(),
+      made.trial.channels["fx1"].sum(), force[0, 0])
+"""
+
+
+def test_a_process_whose_jax_is_single_precision_gets_the_same_answers():
+    trial, task, rig = (str(STACK / name) for name in ("trial_01.csv", "task.toml", "rig.toml"))
+    single = [float(word) for word in run(SINGLE.format(trial=trial, task=task, rig=rig)).split()]
+    aligned = align(trial, task, rig)
+    found = estimation.identify(aligned)
+    made = simgap.simulate(task, rig, found, seed=3)[0]
+    model = simgap.VirtualModel(aligned.rig, aligned.task, made.blocks, {"block1": 0.13, "block2": 0.13})
+    force = model.step([[0.10, 0.02], [0.15, 0.02]], [[0.0, 0.0], [0.0, 0.0]], 0.001)
+    double = [
+        aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean(),
+        made.trial.channels["fx1"].sum(), force[0, 0],
+    ]  # fmt: skip
+    assert single == pytest.approx(double, rel=1e-9)
 
 
 def test_readers_take_paths_tables_and_arrays():
