@@ -6,8 +6,7 @@
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
 
 generate prints the seal's hash; diagnose reads user folders only and may be stopped and started again;
-score opens the seal, checks the hash, fits the true effects by force where the diagnosis did not, and
-writes all figures. docs/blind_check.md has the protocol.
+score opens the seal, checks the hash and writes all figures. docs/blind_check.md has the protocol.
 """
 
 from __future__ import annotations
@@ -16,13 +15,10 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 from experiments.blind_check.sealing import code_digest
 from experiments.blind_check.tables import table
-from experiments.saving import save
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "blind_check.json"
 
@@ -44,6 +40,7 @@ def main(args: Sequence[str] | None = None) -> int:
     run = steps.add_parser("diagnose")
     run.add_argument("--cases", type=Path, required=True)
     run.add_argument("--out", type=Path, required=True)
+    run.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after so long")
     judge = steps.add_parser("score")
     judge.add_argument("--sealed", type=Path, required=True)
     judge.add_argument("--results", type=Path, required=True)
@@ -79,19 +76,18 @@ def _untidy(given: argparse.Namespace) -> int:
 def _diagnose(given: argparse.Namespace) -> int:
     from experiments.blind_check.diagnose import diagnose_cases
 
-    diagnose_cases(given.cases, given.out, lambda k, n, text: _tell(f"{k}/{n} {text}"))
+    tell = lambda k, n, text: _tell(f"{k}/{n} {text}")  # noqa: E731
+    done = diagnose_cases(given.cases, given.out, tell, given.seconds)
+    print(f"the first {done} cases are diagnosed")
     return 0
 
 
 def _score(given: argparse.Namespace) -> int:
-    from experiments.blind_check.follow import follow
     from experiments.blind_check.score import score
 
-    oracles = _Oracles(given.sealed / "cases", given.results / "oracle")
-    again = partial(follow, progress=lambda name: _tell(f"again {name}"), first=given.first)
-    found = score(given.sealed, given.results, oracles, again, given.first)
+    found = score(given.sealed, given.results, given.first)
     given.json.parent.mkdir(parents=True, exist_ok=True)
-    save(given.json, found)
+    given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(table(found))
     print(f"\nSeal {found['seal']['sha256'][:12]} holds; diagnosed by code {found['code'][:12]}.")
     print(_published())
@@ -105,23 +101,6 @@ def _published() -> str:
     there, now = json.loads(RESULTS.read_text(encoding="utf-8")), code_digest()
     what = f"Published figures: set {there['seal']['sha256'][:12]}, code {there['code'][:12]}"
     return f"{what}: {'of this code.' if there['code'] == now else 'spent, the code has changed since.'}"
-
-
-class _Oracles:
-    """Fits of the true effects by force, kept in a folder."""
-
-    def __init__(self, cases: Path, folder: Path) -> None:
-        self.cases, self.folder = cases, folder
-
-    def __call__(self, case: str, effects: str) -> dict[str, Any]:
-        file = self.folder / f"{case}.json"
-        if not file.exists():
-            from experiments.blind_check.diagnose import oracle
-
-            self.folder.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(oracle(self.cases / case, effects)) + "\n", encoding="utf-8")
-            _tell(f"oracle {case}")
-        return json.loads(file.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -8,8 +8,9 @@ import numpy as np
 
 from experiments.blind_check.effects import CATALOGUE
 
-FLOOR = 5.0  # nats of held-out log-likelihood
+FLOOR = 5.0  # nats that an effect gains, its parameters paid for
 AFFECTED = 3.0  # standard deviations of a sample
+VISIBLE = 1.0  # the same, rms over a cell, of an effect that is not fitted
 # What these recordings cannot tell from a withheld effect (gap-effects.md; * only without actual.toml).
 PARTNERS = {
     "force_gain": ("fingertip_compliance*",),
@@ -34,26 +35,38 @@ def partners(entry: dict[str, Any]) -> set[str]:
     return {p.rstrip("*") for p in given if not (p.endswith("*") and entry["measured"])}
 
 
+def _sizes(entry: dict[str, Any], which: str) -> dict[str, np.ndarray]:
+    """Root mean square over trials (subtasks,) of a label's `shift` or `spread`, by channel."""
+    return {
+        channel: np.sqrt(np.mean([np.square(trial[channel]) for trial in entry[which]], axis=0))
+        for channel in entry[which][0]
+    }
+
+
 def affected_cells(entry: dict[str, Any]) -> set[tuple[str, str]]:
     """Cells (channel, subtask) whose mean shift, over the trials, is at least AFFECTED sd of a sample."""
-    out = set()
-    for channel in entry["shift"][0]:
-        rows = np.array([trial[channel] for trial in entry["shift"]])  # (trials, subtasks)
-        size = np.sqrt((rows**2).mean(0))
-        out |= {(channel, s) for s, z in zip(entry["subtasks"], size, strict=True) if z >= AFFECTED}
-    return out
+    return {
+        (channel, subtask)
+        for channel, size in _sizes(entry, "shift").items()
+        for subtask, z in zip(entry["subtasks"], size, strict=True)
+        if z >= AFFECTED
+    }
+
+
+def visible(entry: dict[str, Any]) -> bool:
+    """Whether the effects move any cell by VISIBLE standard deviations of a sample."""
+    return max(float(size.max()) for size in _sizes(entry, "spread").values()) >= VISIBLE
 
 
 def true_parameters(entry: dict[str, Any]) -> dict[str, float]:
-    """True values by the names that a diagnosis uses: prefixed by the effect where there are two."""
+    """True values by effect and parameter, of effects whose parameters mean what the contract's mean."""
     out = {}
     for name, values in entry["effects"].items():
-        if not CATALOGUE[name].scored:
+        if name not in CATALOGUE or not CATALOGUE[name].scored:
             continue
-        prefix = "" if len(entry["effects"]) == 1 else f"{name}."
         for key, value in values.items():
             if name == "structural_vibration" and key == "frequency":
                 rate = entry["world"]["rate"]
                 value = abs(value - rate * round(value / rate))  # known modulo aliases
-            out[prefix + key] = value
+            out[f"{name}.{key}"] = value
     return out

@@ -78,9 +78,11 @@ def _table(document: tomlkit.TOMLDocument, name: str) -> Table:
 
 
 def _pad(pads: Table, name: str, p: Mapping[str, Any]) -> str:
-    before = pads.get(name, float("inf"))
+    before, said = pads.get(name, float("inf")), ""
+    if name in pads:
+        said = pads[name].trivia.comment.lstrip("# ")  # type: ignore[union-attr]
     pads[name] = _number(p["mean"])
-    pads[name].comment(f"was {float(before):g}; {_told(p)}")
+    pads[name].comment(f"was {float(before):g}; {_told(p)}" + (f"; {said}" if said else ""))
     return f"fingertip.{name}"
 
 

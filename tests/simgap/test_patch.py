@@ -57,7 +57,8 @@ def test_the_rig_keeps_its_text_and_says_what_was_found():
     text = written["rig.toml"]
     assert text.startswith("# Our hand, measured in May.\nrate = 20.0\n[fingers.1]")
     changed = [a for a, b in zip(text.splitlines(), RIG.splitlines(), strict=False) if a != b]
-    assert changed == ["normal_stiffness = 1500.0 # was 4000; 90 % interval 1450 to 1550 N/m",
+    normal = "normal_stiffness = 1500.0 # was 4000; 90 % interval 1450 to 1550 N/m; from the data sheet"
+    assert changed == [normal,
                        "shear_stiffness = 900.0 # was 2500; 90 % interval 870 to 930 N/m"]  # fmt: skip
     rig = parse_rig(tomllib.loads(text))
     assert rig.fingertip.normal_stiffness == 1500.0

@@ -1,0 +1,134 @@
+"""One case judged: what is true, what was said, whether that is right."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from experiments.blind_check.truth import (
+    FLOOR,
+    affected_cells,
+    label,
+    partners,
+    true_parameters,
+    visible,
+)
+
+HEALTHY = ("healthy", "slight")
+HONEST = 0.3  # remainder beyond which a named cause does not hide an effect from outside
+# A diagnosis that ended in an error.
+NOTHING: dict[str, Any] = {
+    "verdict": "error",
+    "causes": [],
+    "indistinguishable": [],
+    "probabilities": {},
+    "attribution": {},
+    "where": [],
+    "effects": {},
+    "shrinkage": None,
+    "remainder": None,
+    "bic": "error",
+    "gains": {},
+}
+
+
+def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+    """A row of the results: the tables are made of rows alone."""
+    failed = "error" in found
+    if failed:
+        found = {**NOTHING, "seconds": found["seconds"], "error": found["error"]}
+    true, said, tier = sorted(entry["effects"]), sorted(found["causes"]), entry["tier"]
+    together = {*said, *found["indistinguishable"]}
+    rest = (found.get("remainder") or {}).get("share")
+    named = found["verdict"] in ("named", "set")
+    row: dict[str, Any] = {
+        "case": entry["case"],
+        "tier": tier,
+        "brackets": entry["brackets"],
+        "true": true,
+        "sizes": entry["sizes"],
+        "verdict": found["verdict"],
+        "said": said,
+        "partners": sorted(found["indistinguishable"]),
+        "remainder": rest,
+        "gain": _gain(entry, found),
+        "above": failed or _above(entry, found),
+        "right": found["verdict"] == "none" if tier in HEALTHY else named and said == true,
+        "right_set": set(true) <= together and len(said) == max(len(true), 1),
+        "probability": found["probabilities"].get(label(entry), 0.0),
+        "bic": found["bic"],
+        "seconds": found["seconds"],
+        "cells": _cells(entry, found),
+        "top": _top(entry, found),
+        "inclusion": _inclusion(entry, found),
+    }
+    if failed:
+        row["error"] = found["error"]
+    if tier == "outside":
+        row["right"] = found["verdict"] == "unknown" or (rest is not None and rest > HONEST)
+    if tier == "withheld":
+        shared = bool(together & _stand_ins(entry, found)) and len(said) == 1
+        row["right"] = found["verdict"] == "unknown" or shared or (rest is not None and rest > HONEST)
+    if tier == "dense":
+        row["dominant"] = bool(true) and max(entry["sizes"], key=lambda k: entry["sizes"][k]) in said
+    if tier in ("single", "pair", "dense") and named:
+        row["covered"] = _covered(entry, found)
+    return row
+
+
+def _gain(entry: dict, found: dict) -> float | None:
+    """Nats that the true effects by themselves gain, the least of them; None where it was not fitted."""
+    known = [found["gains"].get(n) for n in entry["effects"]]
+    return None if not known or None in known else float(min(known))  # type: ignore[type-var]
+
+
+def _above(entry: dict, found: dict) -> bool:
+    """Whether each true effect can be seen: by what it gains, else by what it shifts."""
+    gain = _gain(entry, found)
+    return visible(entry) if gain is None else gain >= FLOOR
+
+
+def _stand_ins(entry: dict, found: dict) -> set[str]:
+    """Effects that may stand for a withheld one."""
+    return partners(entry) if len(entry["effects"]) == 1 else set()
+
+
+def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
+    """Largest probability and whether it lies on what is true."""
+    known = {k: v for k, v in found["probabilities"].items() if k != "other"}
+    if not known:
+        return None
+    name = max(known, key=lambda k: known[k])
+    right = name == label(entry)
+    if entry["tier"] == "withheld":
+        right = right or name in _stand_ins(entry, found)
+    return float(known[name]), right
+
+
+def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
+    """Probability that each effect acts, and whether it does; of outside cases nothing is known."""
+    if entry["tier"] in ("outside", "withheld"):
+        return []
+    told = found.get("attribution") or {}
+    return [(float(a["probability"]), name in entry["effects"]) for name, a in told.items()]
+
+
+def _covered(entry: dict, found: dict) -> dict[str, bool]:
+    """Whether the 90 % interval of each true effect's parameter holds its value, where it was named."""
+    got = {}
+    for name in found["causes"]:
+        for key in (name, "+".join(sorted(found["causes"]))):
+            for k, p in found["effects"].get(key, {}).get("parameters", {}).items():
+                got[k if k.startswith(f"{name}.") else f"{name}.{k}"] = p["interval_90"]
+    return {
+        k: bool(got[k][0] <= v <= got[k][1])
+        for k, v in true_parameters(entry).items()
+        if k in got and None not in got[k]
+    }
+
+
+def _cells(entry: dict, found: dict) -> dict[str, Any]:
+    """Hits, false and missed cells."""
+    truly = affected_cells(entry)
+    where = (found.get("small_gap") or {}).get("where") or found["where"]
+    said = {(w["channel"], w["subtask"]) for w in where}
+    return {"hit": len(truly & said), "false": len(said - truly), "missed": len(truly - said)}

@@ -1,0 +1,90 @@
+"""Does a patched model reproduce recordings that took no part in it? Half of each set's trials judge.
+
+    python -m experiments.patch_heldout RECORDINGS
+
+For every folder of labelled recordings: `hmmseg diagnose --patch` on the first half of the trials, then the
+virtual model is driven by the motions of the other half, nominal and patched, and the forces it predicts
+are compared with those recorded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.saving import save
+from experiments.table_text import RESULTS, load, markdown
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segmentation.align import segment
+from simgap.gap.diagnose import diagnose
+from simgap.patch import files, replayed
+from simgap.world.properties import read_properties
+
+
+def measured(folder: Path) -> dict[str, Any]:
+    """Root mean square of the force residual [N] of held-out trials, nominal and patched."""
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    assert isinstance(task, BlockTask)
+    trials = [read_trial(f, rig) for f in sorted(folder.glob("trial_*.csv"))]
+    half = (len(trials) + 1) // 2
+    body = diagnose(trials[:half], task, rig).body
+    row: dict[str, Any] = {"recording": folder.name, "verdict": body["verdict"], "causes": body["causes"]}
+    written = files((folder / "rig.toml").read_text(encoding="utf-8"), body)
+    if not written:
+        return row
+    with tempfile.TemporaryDirectory(prefix="hmmseg-") as place:
+        for name, text in written.items():
+            (Path(place) / name).write_text(text, encoding="utf-8")
+        patched = read_rig(Path(place) / "rig.toml")
+        after = read_properties(Path(place) / "actual.toml", task)
+    shift = body["effects"]["+".join(body["causes"])]["property_shift"]
+    before = {n: _before(b, n, shift) for n, b in after.items()}
+    found = segment(trials[half:], task, rig)
+    sums: dict[str, list[float]] = {"nominal": [], "patched": []}
+    for trial, spans in zip(trials[half:], found, strict=True):
+        ends = [s.start for s in spans.spans[1:]]
+        for name, hand, blocks in (("nominal", rig, before), ("patched", patched, after)):
+            residual = replayed(trial, task, hand, blocks, ends).residual
+            sums[name].append(float(np.nanmean(residual**2)))
+    return row | {k: float(np.sqrt(np.mean(v))) for k, v in sums.items()}
+
+
+def _before(block: Any, name: str, shift: dict[str, Any]) -> Any:
+    from dataclasses import replace
+
+    mine = {k.partition(".")[2]: v["before"] for k, v in shift.items() if k.startswith(f"{name}.")}
+    return replace(block, **mine)
+
+
+def table() -> str | None:
+    """docs/gap_results.md: the held-out residuals."""
+    found = load("patch_heldout")
+    if found is None:
+        return None
+    head = ["recording", "causes named on the first half", "nominal model [N]", "patched model [N]"]
+    rows = []
+    for row in found["rows"]:
+        ends = [f"{row[k]:.3f}" if k in row else "" for k in ("nominal", "patched")]
+        rows.append([row["recording"], " + ".join(row["causes"]) or row["verdict"], *ends])
+    return markdown(head, rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", type=Path)
+    rows = []
+    for task in sorted(parser.parse_args().recordings.glob("*/task.toml")):
+        rows.append(measured(task.parent))
+        print(json.dumps(rows[-1]), flush=True)
+    save(RESULTS / "patch_heldout.json", {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
