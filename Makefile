@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: bench bench-watch before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -48,6 +48,16 @@ before-after: $(INSTALLED)  ## published numbers of release 0.1.0's code and of 
 	test -d $(BEFORE) || git worktree add $(BEFORE) c02f51d
 	$(BIN)/python -m experiments.before_after measure before --root $(BEFORE) --package commands $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.before_after measure after $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.write_tables
+
+bench: $(INSTALLED)  ## kernels beside hmmlearn and dynamax, stages of the commands; fills docs/benchmarks.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[bench]'
+	$(BIN)/python -m experiments.benchmarks.kernels
+	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
+	$(BIN)/python -m experiments.write_tables
+
+bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
+	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/

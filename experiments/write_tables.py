@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments import before_after, spent_sets, table_blind_check, table_gap
+from experiments import before_after, spent_sets, table_blind_check, table_gap, table_speed
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
@@ -160,6 +160,10 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/gap_results.md", "rigs", table_gap.rigs),
     ("docs/gap_results.md", "blind", table_blind_check.table),
     ("docs/history.md", "blind_sets", spent_sets.table),
+    ("docs/benchmarks.md", "kernels", table_speed.kernels),
+    ("docs/benchmarks.md", "smoothing", table_speed.smoothing),
+    ("docs/benchmarks.md", "commands", table_speed.commands),
+    ("docs/watch.md", "watch", table_speed.watch),
     ("docs/before_after.md", "before_after", before_after.table),
 )
 

@@ -183,7 +183,7 @@ def draw(by_lag: dict) -> None:
             line = axes.plot(lags, [by_lag[str(lag)][key] for lag in lags], marker, label=label)[0]
             axes.axhline(by_lag["off line"][key], color=line.get_color(), linestyle=":",
                          label=f"{label}, whole recording")  # fmt: skip
-        axes.set(xlabel="lag [s]", ylabel="error of a boundary [ms]", ylim=(0, None))
+        axes.set(xlabel="lag [s]", ylabel="error of a boundary [ms]", yscale="log", xlim=(-0.005, 2.4))
         axes.set_xscale("symlog", linthresh=0.05)
         axes.set_xticks(lags, [f"{lag:g}" for lag in lags])
         axes.legend()
