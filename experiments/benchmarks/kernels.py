@@ -3,8 +3,9 @@
     python -m experiments.benchmarks.kernels [--small]
 
 Writes experiments/results/benchmark_kernels.json. Every time is the least of several repeats on the
-processor's clock (wall time of a busy machine says little), one thread; ratios are to the limit, a plain loop over the
-band compiled by numba. A peer that is not installed (`pip install hmmseg[bench]`) is left out and said so.
+processor's clock (wall time of a busy machine says little), one thread; ratios are to the limit, a plain
+loop over the band compiled by numba. A peer that is not installed (`pip install hmmseg[bench]`) is left out
+and said so.
 """
 
 from __future__ import annotations
