@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.effects import catalogue, decoys, fitted, free_parameters, name_of
-from simgap.effects.base import Parameter
+from simgap.effects.base import Parameter, gradient, tips
 from simgap.gap.fit import Fitted, Problem, columns_of, derivatives, limits, neutral, residual_at, slots
 from simgap.gap.frame import CHANNELS, subtask_name
 from simgap.gap.spread import Spread
@@ -32,7 +34,7 @@ def gap_of(given: Problem, healthy: Fitted, fits: Sequence[Fitted], spreads: Seq
     measured apart."""
     k = given.num_properties
     start = healthy.residual - healthy.push @ healthy.u[:k]
-    nuisance = np.concatenate([-healthy.push, *_admitted(given, healthy)], 1)
+    nuisance = np.concatenate([-healthy.push, *_admitted(given, healthy), *_late_rates(given)], 1)
     candidates = [_shifting(given, f, start, healthy.push) for f in fits]
     candidates += [_spreading(s) for s in spreads]
     candidates += _measured(given, healthy.push)
@@ -120,6 +122,28 @@ def _measured(given: Problem, push: np.ndarray) -> list[Candidate]:
                 out.append(Candidate("actual", (f"{name}.{kind}",), nothing, nothing, usual,
                                      np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
                                      np.full(1, np.inf)))  # fmt: skip
+    return out
+
+
+def _late_rates(given: Problem) -> list[np.ndarray]:
+    """Columns (n, 1) of speeds read late by half a sample, and smoothed over one, by a drive's differences.
+
+    How a drive comes by its speeds rig.toml does not say: differences are as usual as a tachometer.
+    """
+    world, weight = given.frame.world, given.whitening.weight
+    tree = jax.tree.map(jnp.asarray, world)
+    step = float(np.median(np.diff(world.t[0])))
+    velocity = np.asarray(tips(tree)[1])
+    mean = (velocity[..., :2] + velocity[..., 2:]) / 2
+    rate = np.asarray(gradient(tree.t, jnp.asarray(mean)))
+    bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
+    out = []
+    for change, usual in ((rate, step / 2), (bend, step**2 / 2)):
+        column = np.zeros_like(weight)
+        for k, channel in enumerate(("vx", "vy")):
+            c = CHANNELS.index(channel)
+            column[..., c] = usual * change[..., k] * weight[..., c]
+        out.append(column[weight > 0][:, None])
     return out
 
 

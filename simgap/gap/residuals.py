@@ -21,6 +21,7 @@ from simgap.gap.frame import CHANNELS, Arrays
 TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # sds of the distance by which fingers must be nearer than the block is wide to touch it
 HELD = 0.1  # N; a grip below this holds nothing,
+CLOSED = 0.8  # share of its usual force by which a grip has closed: until then it pushes the block
 LOOSE = 0.35  # nor one below this share of its usual force: pads that let go slide by what shears they bear
 BETWEEN = 0.3  # of a bend, sd: a force read between samples
 CURVED = 0.5  # of the difference of two ways to take a slope, sd: how far it may be off
@@ -69,7 +70,10 @@ def residuals(
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + _sunk(world, load)
     y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
-    still = firm * (arrays.phase[..., 1] + place)
+    # Fingers that close push the block until both hold it: only then it rests.
+    lesser = jnp.minimum(force[..., 0], -force[..., 2])
+    both = _firm(lesser, held, jnp.asarray(arrays.onehot), CLOSED)
+    still = firm * both * (arrays.phase[..., 1] + place)
     onground = firm * world.ground
     offset, loose_offset = _in_grip(offset, firm * held, "offset", arrays, noise, world)
     x = _centred(x, arrays, still * _known(arrays, "x"), place)
@@ -102,11 +106,11 @@ def residuals(
     )
 
 
-def _firm(grip: jax.Array, held: jax.Array, moves: jax.Array) -> jax.Array:
+def _firm(grip: jax.Array, held: jax.Array, moves: jax.Array, loose: float = LOOSE) -> jax.Array:
     """How surely (T, N) a grip's pads hold the block rather than slide on it as they close or let go."""
     mine = moves * held[..., None]
     usual = jnp.einsum("tnm,tn->tm", mine, grip) / jnp.maximum(mine.sum(1), 1.0)
-    least = jnp.maximum(HELD, LOOSE * jnp.einsum("tnm,tm->tn", moves, usual))
+    least = jnp.maximum(HELD, loose * jnp.einsum("tnm,tm->tn", moves, usual))
     return jax.nn.sigmoid((grip / least - 1) * 6)
 
 
