@@ -25,9 +25,9 @@ class RobotEffect:
     """One candidate. `parameters` by short name, neutral at their nominal; it reads, commands or models.
 
     `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
-    `alter` gives channels that depend on others. `command` maps a whole recording to one whose commands are
-    as the drives took them. `model` maps short names to the simulator's parameters. What is `fitted` is
-    fitted along with every cause and is none itself.
+    `alter` gives several channels or such as depend on others, `restore` undoes it on a whole log. `command`
+    maps a whole recording to one whose commands are as the drives took them. `model` maps short names to the
+    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself.
     """
 
     name: str
@@ -37,9 +37,15 @@ class RobotEffect:
     read: Read | None = None
     undo: Read | None = None
     alter: Alter | None = None
+    restore: Command | None = None
     command: Command | None = None
     model: Mapping[str, str] = field(default_factory=dict)
     fitted: bool = False
+
+    @property
+    def undoes(self) -> bool:
+        """Whether starts are read through it, so that it is undone before they are."""
+        return self.undo is not None or self.restore is not None
 
     @property
     def reads(self) -> bool:

@@ -16,9 +16,10 @@ from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robots.borne_out import borne_out, folds_of
 from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.gap import fitted_along, gap_of
-from simgap.robots.heldout import Shrinkage, borne_out, folds_of, shrinkage
+from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
 from simgap.robots.judge import Verdict, judge
 from simgap.robots.linear import Linear, linearise
@@ -121,11 +122,12 @@ def diagnose(
     kinds = {n: c.kind for n, c in simulator.channels.items()}
     cov = covariances(linear, composed.windows, kinds, twins.factor)
     sensor = cov.whitener()
-    causes = tuple(usable.index(n) for n in borne)
+    causes = tuple(sorted(usable.index(n) for n in borne))
     f = forms(gap_of(composed, linear, cov.whitener(off), parts, usable))
     s = forms(gap_of(composed, linear, sensor, parts, usable))
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
-    verdict = judge(f, s, causes, null, rng, bool(forced))
+    told_apart = fold[rows] if off and len(recordings) >= 3 else None
+    verdict = judge(f, s, causes, null, rng, bool(forced), told_apart)
     far = None
     if verdict.causes:
         tell("how far")

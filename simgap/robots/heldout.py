@@ -1,4 +1,4 @@
-"""What stretches of logs that took no part say: whether they bear a cause out, how far the gap shrinks."""
+"""How far the gap shrinks on stretches of logs that took no part."""
 
 from __future__ import annotations
 
@@ -8,59 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from simgap.attribution.posterior import Forms, fitted, forms, sought
-from simgap.attribution.problem import Gap
+from simgap.attribution.posterior import forms, sought
+from simgap.robots.borne_out import borne_out
 from simgap.robots.linear import Linear, base_at
 from simgap.robots.model import Composed, Point
 from simgap.robots.search import Found, moved_to, point_of
 from simgap.robots.whiten import Whitener
-
-FOLDS = 6
-BORNE_OUT = 0.05  # chance of held-out gains as good without any
-
-
-def folds_of(linear: Linear, num_logs: int) -> np.ndarray:
-    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches."""
-    if num_logs >= 3:
-        return linear.rows.log % min(num_logs, FOLDS)
-    stretches = max(2, FOLDS // num_logs)
-    out = np.zeros(linear.rows.log.size, int)
-    for log in range(num_logs):
-        mine = linear.rows.log == log
-        window = linear.rows.window[mine]
-        first, count = int(window.min()), int(np.ptp(window)) + 1
-        out[mine] = log * stretches + (window - first) * stretches // count
-    return np.unique(out, return_inverse=True)[1]
-
-
-def _log_likelihood(f: Forms, gap: Gap, effects: Sequence[int], x: np.ndarray) -> float:
-    """Of held-out rows at parameters x, the background averaged over."""
-    from simgap.attribution.posterior import _taken
-
-    taken = _taken(f, tuple(effects))
-    return float(f.background.marginal(taken.energy(x), f.count, taken.shift)[0].sum())
-
-
-def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> tuple[int, ...]:
-    """Of a set's effects those that held-out rows bear out beside the others; the least one goes first."""
-    kept = tuple(sorted(effects))
-    numbers = np.unique(fold)
-    while kept and numbers.size >= 2:
-        sets = [kept, *(tuple(j for j in kept if j != out) for out in kept)]
-        score = np.zeros((numbers.size, len(sets)))
-        for k, number in enumerate(numbers):
-            inside = fold == number
-            train, judge = forms(gap.taken(~inside)), forms(gap.taken(inside))
-            for i, effects in enumerate(sets):
-                score[k, i] = _log_likelihood(judge, gap, effects, fitted(train, effects).x)
-        gain = score[:, :1] - score[:, 1:]
-        mean, sd = gain.mean(0), np.maximum(gain.std(0, ddof=1), 1e-9) / np.sqrt(numbers.size)
-        chance = student.sf(mean / sd, numbers.size - 1)
-        worst = int(chance.argmax())
-        if chance[worst] < BORNE_OUT:
-            break
-        kept = sets[1 + worst]
-    return kept
 
 
 @dataclass(frozen=True)

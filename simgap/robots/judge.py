@@ -14,7 +14,9 @@ from simgap.attribution.detection import Detection, statistic
 from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import LEAST, MOST, WIDTH
+from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
 
+RIVALS = 8  # sets that are compared on held-out rows
 TWENTY = 20.0  # to one: odds from which on a rival is ruled out
 
 
@@ -52,6 +54,7 @@ def judge(
     twins: Sequence[float],
     rng: np.random.Generator,
     forced: bool = False,
+    fold: np.ndarray | None = None,
 ) -> Verdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
     `causes` were borne out by held-out rows; `twins` are healthy twins' statistics."""
@@ -93,6 +96,8 @@ def judge(
         verdict = "unknown"
         if kept and left <= MOST:
             partners = _partners(models, causes, kept)
+            if fold is not None:
+                partners = tuple(sorted({*partners, *_not_told_apart(f, models, causes, kept, fold)}))
             verdict = "set" if partners else "named"
     told = kept if verdict in ("named", "set") else ()
     noise = np.ones(len(gap.rows.channels))
@@ -127,6 +132,34 @@ def _partners(models: Sequence[Model], causes: tuple[int, ...], told: tuple[int,
         if gone and gone <= set(told) and m.score > best - np.log(TWENTY):
             found |= set(m.effects) - set(causes)
     return tuple(sorted(found))
+
+
+def _not_told_apart(
+    f: Forms, models: Sequence[Model], causes: tuple[int, ...], told: tuple[int, ...], fold: np.ndarray
+) -> set[int]:
+    """Effects that take a told cause's place and that held-out rows do not tell from it, though all rows
+    together seem to: where the model is off by itself, its likelihood is no judge of small differences."""
+    best = next(m for m in models if m.effects == causes)
+    found: set[int] = set()
+    rivals_of = [
+        m for m in models if len(set(causes) - set(m.effects)) == 1 and len(m.effects) == len(causes)
+    ]
+    for m in [m for m in rivals_of if set(causes) - set(m.effects) <= set(told)][:RIVALS]:
+        apart = log_prior(f, m) - log_prior(f, best)
+        if apart > -np.log(TWENTY) and chance_of_gain(f.gap, causes, m.effects, fold) > BORNE_OUT:
+            found |= set(m.effects) - set(causes)
+    return found
+
+
+def log_prior(f: Forms, model: Model) -> float:
+    """Log prior of a set's parameters at its mode, constants left out (Cauchy; see `Candidate`)."""
+    at, out = f.gap.nuisance.shape[1], 0.0
+    for j in model.effects:
+        k = f.gap.candidates[j].at.size
+        x = model.x[at : at + k]
+        out -= 0.5 * (1 + k) * float(np.log1p(x @ x))
+        at += k
+    return out
 
 
 def _left(f: Forms, effects: tuple[int, ...]) -> np.ndarray:

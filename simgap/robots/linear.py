@@ -152,7 +152,7 @@ def _rows_at(
         run = run_all(composed.simulator, composed.jobs(moved, base.begun))
         return composed.rows.averaged(composed.read(run, moved))
     out = composed.rows.averaged(composed.read(base.true, moved))
-    if effect.undo is not None:
+    if effect.undoes:
         for old, new, mine in zip(base.begun, composed.starts(moved), composed.rows.of, strict=True):
             if old is not None and new is not None:
                 for state, change in starts.items():

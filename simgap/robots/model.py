@@ -112,15 +112,17 @@ class Composed:
 
     def unread(self, point: Point) -> list[Recording] | None:
         """The recordings with read-outs' effects undone, None where none acts."""
-        acting = [(e, v) for e, v in self._acting(point) if e.undo is not None]
+        acting = [(e, v) for e, v in self._acting(point) if e.undoes]
         if not acting:
             return None
         out = list(self.recordings)
         for effect, theta in reversed(acting):
             for i, log in enumerate(out):
-                values = log[effect.channel]
-                assert effect.undo is not None
-                out[i] = log.with_columns({effect.channel: effect.undo(log.t - log.t[0], values, theta)})
+                if effect.restore is not None:
+                    out[i] = effect.restore(log, theta)
+                if effect.undo is not None:
+                    values = effect.undo(log.t - log.t[0], log[effect.channel], theta)
+                    out[i] = log.with_columns({effect.channel: values})
         return out
 
     def _acting(self, point: Point) -> list[tuple[RobotEffect, dict[str, float]]]:

@@ -1,0 +1,84 @@
+"""Real tosses of a cube against MuJoCo's model of it with the published parameters.
+
+    python -m experiments.real.contactnets FOLDER [--output FILE.json]
+
+FOLDER holds tosses.csv and source_params.json (DAIRLab/contact-nets). Every toss is a log of the cube's pose;
+the model is built from the published mass, side, friction and inertia. TOSSES of them, evenly chosen, are
+taken: windows are begun anew at every change of contact.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from experiments.real.on_folder import run_on_folder
+from experiments.real.robot_gap import summary
+from simgap.robots.diagnose import diagnose
+from simgap.simulators.mjcf.load import load_mjcf
+
+RESULTS = Path(__file__).resolve().parents[1] / "results" / "contactnets.json"
+TOSSES = 24
+SOURCE_UNIT = 0.0524  # m: half of the published side
+POSE = {"x": "x", "y": "y", "z": "z", "qw": "qw", "qx": "qx", "qy": "qy", "qz": "qz"}
+
+
+def model_text(params: dict) -> str:
+    """The cube on a board, as MJCF, by the published parameters (given in units of SOURCE_UNIT)."""
+    half = SOURCE_UNIT
+    inertia = params["inertia"] * SOURCE_UNIT**2
+    return f"""<mujoco model="cube">
+  <option timestep="0.0016891892" integrator="implicitfast" cone="elliptic" gravity="0 0 -9.81"/>
+  <worldbody>
+    <geom name="board" type="plane" size="2 2 0.1" friction="{params["mu"]} 0.005 0.0001"/>
+    <body name="cube">
+      <freejoint name="pose"/>
+      <inertial pos="0 0 0" mass="{params["mass"]}" diaginertia="{inertia:.6g} {inertia:.6g} {inertia:.6g}"/>
+      <geom name="box" type="box" size="{half} {half} {half}" friction="{params["mu"]} 0.005 0.0001"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def map_text() -> str:
+    """Which column is which component of the cube's pose."""
+    return "".join(f'[columns.{c}]\nbody = "cube"\naxis = "{a}"\n' for c, a in POSE.items())
+
+
+def write_inputs(folder: Path, into: Path, count: int = TOSSES) -> list[Path]:
+    """Model, map and one CSV a toss in `into`; paths of the tosses."""
+    params = json.loads((folder / "source_params.json").read_text(encoding="utf-8"))
+    (into / "cube.xml").write_text(model_text(params), encoding="utf-8")
+    (into / "map.toml").write_text(map_text(), encoding="utf-8")
+    tosses = pd.read_csv(folder / "tosses.csv")
+    numbers = np.unique(tosses.toss)
+    chosen = numbers[np.linspace(0, numbers.size - 1, min(count, numbers.size)).round().astype(int)]
+    out = []
+    for number in chosen:
+        path = into / f"toss_{number:03d}.csv"
+        tosses[tosses.toss == number][["t", *POSE]].to_csv(path, index=False)
+        out.append(path)
+    return out
+
+
+def run(folder: Path, count: int = TOSSES) -> dict:
+    """The diagnosis of the tosses."""
+    with tempfile.TemporaryDirectory() as into:
+        paths = write_inputs(folder, Path(into), count)
+        loaded = load_mjcf(Path(into) / "cube.xml", Path(into) / "map.toml")
+        logs = [loaded.read(p) for p in paths]
+        return summary(diagnose(loaded.simulator, logs, more=loaded.effects(logs), tell=print))
+
+
+def main() -> None:
+    """Run on a folder and write the results."""
+    run_on_folder(__doc__ or "", run, RESULTS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""What rows that took no part say of a cause: whether they bear it out, whether they tell it from another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import t as student
+
+from simgap.attribution.posterior import Forms, _taken, fitted, forms
+from simgap.attribution.problem import Gap
+from simgap.robots.linear import Linear
+
+FOLDS = 6
+BORNE_OUT = 0.05  # chance of held-out gains as good without any
+
+
+def folds_of(linear: Linear, num_logs: int) -> np.ndarray:
+    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches."""
+    if num_logs >= 3:
+        return linear.rows.log % min(num_logs, FOLDS)
+    stretches = max(2, FOLDS // num_logs)
+    out = np.zeros(linear.rows.log.size, int)
+    for log in range(num_logs):
+        mine = linear.rows.log == log
+        window = linear.rows.window[mine]
+        first, count = int(window.min()), int(np.ptp(window)) + 1
+        out[mine] = log * stretches + (window - first) * stretches // count
+    return np.unique(out, return_inverse=True)[1]
+
+
+def held_out_scores(gap: Gap, sets: Sequence[tuple[int, ...]], fold: np.ndarray) -> np.ndarray:
+    """Log likelihood (folds, sets) of each fold's rows, every set fitted to the others."""
+    numbers = np.unique(fold)
+    out = np.zeros((numbers.size, len(sets)))
+    for k, number in enumerate(numbers):
+        inside = fold == number
+        train, judge = forms(gap.taken(~inside)), forms(gap.taken(inside))
+        for i, effects in enumerate(sets):
+            out[k, i] = _log_likelihood(judge, effects, fitted(train, effects).x)
+    return out
+
+
+def _log_likelihood(f: Forms, effects: tuple[int, ...], x: np.ndarray) -> float:
+    """Of rows at parameters x, the background averaged over."""
+    taken = _taken(f, effects)
+    return float(f.background.marginal(taken.energy(x), f.count, taken.shift)[0].sum())
+
+
+def _chances(gain: np.ndarray) -> np.ndarray:
+    """Chance (sets,) of gains (folds, sets) as good without any: one-sided t test over folds."""
+    sd = np.maximum(gain.std(0, ddof=1), 1e-9) / np.sqrt(len(gain))
+    return student.sf(gain.mean(0) / sd, len(gain) - 1)
+
+
+def chance_of_gain(gap: Gap, one: tuple[int, ...], other: tuple[int, ...], fold: np.ndarray) -> float:
+    """Chance that a set gains as much over another on held-out rows without being any better."""
+    score = held_out_scores(gap, [one, other], fold)
+    return float(_chances(score[:, :1] - score[:, 1:])[0])
+
+
+def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> tuple[int, ...]:
+    """Of a set's effects those that held-out rows bear out beside the others; the least one goes first."""
+    kept = tuple(sorted(effects))
+    while kept and np.unique(fold).size >= 2:
+        sets = [kept, *(tuple(j for j in kept if j != out) for out in kept)]
+        score = held_out_scores(gap, sets, fold)
+        chance = _chances(score[:, :1] - score[:, 1:])
+        worst = int(chance.argmax())
+        if chance[worst] < BORNE_OUT:
+            break
+        kept = sets[1 + worst]
+    return kept
