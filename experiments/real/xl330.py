@@ -58,7 +58,7 @@ class Pendulum:
         "direction_friction": {"nominal": 0.0, "sd": 0.02, "unit": "N m"},
         "current_fade": {"nominal": 0.0, "sd": 0.2, "unit": "1", "low": -0.9, "high": 0.9},
         "quadratic_drag": {"nominal": 0.0, "sd": 1e-3, "unit": "N m s^2/rad^2", "low": 0.0},
-        "spring": {"nominal": 0.0, "sd": 0.02, "unit": "N m/rad"},
+        "spring": {"nominal": 0.0, "sd": 0.02, "unit": "N m/rad", "low": 0.0},
         "joint_zero": {"nominal": 0.0, "sd": 0.01, "unit": "rad"},
     }
     says = {  # noqa: RUF012

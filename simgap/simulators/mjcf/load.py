@@ -81,6 +81,9 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     for name in candidates:
         setting_of(plain, name)
     address = _add_sensors(mujoco, spec, described.columns)
+    for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
+        if hasattr(body, "simple"):
+            body.simple = False
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     simulator, warnings = _simulator(mujoco, model, described, address)
