@@ -91,3 +91,6 @@ check-gap: $(INSTALLED)  ## diagnose a small sealed set of another simulator's r
 	rm -rf $(CHECKED)
 	$(BIN)/python -m experiments.blind_check diagnose --cases $(SEALED)/cases --out $(CHECKED)
 	$(BIN)/python -m experiments.blind_check score --sealed $(SEALED) --results $(CHECKED) --json $(CHECKED)/score.json
+
+fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, in process (some minutes)
+	PYTHONPATH=tests $(BIN)/python -m experiments.fuzz --cases 100000 --keep build/fuzz

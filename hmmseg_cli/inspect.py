@@ -10,6 +10,7 @@ from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg.io.schema import parse_toml
 from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, check_file
 
 FilesArgument = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of any kind.")]
@@ -49,22 +50,13 @@ def _extended(rig_file: Path, found: list[Any]) -> str:
     if len(proposed) > 1:
         raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
     text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""
-    now = parse_rig(_toml(text, rig_file), str(rig_file))
+    now = parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
     table = proposed[0].split("\n", 1)[0]
     if (table == "[columns]" and now.columns) or (table == "[topics]" and now.topics):
         raise InputError(f"--write {rig_file}", f"already has {table}", "a rig without it")
     text = f"{text.rstrip()}\n\n{proposed[0]}".lstrip()
-    parse_rig(_toml(text, rig_file), str(rig_file))
+    parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
     return text
-
-
-def _toml(text: str, path: Path) -> dict[str, Any]:
-    import tomllib
-
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise InputError(str(path), f"not valid TOML: {error}") from None
 
 
 def _show(out: Output, found: Any) -> None:

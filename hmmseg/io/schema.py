@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 import typing
 from pathlib import Path
@@ -17,6 +18,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Deviation = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(min_length=1, max_length=500, strict=True)]
 MAX_TOML_BYTES = 1_000_000
+DEEPEST = 32  # parts of a dotted key
+SEPARATOR, JOINT = re.compile(r"[=,{}\[\]\n]"), re.compile(r"[\w\"'-]\s*\.(?=\s*[\w\"'-])")
 
 
 class StrictTable(BaseModel):
@@ -77,16 +80,23 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             content = file.read(MAX_TOML_BYTES + 1)
-        if len(content) > MAX_TOML_BYTES:
-            raise InputError(str(path), f"larger than {MAX_TOML_BYTES} bytes", "a TOML file")
-        return tomllib.loads(content.decode("utf-8"))
-    except InputError:
-        raise
+        text = content.decode("utf-8")
     except FileNotFoundError:
         raise InputError(str(path), "no such file", "a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"cannot be read ({error})", "a TOML file") from None
+    if len(content) > MAX_TOML_BYTES:
+        raise InputError(str(path), f"larger than {MAX_TOML_BYTES} bytes", "a TOML file")
+    return parse_toml(text, str(path))
+
+
+def parse_toml(text: str, where: str) -> dict[str, Any]:
+    """Table of a TOML text; InputError for a malformed or hostile one."""
+    if any(len(JOINT.findall(token)) > DEEPEST for token in SEPARATOR.split(text)):
+        raise InputError(where, "not valid TOML: nested too deeply")  # it would take tomllib gigabytes
+    try:
+        return tomllib.loads(text)
     except RecursionError:
-        raise InputError(str(path), "not valid TOML: nested too deeply") from None
+        raise InputError(where, "not valid TOML: nested too deeply") from None
     except ValueError as error:  # malformed, or a number of thousands of digits
-        raise InputError(str(path), f"not valid TOML: {error}") from None
+        raise InputError(where, f"not valid TOML: {error}") from None

@@ -9,13 +9,13 @@ noise = 0.01            # sd of a sample, in that unit; learned from the log whe
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hmmseg.errors import InputError, nearest
+from hmmseg.io.schema import read_toml
 from hmmseg.io.units import si_factor
 
 THINGS = ("joint", "actuator", "sensor", "body", "site")
@@ -63,12 +63,7 @@ class Map:
 
 def read_map(path: Path) -> Map:
     """The map of a TOML file; InputError names the key at fault."""
-    if not path.is_file():
-        raise InputError(f"--map {path}", "no such file", "a TOML file")
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(str(path), f"is no TOML ({error})") from None
+    raw = read_toml(path)
     for key in raw:
         if key not in TOP:
             raise InputError(f"{path}: {key}", "unknown key", nearest(key, TOP))

@@ -1,0 +1,211 @@
+"""Bad input: each gives its one line, nothing is half-written, and an interrupted run leaves nothing."""
+
+import io
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.actual import read_actual
+from experiments.fuzz import run
+from hmmseg.errors import InputError
+from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg_cli.main import main
+
+CORPUS = tomllib.loads((Path(__file__).parents[1] / "data/bad/corpus.toml").read_text(encoding="utf-8"))[
+    "case"
+]
+READERS = {
+    "trial": lambda path: read_trial(path, parse_rig({})),
+    "gripper": lambda path: read_trial(path, parse_rig({"gripper": {}})),
+    "rig": read_rig,
+    "task": read_task,
+    "actual": lambda path: read_actual(path, ("a", "b")),
+}
+STACK = Path(__file__).parents[1] / "data/stack"
+TASK = """[objects.block1]
+on = "block2"
+[objects.block2]
+on = "ground"
+[[moves]]
+object = "block1"
+to = "ground"
+[[moves]]
+object = "block2"
+to = "block1"
+"""
+
+
+def told(call, *arguments):
+    """The line that a call gives."""
+    with pytest.raises(InputError) as error:
+        call(*arguments)
+    line = str(error.value)
+    assert "\n" not in line
+    assert len(line) < 2000
+    return line
+
+
+@pytest.mark.parametrize("case", CORPUS, ids=[case["file"] for case in CORPUS])
+def test_each_bad_file_gives_its_line(case, tmp_path):
+    path = tmp_path / case["file"]
+    path.write_text(case["content"], encoding="utf-8")
+    line = told(READERS[case["as"]], path)
+    assert line.startswith(str(path))
+    assert re.search(case["line"], line), line
+
+
+class Exploding:
+    """What runs when it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("exploded",)
+
+
+def pickled(path):
+    np.savez(path, t=np.arange(9.0), x1=np.array([Exploding()], dtype=object))
+
+
+def bare_pickle(path):
+    path.write_bytes(pickle.dumps(Exploding()))
+
+
+def zip_bomb(path):
+    """An array that claims a thousand times what the file holds."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (2_000_000_000,)}
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bomb:
+        bomb.writestr("t.npy", header.getvalue() + bytes(50_000_000))
+
+
+def huge_claim(path):
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("t.npy", header.getvalue() + bytes(80))
+
+
+def climbing(path):
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("../../escaped.npy", b"x")
+
+
+@pytest.mark.parametrize("make", [pickled, bare_pickle, zip_bomb, huge_claim, climbing])
+def test_a_hostile_npz_is_refused_and_runs_nothing(make, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "t.npz"
+    make(path)
+    told(read_trial, path, parse_rig({}))
+    assert [each.name for each in tmp_path.iterdir()] == ["t.npz"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet", ".hdf5", ".mcap", ".bag", ".toml"])
+def test_a_folder_a_loop_and_nothing_are_no_file(suffix, tmp_path):
+    folder, loop, absent = (tmp_path / f"{name}{suffix}" for name in ("folder", "loop", "absent"))
+    folder.mkdir()
+    loop.symlink_to(loop)
+    for path in (folder, loop, absent):
+        reader = read_rig if suffix == ".toml" else READERS["trial"]
+        assert str(path) in told(reader, path)
+
+
+def test_toml_bombs(tmp_path):
+    for content in (
+        "a = " + "[" * 100_000,
+        "a" + ".a" * 100_000 + " = 1",
+        "x = 1\n" * 400_000,
+        "a = " + "9" * 100_000,
+    ):
+        path = tmp_path / "bomb.toml"
+        path.write_text(content)
+        told(read_rig, path)
+        told(read_task, path)
+
+
+def test_a_symlink_out_of_a_data_set_is_read_as_the_file_it_is(tmp_path):
+    outside = tmp_path / "outside.csv"
+    outside.write_text("t,x\n" + "".join(f"{k},{k}\n" for k in range(20)))
+    link = tmp_path / "link.csv"
+    link.symlink_to(outside)
+    assert read_trial(link, None, read_task_of(["a"])).t.size == 20
+
+
+def read_task_of(sequence):
+    from hmmseg.io.task import parse_task
+
+    return parse_task({"sequence": sequence})
+
+
+def test_damaged_files_give_a_result_or_a_line():
+    """A subset of `make fuzz`."""
+    found = run(cases=1200, seed=int.from_bytes(b"ci", "big"))
+    assert not found["failures"], found["failures"][0]["trace"]
+    assert found["outcomes"]["refused"] > 100
+
+
+def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("task.toml").write_text(TASK)
+    Path("bad.csv").write_text("t,x1\n0,zero\n")
+    before = sorted(tmp_path.rglob("*"))
+    hand = ["--task", "task.toml", "--rig", str(STACK / "rig.toml")]
+    for command in (
+        ["segment", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--write", "w"],
+        ["identify", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--report", "r.html"],
+        ["inspect", "bad.csv", "--write", "bad.toml", "--json", "a.json"],
+        ["simulate", *hand, "--properties", "bad.csv", "--output", "s"],
+    ):
+        assert main(command) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1, lines
+        assert sorted(tmp_path.rglob("*")) == before
+
+
+def identify_command(folder, output, seed="3"):
+    trials = [str(STACK / f"trial_0{k}.csv") for k in (1, 2)]
+    return [sys.executable, "-m", "hmmseg_cli.main", "identify", *trials, "--task", str(folder / "task.toml"),
+            "--rig", str(STACK / "rig.toml"), "--json", str(output), "--quiet", "--seed", seed]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_interrupted_at_any_moment_nothing_is_left(how, tmp_path):
+    (tmp_path / "task.toml").write_text(TASK)
+    rng = np.random.default_rng(int(how))
+    for moment in rng.uniform(0.05, 6.0, 5):
+        out = tmp_path / "out.json"
+        process = subprocess.Popen(identify_command(tmp_path, out), stderr=subprocess.PIPE, text=True)
+        try:
+            process.wait(moment)
+        except subprocess.TimeoutExpired:
+            process.send_signal(how)
+        _, err = process.communicate(timeout=120)
+        if out.exists():  # it was done by then: whole
+            import json
+
+            json.loads(out.read_text())
+            out.unlink()
+        assert "Traceback" not in err
+        assert [path.name for path in tmp_path.iterdir()] == ["task.toml"]
+
+
+@pytest.mark.slow
+def test_two_runs_in_one_folder_and_the_same_seed(tmp_path):
+    (tmp_path / "task.toml").write_text(TASK)
+    names = ["a.json", "b.json"]
+    both = [subprocess.Popen(identify_command(tmp_path, tmp_path / name)) for name in names]
+    assert [process.wait(300) for process in both] == [0, 0]
+    first, second = ((tmp_path / name).read_text() for name in names)
+    assert first == second
