@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.numbers import estimate, interval, shown_as
 from hmmseg_cli.console import (
     ActualOption,
     FiguresOption,
@@ -35,7 +33,8 @@ from hmmseg_cli.diagnose_robot import (
     SimulatorOption,
     diagnose_robot,
 )
-from hmmseg_cli.finding import sentence
+from simgap.report.finding import sentence
+from simgap.report.tables import tables
 
 EffectOption = Annotated[
     list[str] | None,
@@ -267,8 +266,8 @@ def _show(
 ) -> None:
     """Figures where asked for, and the page, from the body alone; `signal` draws the recorded one."""
     from hmmseg.contact.decompose import subtasks
-    from hmmseg_cli.figures.gap import draw_all, draw_how_far
     from hmmseg_cli.gap_report import Setting, page
+    from simgap.report.figures import draw_all, draw_how_far
 
     names = list(dict.fromkeys(f"{s.name} {s.object or ''}".strip() for s in subtasks(task)))
 
@@ -283,45 +282,3 @@ def _show(
     if out.report is not None:
         setting = Setting(files, names, pads or {}, measured, shows or {}, out.warnings)
         out.stage(out.report).write_text(page(body, setting, draw), encoding="utf-8")
-
-
-def tables(body: dict[str, Any]) -> list[Table]:
-    """Probabilities, parameters of the cause and the largest cells, for people to read."""
-    likely = Table(title="probabilities", title_justify="left")
-    likely.add_column("candidate", no_wrap=True)
-    likely.add_column("probability", justify="right")
-    for name, value in sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]:
-        likely.add_row(name, f"{value:.3f}")
-    out = [likely]
-    if body["causes"]:
-        values = Table(title="parameters", title_justify="left")
-        for head in ("parameter", "estimate", "90 % interval"):
-            values.add_column(head, no_wrap=True)
-        for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
-            low, high = p["interval_90"]
-            shown = shown_as(p["unit"])
-            values.add_row(name, estimate(p["mean"], p["sd"], shown), interval(low, high, shown))
-        out.append(values)
-    if body["next_experiment"] is not None:
-        following = Table(title="next experiment", title_justify="left", show_header=False)
-        told = body["next_experiment"]
-        gain = f"by {told['expected_gain_nats']:.0f} nats at least"
-        following.add_row(told["do"])
-        following.add_row(f"expected to tell {', '.join(told['separates'])} apart, {gain}")
-        out.append(following)
-    if body["where"]:
-        cells = Table(title="where the gap is largest", title_justify="left")
-        for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
-            cells.add_column(head, no_wrap=True)
-        for row in body["where"][:8]:
-            low, high = row["band"]
-            cells.add_row(
-                row["trial"],
-                row["channel"],
-                row["subtask"],
-                f"{low:g}-{high:g}",
-                f"{100 * row['share']:.0f} %",
-                f"{row['z']:.1f}",
-            )
-        out.append(cells)
-    return out

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg_cli.console import Output, check_folder
-from hmmseg_cli.finding import sentence
+from simgap.report.finding import sentence
 
 if TYPE_CHECKING:
     from simgap.robots.diagnose import RobotDiagnosis

@@ -10,8 +10,8 @@ from typing import Any
 
 from hmmseg.numbers import SHOWN, between, estimate, interval, percent, plain, property_shown_as, shown_as
 from hmmseg_cli import finding
-from hmmseg_cli.causes import plain_name
 from hmmseg_cli.pages import embedded, rendered
+from simgap.report.causes import plain_name
 
 Body = Mapping[str, Any]
 MOST = 8  # rows of a table

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hmmseg.contact.decompose import subtasks
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
+from hmmseg.tables import as_html, as_text
 from simgap.attribution.attribute import ALARM, Attribution, attribute
 from simgap.attribution.posterior import Model, forms, sought
 from simgap.attribution.problem import Gap
@@ -25,13 +29,15 @@ from simgap.gap.search import Search, search
 from simgap.gap.spread import spreads
 from simgap.gap.tolerance import properties_tolerated, tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
+from simgap.report.finding import sentence
+from simgap.report.tables import tables
 
 STAGES = 12  # that `progress` is told of, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """Everything found; `body` is the JSON document's. Arrays are for figures and tests.
 
@@ -52,6 +58,31 @@ class Diagnosis:
     def problem(self) -> Problem:
         """Aligned trials and their whitening."""
         return self.search.problem
+
+    def to_json(self) -> dict[str, Any]:
+        """The body of `diagnose`'s JSON document."""
+        return self.body
+
+    def __repr__(self) -> str:
+        return "\n".join([sentence(self.body), *(as_text(table) for table in tables(self.body))])
+
+    def _repr_html_(self) -> str:
+        head = f"<p>{html.escape(sentence(self.body))}</p>"
+        return head + "".join(as_html(table) for table in tables(self.body))
+
+    def plot_where(self, path: str | Path | None = None):
+        """Share of the gap by channel and subtask; the axes. Saved where a path is given."""
+        from simgap.report.figures import draw_heat_map
+
+        steps = subtasks(self.problem.frame.task)
+        names = list(dict.fromkeys(f"{step.name} {step.object or ''}".strip() for step in steps))
+        return draw_heat_map(self.body, names, None if path is None else Path(path))
+
+    def plot_causes(self, path: str | Path | None = None):
+        """Whether each effect acts and what share of the gap it explains; the axes."""
+        from simgap.report.figures import draw_suspects
+
+        return draw_suspects(self.body, None if path is None else Path(path))
 
 
 @double_precision

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
-from hmmseg_cli.causes import _told, checks, plain_name
-from hmmseg_cli.finding import headline, moving, remains, sentences, to_do
 from hmmseg_cli.gap_report import Setting, page
 from simgap.effects import catalogue
+from simgap.report.causes import _told, checks, plain_name
+from simgap.report.finding import headline, moving, remains, sentences, to_do
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
 

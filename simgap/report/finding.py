@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hmmseg.numbers import between, estimate, percent, plain, shown_as
-from hmmseg_cli.causes import checks, plain_name
+from simgap.report.causes import checks, plain_name
 
 Body = Mapping[str, Any]
 CHANNELS = {

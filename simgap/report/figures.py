@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from hmmseg.plot.style import BLUE, GREY, RED, canvas
-from hmmseg_cli.causes import plain_name
-from hmmseg_cli.finding import CHANNELS, by_place, share_of
+from simgap.report.causes import plain_name
+from simgap.report.finding import CHANNELS, by_place, share_of
 
 Body = Mapping[str, Any]
 
@@ -23,7 +24,7 @@ def draw_all(body: Body, subtasks: Sequence[str], path: Callable[[str], Path]) -
         draw_how_far(body, path("gap_before_after.png"))
 
 
-def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path) -> None:
+def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None) -> Axes:
     """Share of the gap by channel and subtask, all trials together: the numbers of the table."""
     cells = by_place(body)
     channels = [*CHANNELS, *sorted({k[0] for k in cells} - set(CHANNELS))]
@@ -48,9 +49,10 @@ def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path) -> None:
                 axes.text(column, row, text, ha="center", va="center", color=colour)
         figure.colorbar(shown, label="share of the gap [%]")
         axes.set_title("Where recording and model part (blank: nothing stands out of the noise)")
+    return axes
 
 
-def draw_suspects(body: Body, path: Path) -> None:
+def draw_suspects(body: Body, path: Path | None = None) -> Axes:
     """Whether each suspect acts, and the share of the gap that it explains; else the probabilities."""
     told = body.get("attribution")
     if told:
@@ -74,6 +76,7 @@ def draw_suspects(body: Body, path: Path) -> None:
         axes.set_yticks(at, [plain_name(name) for name, _ in rows])
         axes.set(xlim=(0, 1.02))
         axes.legend(loc="lower right")
+    return axes
 
 
 def draw_how_far(body: Body, path: Path) -> None:
