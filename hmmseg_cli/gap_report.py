@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hmmseg.numbers import SHOWN, between, estimate, interval, percent, plain, property_shown_as, shown_as
-from hmmseg_cli import finding
 from hmmseg_cli.pages import embedded, rendered
+from simgap.report import finding
 from simgap.report.causes import plain_name
 
 Body = Mapping[str, Any]
