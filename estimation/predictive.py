@@ -73,5 +73,6 @@ def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> Predictive
         excess[name] = float(np.median(share) * np.mean(np.abs(d.unit[mine])))
         repeats[name] = int(d.repeats()[c])
         if p_values[name] < SMALL:
-            warnings.append(f"{MEANING[name]} by more than sensor noise (p {p_values[name]:.3f})")
+            size = f"{excess[name]:.2g} N" if c == 0 else f"{1e6 * excess[name]:.2g} um"
+            warnings.append(f"{MEANING[name]} by {size} beyond sensor noise; intervals allow for it")
     return PredictiveCheck(p_values, excess, repeats, tuple(warnings))

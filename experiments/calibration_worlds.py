@@ -26,7 +26,7 @@ from experiments.scoring import boundaries_covered, boundary_residuals
 from experiments.sweeps.cells import Cell
 from experiments.sweeps.trials import GRASP_SPREAD, disturbed, recording_rig, scene
 from hmmseg.io.rig import Fingertip, Noise, Rig, Systematic
-from hmmseg.io.task import BlockTask
+from hmmseg.io.task import BlockTask, parse_task
 from hmmseg.io.trial import Trial
 from simgap.gap.synthetic import recorded
 from simgap.world.operator import OperatorSettings
@@ -98,7 +98,9 @@ def task_of(blocks: int) -> BlockTask:
     names = [f"b{k}" for k in range(blocks)]
     under = {name: on for name, on in zip(names, [*names[1:], "ground"], strict=True)}
     moves = [{"object": name, "to": "ground" if k == 0 else names[k - 1]} for k, name in enumerate(names)]
-    return BlockTask.model_validate({"objects": {n: {"on": on} for n, on in under.items()}, "moves": moves})
+    task = parse_task({"objects": {n: {"on": on} for n, on in under.items()}, "moves": moves})
+    assert isinstance(task, BlockTask)
+    return task
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,7 @@ def replicates(row: Row, num: int) -> Iterator[Replicate]:
     """`num` replicates of a row; each number the same whatever its company."""
     task, nominal = task_of(row.blocks), _rig(row)
     numbers = range(FIRST, FIRST + num)
-    true = replace(row, softer=row.softer)
-    done = _performed(row.cell.pace, row.pads * true.softer, row.blocks, row.trials, num)
+    done = _performed(row.cell.pace, row.pads * row.softer, row.blocks, row.trials, num)
     sensors = recording_rig(row.cell, nominal)
     for i, number in enumerate(numbers):
         mine = done[i * row.trials : (i + 1) * row.trials]

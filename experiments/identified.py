@@ -1,9 +1,10 @@
 """Properties of recorded cases against what is true of them: errors, z-scores, intervals.
 
-    python -m experiments.identified FOLDER... [--rig rig_pads.toml] [--pooled 4] [--untold]
+    python -m experiments.identified FOLDER... [--rig rig_pads.toml] [--pooled 1] [--keep]
 
 A case's trials are estimated in groups of `--pooled` (all of them by default). Prints a row for each
-property, then z and coverage by folder, healthy cases and others apart; --json keeps the rows.
+property, then z and coverage by folder, healthy cases and others apart; --keep writes these summaries to
+experiments/results/identified.json, which docs/calibration.md shows.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from experiments.saving import save
 from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
 
 Row = dict[str, Any]
+RESULTS = Path(__file__).parent / "results" / "identified.json"
 
 
 def rows_of(folder: Path, rig: str, pooled: int | None, seed: int = 0) -> Iterator[Row]:
@@ -114,11 +116,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rig", default="rig.toml", help="the rig file of each case to believe")
     parser.add_argument("--pooled", type=int)
     parser.add_argument("--only", nargs="*", help="cases to take")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="every row, for a closer look")
+    parser.add_argument("--keep", action="store_true", help=f"put the summaries into {RESULTS.name}")
     options = parser.parse_args(arguments)
-    document: dict[str, list[Row]] = {}
+    every: dict[str, list[Row]] = {}
     for folder in options.folders:
-        rows = document.setdefault(folder.name, [])
+        rows = every.setdefault(folder.name, [])
         for path in list_cases(folder):
             chosen = not options.only or path.name in options.only
             if not chosen or not (path / options.rig).exists():
@@ -126,14 +129,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for row in rows_of(path, options.rig, options.pooled):
                 rows.append(row)
                 print(line(row), flush=True)
-        for name, kind in (("healthy", ("none",)), ("unlabelled", ("unlabelled",)), ("other", None)):
-            mine = [
-                r for r in rows
-                if (r["effect"] in kind if kind else r["effect"] not in ("none", "unlabelled"))
-            ]  # fmt: skip
-            print(*summary_lines(f"{folder.name}, {name}", summary(mine)), sep="\n", flush=True)
-        if options.json is not None:
-            save(options.json, document)
+        kept = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+        for kind in ("healthy", "unlabelled", "other"):
+            found = summary([r for r in rows if _kind(r) == kind])
+            size = "all trials" if options.pooled is None else f"{options.pooled} a time"
+            name = f"{folder.name}, {kind}, {options.rig.removesuffix('.toml')}, {size}"
+            if found:
+                kept[name] = found
+                print(*summary_lines(name, found), sep="\n", flush=True)
+        if options.keep:
+            RESULTS.write_text(json.dumps(kept, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if options.json is not None:
+        options.json.write_text(json.dumps(every, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _kind(row: Row) -> str:
+    return {"none": "healthy", "unlabelled": "unlabelled"}.get(row["effect"], "other")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from estimation.sampler import sample
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "sbc.json"
+CHUNKS, CHUNK = HERE.parent / "build" / "sbc", 25  # ranks are kept, so that a run goes on where it stopped
 SETS, DRAWS, BINS, SEED = 1000, 99, 20, 7
 MEAN_SD = np.array([4e-3, 5e-6, 1e-5])  # of one mean, by channel [N, m, m]: as at 20 Hz
 UNIT = np.array([0.5, 1.4e-3, 2e-4])  # what shares of model error are taken of [N, m, m]
@@ -107,25 +108,41 @@ def summary(ranks: np.ndarray) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def ranked(first: int, num: int) -> list[dict[str, Any]]:
+    """Ranks of a chunk of data sets, one property of each kind from each; kept in CHUNKS.
+
+    One, as blocks of a data set share their deviations.
+    """
+    path = CHUNKS / f"{first:05d}_{num}.json"
+    if path.exists():
+        return json.loads(path.read_text(encoding="utf-8"))
+    out = []
+    for number in range(first, first + num):
+        ranks, props, method = ranks_of(number)
+        out.append({"method": method} | {prop: int(ranks[props.index(prop)]) for prop in PROPERTIES})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(out) + "\n", encoding="utf-8")
+    return out
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of this experiment."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=SETS)
+    parser.add_argument("--fresh", action="store_true", help="forget the ranks that were kept")
     options = parser.parse_args(arguments)
-    began, one = time.process_time(), {prop: [] for prop in PROPERTIES}
-    methods: dict[str, int] = {}
-    for number in range(options.sets):
-        ranks, props, method = ranks_of(number)
-        methods[method] = methods.get(method, 0) + 1
-        if method == "not converged":
-            continue
-        for prop in PROPERTIES:  # one a data set: blocks of one share their deviations
-            one[prop].append(int(ranks[props.index(prop)]))
-        if number % 100 == 99:
-            print(f"{number + 1} data sets, {time.process_time() - began:.0f} s", flush=True)
+    if options.fresh:
+        for path in CHUNKS.glob("*.json"):
+            path.unlink()
+    began, rows = time.process_time(), []
+    for first in range(0, options.sets, CHUNK):
+        rows += ranked(first, min(CHUNK, options.sets - first))
+        print(f"{len(rows)} data sets, {time.process_time() - began:.0f} s", flush=True)
+    methods = {m: sum(r["method"] == m for r in rows) for m in sorted({r["method"] for r in rows})}
+    good = [r for r in rows if r["method"] != "not converged"]
     document = {
-        "sets": options.sets, "draws": DRAWS, "methods": methods, "seconds": time.process_time() - began,
-        "properties": {prop: summary(np.array(ranks)) for prop, ranks in one.items()},
+        "sets": options.sets, "draws": DRAWS, "methods": methods,
+        "properties": {prop: summary(np.array([r[prop] for r in good])) for prop in PROPERTIES},
     }  # fmt: skip
     for prop, s in document["properties"].items():
         print(f"{prop:7} {s['count']} ranks, p {s['p_value']:.3f}, 68 %: {100 * s['coverage_68']:.1f}, "

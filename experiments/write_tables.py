@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments import before_after, spent_sets, table_blind_check, table_gap, table_speed
+from experiments import before_after, spent_sets, table_blind_check, table_calibration, table_gap, table_speed
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
@@ -153,6 +153,10 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/results.md", "real", real),
     ("docs/calibration.md", "ablation", ablation),
     ("docs/calibration.md", "calibration", calibration),
+    ("docs/calibration.md", "identified", table_calibration.identified),
+    ("docs/calibration.md", "worlds", table_calibration.worlds),
+    ("docs/calibration.md", "sbc", table_calibration.sbc),
+    ("docs/calibration.md", "reference", table_calibration.reference),
     ("docs/calibration.md", "moves", moves),
     ("docs/calibration.md", "misfits", misfits),
     ("docs/results.md", "gap", table_gap.summary),

@@ -79,6 +79,8 @@ def run(
     out.print(properties_table(body, measured))
     for key, reason in body["reasons"].items():
         out.print(f"{key}: {reason}")
+    for note in body.get("notes", ()):
+        out.print(note)
     if out.figures is not None:
         from hmmseg_cli.figures.identification import draw_all
 

@@ -41,7 +41,7 @@ def identification_page(
         warnings=warnings, measured=measured is not None, rows=_rows(body, measured), figures=figures,
         trials=[_trial(i, s, t, g, found)
                 for i, (s, t, g) in enumerate(zip(signals, trials, segmentations, strict=True))],
-        sampler=body["sampler"], predictive=_checks(body.get("predictive")),
+        sampler=body["sampler"], predictive=_checks(body.get("predictive")), notes=body.get("notes", ()),
     )  # fmt: skip
 
 
