@@ -8,7 +8,14 @@ from hmmseg.errors import InputError
 from hmmseg.hand.gripper_signs import check_gripper
 from hmmseg.hand.signs import check_signs
 from hmmseg.hand.wrist import halved
-from hmmseg.io.plausibility import Finding, check_angles, check_clock, check_lengths, check_velocities
+from hmmseg.io.plausibility import (
+    Finding,
+    check_angles,
+    check_clock,
+    check_forces,
+    check_lengths,
+    check_velocities,
+)
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
@@ -19,7 +26,7 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
     Units come first: what moves 120 m has no sides.
     """
     out: list[Finding] = []
-    looks = [check_clock, check_lengths, check_angles, check_velocities, check_signs]
+    looks = [check_clock, check_lengths, check_angles, check_velocities, check_forces, check_signs]
     if halved(trial):
         looks.remove(check_signs)  # a wrist's force has no sides
     if rig.gripper is not None:

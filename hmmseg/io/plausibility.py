@@ -20,6 +20,7 @@ from hmmseg.io.trial import Trial
 
 SLOWEST = 2.0  # [Hz]; hands are recorded at 10 Hz at least
 REACH = 3.0  # [m]
+WEAKEST, STRONGEST = 0.02, 1000.0  # [N] of a grip
 STILL = 2e-4  # [m]: travel of a hand that moved nothing
 WINDING = 4 * np.pi  # [rad]
 YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9  # [s] since 1970
@@ -143,6 +144,18 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
     changes = {k: v for each, (_, what) in found.items() for k, v in changed(each, rig, **what).items()}
     told = f"is {slope:.3g} times what {name.removeprefix('d').removeprefix('v')} changes by"
     return [Finding(name, told, changes)]
+
+
+def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
+    """Forces in mN or kN: no fingertip presses so hard, or holds anything so softly."""
+    names = [name for name in ("fx1", "fy1", "fx2", "fy2") if name in trial.channels]
+    there = [np.abs(v[np.isfinite(v)]) for v in (trial.channels[name] for name in names)]
+    strongest = max((float(np.quantile(v, 0.99)) for v in there if v.size), default=1.0)
+    if WEAKEST < strongest < STRONGEST or strongest == 0:
+        return []
+    unit = "mN" if strongest > 1 else "kN"
+    problem = f"reaches {strongest:.3g} N, a fingertip {WEAKEST:g} to {STRONGEST:g} N: it looks like {unit}"
+    return [Finding(names[0], problem, all_changed(names, rig, unit=unit), certain=False)]
 
 
 def _pairs(trial: Trial) -> list[tuple[str, str]]:
