@@ -98,7 +98,7 @@ def unrefined() -> Iterator[None]:
     def unknown(*_: object) -> None:
         return None
 
-    with patch("hmmseg.segmentation.crossings.Contacts.density", unknown):
+    with patch("hmmseg.segmentation.crossings.Contacts.change", unknown):
         yield
 
 

@@ -12,20 +12,18 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
+from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
-from hmmseg.segmentation.crossings import NEAREST, Contacts, contacts
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.features import WINDOW, features, thin
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.misfit import Plan, at, explain, plan, spread
+from hmmseg.segmentation.pooling import Pool, Reading, pooled, unfitted
+from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import cut, merge_point, one_round, part, round_tasks, slices
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
 from hmmseg.segmentation.tables import trials_table
 from hmmseg.tables import as_html, as_text
-
-INTERVAL = (0.05, 0.95)
-NEARBY = 0.15  # s; a touch known apart from forces this near a boundary is that boundary
 
 
 @dataclass(frozen=True)
@@ -111,23 +109,23 @@ def align(
     else:
         every, verdicts = _rounds(signals, judged, task, rig)
     steps = subtasks(task if insist else one_round(task))
-    thinned = [[thin(part(s, p), window=WINDOW) for p in own] for s, own in zip(signals, every, strict=True)]
-    flat = [s for own in thinned for s in own]
-    tables, of = [features(s, rig) for s in flat], [v for own in verdicts for v in own]
+    flat = [part(s, p) for s, own in zip(signals, every, strict=True) for p in own]
+    of = [v for own in verdicts for v in own]
     fitting = [i for i, verdict in enumerate(of) if insist or verdict.failing is None]
-    pooled = fit([tables[i] for i in fitting], steps) if fitting else _unfitted(of)
-    ends = [(float(s.t[p][0]), float(s.t[p][-1])) for s, own in zip(signals, every, strict=True) for p in own]
+    parameters = of[0].free.parameters
+    pool = pooled(flat, fitting, steps, rig) if fitting else unfitted(flat, parameters, rig)
     pieces = iter([
-        _aligned(s, f, steps, pooled, fitting.index(i), rig, ends[i]) if i in set(fitting)
-        else _departed(s, f, steps, of[i], rig, ends[i])
-        for i, (s, f) in enumerate(zip(flat, tables, strict=True))
+        _aligned(reading, steps, pool, fitting.index(i)) if i in set(fitting)
+        else _departed(reading, steps, of[i], pool)
+        for i, reading in enumerate(pool.readings)
     ])  # fmt: skip
     joined = [[next(pieces) for _ in own] for own in every]
     number = task.repeat if task.repeat != "unknown" else max(len(own) for own in joined)
     performed = replace(task, repeat=number)
     every_step = subtasks(performed)
-    return AlignedTrials(performed, rig, every_step, pooled, tuple(
-        _joined(trial, s, own, every_step, 1 if insist else number, task.repeat == "unknown", rig)
+    return AlignedTrials(performed, rig, every_step, pool.fit, tuple(
+        _joined(trial, s, own, every_step, 1 if insist else number, task.repeat == "unknown", rig,
+                pool.remarks)
         for trial, s, own in zip(trials, signals, joined, strict=True)
     ))  # fmt: skip
 
@@ -155,24 +153,28 @@ def _rounds(
             return every, verdicts
 
 
-def _aligned(
-    s: Signals, f: Features, steps: tuple[Subtask, ...], pooled: Fit, j: int, rig: Rig,
-    ends: tuple[float, float],
-) -> _Piece:  # fmt: skip
-    boundaries = boundary_posteriors(s, rig, steps, pooled, j)
-    evidence = float(pooled.posteriors[j].log_evidence)
-    return _Piece(boundaries, to_spans(steps, boundaries, *ends), None, evidence, *ends)
+def _aligned(reading: Reading, steps: tuple[Subtask, ...], pool: Pool, j: int) -> _Piece:
+    alignment, t = pool.fit.posteriors[j], reading.thinned.t
+    boundaries = boundary_posteriors(pool.changes[j], pool.discrepancy, t, alignment, reading.fine.touches)
+    evidence = float(alignment.log_evidence)
+    return _Piece(boundaries, to_spans(steps, boundaries, *reading.ends), None, evidence, *reading.ends)
 
 
-def _departed(
-    s: Signals, f: Features, steps: tuple[Subtask, ...], verdict: Conformity, rig: Rig,
-    ends: tuple[float, float],
-) -> _Piece:  # fmt: skip
+def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity, pool: Pool) -> _Piece:
     """A trial aligned with the order that it shows in place of its task's."""
     assert verdict.failing is not None
     shown = plan(verdict, steps)
-    own, evidence = _fit_shown(f, shown, verdict)
-    found = boundary_posteriors(s, rig, shown.steps, own, 0) if own else ()
+    own, evidence = _fit_shown(reading.features, shown, verdict)
+    found = ()
+    if own is not None:
+        alignment = own.posteriors[0]
+        changes = contact_changes(
+            reading.fine, reading.thinned, pool.sensing, shown.steps, own.parameters, alignment
+        )
+        found = boundary_posteriors(
+            changes, pool.discrepancy, reading.thinned.t, alignment, reading.fine.touches
+        )
+    ends = reading.ends
     boundaries = spread(shown, found, len(steps), *ends)
     every = to_spans(shown.steps, found, *ends)
     spans = (*every[: shown.num_before], *every[len(every) - shown.num_after :])
@@ -183,7 +185,7 @@ def _departed(
 
 def _joined(
     trial: Trial, signals: Signals, pieces: Sequence[_Piece], steps: tuple[Subtask, ...], number: int,
-    open_end: bool, rig: Rig,
+    open_end: bool, rig: Rig, remarks: tuple[str, ...],
 ) -> TrialAlignment:  # fmt: skip
     """One recording from its rounds, `number` of them by its task (`open_end`: at most)."""
     thinned = thin(signals, window=WINDOW)
@@ -211,7 +213,7 @@ def _joined(
     rate = float(1.0 / np.median(np.diff(signals.t)))
     segmentation = Segmentation(
         trial.file, rate, sum(p.evidence for p in pieces), tuple(spans), failures[0] if failures else None,
-        len(pieces) if number > 1 or open_end else None, tuple(failures), signals,
+        len(pieces) if number > 1 or open_end else None, tuple(failures), signals, remarks,
     )  # fmt: skip
     table = features(thinned, rig)
     return TrialAlignment(trial, signals, thinned, table, tuple(boundaries), segmentation, present)
@@ -231,73 +233,6 @@ def _fit_shown(f: Features, shown: Plan, verdict: Conformity) -> tuple[Fit | Non
         return None, verdict.log_evidence
     own = fit([f], shown.steps, shown.start)
     return own, float(own.posteriors[0].log_evidence)
-
-
-def _unfitted(verdicts: Sequence[Conformity]) -> Fit:
-    """Where no trial fits the task: what the first shows of the sensors, and no alignment."""
-    return Fit(verdicts[0].free.parameters, ())
-
-
-def boundary_posteriors(
-    signals: Signals, rig: Rig, steps: tuple[Subtask, ...], fitted: Fit, trial: int
-) -> tuple[BoundaryPosterior, ...]:
-    """Posterior of each of the boundaries between subtasks of one trial."""
-    posterior = fitted.posteriors[trial]
-    table = contacts(signals, rig, fitted.parameters)
-    path = np.asarray(posterior.log_smoothed).argmax(axis=1)
-    out = []
-    for k in range(len(steps) - 1):
-        probability = np.exp(posterior.log_advance[:, k])
-        densities = {}
-        for n in np.flatnonzero(probability > 1e-3):
-            held = _held_side(path, steps, k, int(n))
-            density = _density(table, steps[k], steps[k + 1], int(n), held)
-            if density is not None:
-                densities[int(n)] = density
-        found = combine(signals.t, probability, densities)
-        if FREE in (steps[k].state, steps[k + 1].state):
-            found = _known(signals, found)
-        out.append(found)
-    return tuple(out)
-
-
-def _known(signals: Signals, found: BoundaryPosterior) -> BoundaryPosterior:
-    """The touch or release that is known apart from forces where there is one nearby, else as it is."""
-    middle = found.quantile(0.5)
-    for time, sd in sorted(signals.touches, key=lambda touch: abs(touch[0] - middle))[:1]:
-        if abs(time - middle) < max(NEARBY, 3 * sd, 3 * found.sd):
-            return normal(time, sd)
-    return found
-
-
-def _density(table: Contacts, before: Subtask, after: Subtask, n: int, held: slice) -> np.ndarray | None:
-    return table.density(before, after, n, held) if held.stop > held.start else None
-
-
-def _held_side(path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int) -> slice:
-    """The samples nearest to interval n of the subtask that rests on the ground beside it."""
-    after = steps[k].state == FREE or steps[k + 1].name == "place"
-    if after:
-        end = np.flatnonzero(path == k + 1)
-        stop = int(end[-1]) + 1 if end.size else n + 2
-        return slice(n + 1, min(n + 1 + NEAREST, max(stop, n + 2)))
-    begin = np.flatnonzero(path == k)
-    start = int(begin[0]) if begin.size else n
-    return slice(max(n + 1 - NEAREST, min(start, n)), n + 1)
-
-
-def to_spans(
-    steps: tuple[Subtask, ...], boundaries: tuple[BoundaryPosterior, ...], first: float, last: float
-) -> tuple[Span, ...]:
-    """Spans between boundary medians, kept in order."""
-    medians = np.maximum.accumulate([first, *(b.quantile(0.5) for b in boundaries), last])
-    sds = [0.0, *(b.sd for b in boundaries), 0.0]
-    intervals = [(first, first), *(tuple(b.quantile(q) for q in INTERVAL) for b in boundaries), (last, last)]
-    return tuple(
-        Span(s.name, s.object, s.state, float(medians[i]), float(medians[i + 1]),
-             sds[i], sds[i + 1], intervals[i], intervals[i + 1])
-        for i, s in enumerate(steps)
-    )  # fmt: skip
 
 
 def segment(trials: Sequence[Trial], task: BlockTask, rig: Rig) -> list[Segmentation]:

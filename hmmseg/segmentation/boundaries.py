@@ -33,6 +33,8 @@ SHAPE = 0.05  # how far its speed may be off the minimum-jerk profile, as a shar
 STOP, STOPS = (0.002, 0.05), 10  # s; time constant of the stop after an impact: log-uniform
 UNIFORM = 0.02  # weight of a crossing anywhere in the interval, against what g leaves out
 
+Kind = Literal["smooth", "impact", "launch"]
+
 
 @dataclass(frozen=True)
 class Crossing:
@@ -50,7 +52,7 @@ class Crossing:
     sd_left: float
     sd_right: float
     sd_v: float
-    kind: Literal["smooth", "impact", "launch"] = "smooth"
+    kind: Kind = "smooth"
 
     @property
     def known(self) -> bool:
@@ -238,13 +240,15 @@ def combine(
         density = densities.get(int(n), np.full(POINTS, 1.0 / POINTS))
         times.append(t[n] + u * (t[n + 1] - t[n]))
         probabilities.append(interval_probability[n] * density)
-    return _blurred(np.concatenate(times), np.concatenate(probabilities), t[0], t[-1])
+    return blurred(np.concatenate(times), np.concatenate(probabilities), t[0], t[-1])
 
 
-def _blurred(times: np.ndarray, probabilities: np.ndarray, first: float, last: float) -> BoundaryPosterior:
-    """The posterior widened by ONSET, by Gauss-Hermite nodes of a normal distribution."""
+def blurred(
+    times: np.ndarray, probabilities: np.ndarray, first: float, last: float, sd: float = ONSET
+) -> BoundaryPosterior:
+    """The posterior widened by `sd` [s], by Gauss-Hermite nodes of a normal distribution."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(5)
-    spread = np.clip(times[:, None] + ONSET * nodes, first, last).ravel()
+    spread = np.clip(times[:, None] + sd * nodes, first, last).ravel()
     mass = (probabilities[:, None] * weights).ravel()
     order = np.argsort(spread, kind="stable")
     return BoundaryPosterior(spread[order], mass[order] / mass.sum())

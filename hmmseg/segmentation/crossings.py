@@ -1,94 +1,99 @@
-"""The crossing quantity of each contact change, from fingertip signals and a fitted alignment."""
+"""What finger and block show of each contact change of an alignment."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
-from hmmseg.contact.equations import Pads, block_y, hanging, pads_of
+from hmmseg.contact.equations import Pads, block_y, hanging
 from hmmseg.hand.signals import Signals
-from hmmseg.io.rig import Rig
-from hmmseg.segmentation.boundaries import POINTS, Crossing, crossing_density, first_of
+from hmmseg.segmentation.changes import Change, Prior, cut
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.pads import RIGID, Sensing
+from hmmseg.segmentation.switching import SURE, Penetration
 
-NEAREST = 6  # samples of a hold that locate the block next to a contact change
+HELD = 0.15  # s of a hold that locate the block next to a contact change; a hand drifts over more
+STIFFEST = 1e-7  # m/N
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """Fingertip signals of one trial with what the fit knows: biases, weights and spans.
+    """Fingertip signals of one trial with what the fit knows: biases, weights, pads and noise.
 
     `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
-    position along its own closing direction [m], `inward_velocity` likewise; `deflection` (T,):
-    the pads' mean shear deflection by the net vertical force [m].
+    position along its own closing direction [m], `inward_rate` likewise; `deflection` (T,): the pads'
+    mean shear deflection by the net vertical force [m].
     """
 
     signals: Signals
-    pads: Pads
+    sensing: Sensing
     compression: np.ndarray
     inward: np.ndarray
-    inward_velocity: np.ndarray
+    inward_rate: np.ndarray
     deflection: np.ndarray
     weight: dict[str, float]
     sd: dict[str, float]
 
-    def density(self, before: Subtask, after: Subtask, n: int, held: slice) -> np.ndarray | None:
-        """Density (POINTS,) of the boundary in the interval n, n+1; None: nothing is known.
+    def change(
+        self, before: Subtask, after: Subtask, prior: Prior, held: tuple[float, float]
+    ) -> Change | None:
+        """What is known of one boundary; None: these signals say nothing of it.
 
-        `held`: samples at which, on the held side of the boundary, the block rests or is held.
+        `held` [s]: a stretch on the held side of the boundary in which the block rests or is held.
         """
-        width = float(self.signals.t[n + 1] - self.signals.t[n])
-        if before.state == FREE:
-            return self._checked(crossing_density, [self._gap(i, n, held, 1) for i in (0, 1)], width)
-        if after.state == FREE:
-            return self._checked(first_of, [self._gap(i, n, held, -1) for i in (0, 1)], width)
+        stretch = (self.signals.t >= held[0]) & (self.signals.t <= held[1])
+        if not stretch.any():
+            return None
+        timing = self.sensing.delay_sd
+        if FREE in (before.state, after.state):
+            making = before.state == FREE
+            rests = (after if making else before).state == ON_GROUND
+            fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
+            return cut(Change(fingers, prior, making, "impact" if making else "smooth", timing))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
-            lifting = after.state == ABOVE_GROUND
-            return self._checked(crossing_density, [self._load(before, n, held, lifting)], width)
+            making = after.state == ON_GROUND
+            load = self._load(before, stretch, making)
+            return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
         return None
 
-    @staticmethod
-    def _checked(combined, crossings: list[Crossing], width: float) -> np.ndarray | None:
-        if not all(c.known for c in crossings):
-            return None
-        density = combined(crossings, width)
-        return density if density.shape == (POINTS,) and np.isfinite(density).all() else None
+    def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
+        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
+        inward, rate = self.inward[i], self.inward_rate[i]
+        if not rests:
+            inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=0)
+        face = _median(inward[held] - self.compression[i, held])
+        sd = self.sd["compression"]
+        return self._timely(Penetration(
+            self.signals.t, self.compression[i], inward - face, rate, sd, sd,
+            self.sd["inward"], self.sd["inward_rate"], self.sensing.normal.form,
+            self.sensing.normal.value < RIGID,
+        ), making)  # fmt: skip
 
-    def _gap(self, i: int, n: int, held: slice, sign: int) -> Crossing:
-        """Compression of finger i's pad: rises through zero at a touch, falls at a release.
-
-        On the held side the force gives it; on the free side the distance to the block's face.
-        """
-        face = _median(self.inward[i, held] - self.compression[i, held])
-        free, touching = (n, n + 1) if sign > 0 else (n + 1, n)
-        gap = self.inward[i, free] - face
-        squeeze, sd_squeeze = self.compression[i, touching], self.sd["compression"]
-        if self.pads.normal1 == 0.0:  # a rigid pad hides its compression
-            squeeze = max(self.inward[i, touching] - face, 0.0)
-            sd_squeeze = self.sd["inward"] + 0.5 * abs(gap)
-        v, sd_v = self.inward_velocity[i], self.sd["inward_velocity"]
-        if sign > 0:
-            return Crossing(gap, squeeze, v[n], v[n + 1], self.sd["inward"], sd_squeeze, sd_v, "impact")
-        return Crossing(-squeeze, -gap, -v[n], -v[n + 1], sd_squeeze, self.sd["inward"], sd_v, "smooth")
-
-    def _load(self, before: Subtask, n: int, held: slice, lifting: bool) -> Crossing:
-        """Height of the fingers above where the pads' shear just carries the weight."""
+    def _load(self, before: Subtask, held: np.ndarray, making: bool) -> Penetration:
+        """The fingers below the height at which the pads' shear just carries the weight."""
         y = self.signals.y
         level = _median(y[held] - self.deflection[held])
-        carrying = hanging(self.weight[str(before.object)], self.pads)
-        resting, lifted = (n, n + 1) if lifting else (n + 1, n)
-        on_ground = self.deflection[resting] - carrying
-        sd_ground = self.sd["deflection"]
-        if hanging(1.0, self.pads) == 0.0:  # rigid pads: only the position tells
-            on_ground, sd_ground = y[resting] - level, self.sd["y"]
-        in_air = y[lifted] - level - carrying
-        v, sd_y, sd_v = self.signals.vy, self.sd["y"], self.sd["vy"]
-        if lifting:
-            return Crossing(on_ground, in_air, v[n], v[n + 1], sd_ground, sd_y, sd_v, "launch")
-        return Crossing(-in_air, -on_ground, -v[n], -v[n + 1], sd_y, sd_ground, sd_v, "impact")
+        carrying = hanging(self.weight[str(before.object)], shown(self.sensing.pads))
+        return self._timely(Penetration(
+            self.signals.t, carrying - self.deflection, level + carrying - y, -self.signals.vy,
+            self.sd["deflection"], self.sd["carried"], self.sd["y"], self.sd["vy"],
+            self.sensing.shear.form, self.sensing.shear.value < RIGID,
+        ), making)  # fmt: skip
+
+    def _timely(self, c: Penetration, making: bool) -> Penetration:
+        """The contact as its change would be seen without the forces' small delay, or lead.
+
+        A touch begins where the compression does, and so do both changes for a sensor that is late.
+        Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly.
+        """
+        moved = self.sensing.delay * np.nan_to_num(c.rate)
+        if not making and self.sensing.delay < 0:
+            return replace(c, place=c.place - moved)
+        sure = c.pressed > SURE * c.sd_apart
+        return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
 
 
 def _median(values: np.ndarray) -> float:
@@ -97,29 +102,36 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(there)) if there.size else np.nan
 
 
-def contacts(signals: Signals, rig: Rig, parameters: Parameters) -> Contacts:
+def shown(pads: Pads) -> Pads:
+    """A pad too stiff to show its compression still shows its force, in whatever unit of length."""
+    return Pads(*(max(float(c), STIFFEST) for c in pads))
+
+
+def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Contacts:
     """Contacts of one trial; noise the rig does not state is learned from the recording."""
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
     inward = np.stack([s.x1, -s.x2])
-    velocity = np.stack([s.vx1, -s.vx2])
+    rate = np.stack([s.vx1, -s.vx2])
     force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
 
     def sd(stated: np.ndarray, values: np.ndarray) -> float:
         return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
 
-    pads = pads_of(rig)
+    pads = shown(sensing.pads)
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
     return Contacts(
-        signals=s, pads=pads, compression=normal * pads.normal1, inward=inward,
-        inward_velocity=velocity, deflection=-block_y(0.0, fy1, fy2, pads), weight=parameters.weight,
+        signals=s, sensing=sensing, compression=normal * np.array([[pads.normal1], [pads.normal2]]),
+        inward=inward, inward_rate=rate, deflection=-block_y(0.0, fy1, fy2, pads),
+        weight=parameters.weight,
         sd={
-            "compression": force * pads.normal1 + 1e-9,
+            "compression": force * float(pads.normal1),
             "inward": sd(s.sd_x, s.x1),
-            "inward_velocity": sd(s.sd_vx, s.vx1),
+            "inward_rate": sd(s.sd_vx, s.vx1),
             "y": float(np.hypot(sd(s.sd_y, s.y1) / root2, level)),
             "vy": sd(s.sd_vy, s.vy1) / root2,
-            "deflection": root2 * hanging(force, pads) + 1e-9,
+            "deflection": root2 * hanging(force, pads),
+            "carried": hanging(max(parameters.scale["carry"], root2 * force), pads),
         },
     )  # fmt: skip

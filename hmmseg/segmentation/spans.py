@@ -60,7 +60,7 @@ class Segmentation:
     `log_evidence` is None from a method that has no likelihood. Of a repeated task, `repetitions` says
     how often the recording shows it and `failures` holds all rounds that do not fit, `failed` the first.
     `recorded` is what `plot` shows: the signals of a block task's trial, the trial itself of a plain
-    ordered task.
+    ordered task. `remarks` say what the recording contradicts in the rig, or leaves open.
     """
 
     file: str
@@ -71,6 +71,7 @@ class Segmentation:
     repetitions: int | None = None
     failures: tuple[Failure, ...] = ()
     recorded: Any = field(default=None, compare=False)
+    remarks: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:

@@ -1,0 +1,89 @@
+"""Trials of one task read, fitted and sensed together: what all of them show of task and hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hmmseg.contact.decompose import Subtask
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import Rig
+from hmmseg.segmentation.boundaries import Kind
+from hmmseg.segmentation.changes import Change, discrepancies
+from hmmseg.segmentation.emissions import Features, Parameters
+from hmmseg.segmentation.features import WINDOW, features, thin
+from hmmseg.segmentation.fit import Fit, fit
+from hmmseg.segmentation.pads import Sensing, read_again, sense
+from hmmseg.segmentation.posteriors import contact_changes
+
+LOCAL_RATE = 100.0  # Hz; contacts are located at up to this rate, at which readings share no noise
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One recording, or round: `fine` signals locate contacts, `thinned` ones are aligned by `features`.
+
+    `ends` [s]: its first and last time.
+    """
+
+    fine: Signals
+    thinned: Signals
+    features: Features
+    ends: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Pool:
+    """All recordings as they were read last, the fit of those that fit, and what they show of the hand.
+
+    `changes` are those of each fitted recording; `discrepancy` [m] as in `discrepancies`. `remarks` tell
+    people what contradicts the rig.
+    """
+
+    readings: list[Reading]
+    fit: Fit
+    sensing: Sensing
+    changes: list[list[Change | None]] = field(default_factory=list)
+    discrepancy: dict[tuple[Kind, int], float] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+
+
+def pooled(
+    recordings: Sequence[Signals], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig
+) -> Pool:
+    """One fit of all that fit; a second one where their forces come late."""
+
+    def once(signals: Sequence[Signals], again: bool) -> tuple[list[Reading], Fit, Sensing]:
+        readings = [_read(s, rig) for s in signals]
+        fitted = fit([readings[i].features for i in fitting], steps)
+        fine = [readings[i].fine for i in fitting]
+        paths = [(readings[i].thinned.t, a.path) for i, a in zip(fitting, fitted.posteriors, strict=True)]
+        return readings, fitted, sense(fine, paths, steps, fitted.parameters, rig, again)
+
+    made_up = any(s.touches for s in recordings)  # forces of a wrist's fingers show no pads of their own
+    readings, fitted, sensing = once(recordings, again=made_up)
+    remarks = sensing.remarks(rig)
+    if sensing.late:
+        readings, fitted, again = once([read_again(s, sensing) for s in recordings], again=True)
+        remarks = replace(again, late=True, filter=sensing.filter, delay=sensing.delay).remarks(rig)
+        sensing = replace(again, delay_sd=float(np.hypot(again.delay_sd, sensing.delay_sd)))
+    changes = [
+        contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
+        for i, alignment in zip(fitting, fitted.posteriors, strict=True)
+    ]
+    discrepancy = discrepancies([c for own in changes for c in own if c is not None])
+    return Pool(readings, fitted, sensing, changes, discrepancy, remarks)
+
+
+def unfitted(recordings: Sequence[Signals], parameters: Parameters, rig: Rig) -> Pool:
+    """Where no trial fits the task: what is known of the sensors, and no alignment."""
+    readings = [_read(s, rig) for s in recordings]
+    return Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
+
+
+def _read(signals: Signals, rig: Rig) -> Reading:
+    thinned = thin(signals, window=WINDOW)
+    fine = thin(signals, LOCAL_RATE, WINDOW)
+    return Reading(fine, thinned, features(thinned, rig), (float(signals.t[0]), float(signals.t[-1])))

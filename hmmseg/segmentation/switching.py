@@ -1,0 +1,92 @@
+"""In which sample interval a contact switched, from force and position together.
+
+A contact is a penetration p(t) [m]: how far a finger is in a pad, or how far a block's weight is short
+of hanging on the pads alone. Where there is contact (p > 0) the force measures it, far more finely than
+positions do; where there is none the force is silent and the position measures how far apart things are:
+
+    contact: pressed ~ N(p, .), place ~ N(p, .), p > 0      apart: pressed ~ N(0, .), place ~ N(p, .), p < 0
+
+with p unknown, uniform over the range seen. Every sample so weighs contact against none, with p
+integrated out; a switch at interval n has the likelihood of all samples up to n before it and all later
+ones after it. The chain of contact states does not know that motion is continuous (a block that has
+just lifted is still near the ground); these samples do. The alignment says which contact is meant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr
+
+STRAY = (
+    0.02  # share of samples at which one sensor tells another story than the model (ringing, a block pushed)
+)
+SELDOM = 0.002  # ... where that is the less likely of the two stories
+SURE = 5.0  # sds of noise for a contact to be sure
+TAIL = 4.0  # Student-t residuals, as in the emissions
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """One contact as sensed, arrays (num_samples,), NaN where missing.
+
+    `pressed` [m]: by the force; `place` [m]: by the position; `rate` [m/s] of `place`. `sd_pressed` is
+    the noise of the force, `form` the share by which a pad's force may be off its compression;
+    `sd_apart` [m]: what the force may be of itself where there is no contact. `hidden`: a rigid pad, whose
+    force tells that there is contact, but not how deep.
+    """
+
+    t: np.ndarray
+    pressed: np.ndarray
+    place: np.ndarray
+    rate: np.ndarray
+    sd_pressed: float
+    sd_apart: float
+    sd_place: float
+    sd_rate: float
+    form: float
+    hidden: bool = False
+
+
+def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Log-likelihoods (num_samples,) of contact and of none, p integrated out; a missing sensor adds nothing.
+
+    What is more likely amiss differs: before a touch (`making`) the face may lie elsewhere, as a finger
+    that came first pushes the block; after a release the force may ring.
+    """
+    force, position = np.isfinite(c.pressed), np.isfinite(c.place)
+    pressed, place = np.where(force, c.pressed, 0.0), np.where(position, c.place, 0.0)
+    log_force = np.log(2 * max(np.ptp(pressed), 10 * c.sd_pressed)) * force
+    log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
+    pushes = np.where(force, log_ndtr(pressed / c.sd_pressed), 0.0) - log_force
+    silent = np.where(force, _log_student(pressed / c.sd_apart) - np.log(c.sd_apart), 0.0)
+    within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
+    beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
+    sd_force = np.hypot(c.sd_pressed, c.form * np.abs(pressed))
+    both = np.hypot(sd_force, c.sd_place)
+    depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
+    agree = _log_student((pressed - place) / both) - np.log(both) - log_place
+    held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))
+    held = np.where(force & position & (not c.hidden), held, pushes + within)
+    moved, rung = (STRAY, SELDOM) if making else (SELDOM, STRAY)
+    neither = np.log(STRAY * SELDOM) - log_force - log_place
+    contact = np.logaddexp.reduce([held, np.log(moved) + pushes - log_place, neither])
+    none = np.logaddexp.reduce([
+        silent + beyond, np.log(moved) + silent - log_place, np.log(rung) + beyond - log_force, neither,
+    ])  # fmt: skip
+    return contact, none
+
+
+def switch_probability(c: Penetration, log_prior: np.ndarray, making: bool) -> np.ndarray:
+    """Probability (num_samples - 1,) that the contact is made, or broken, in each interval."""
+    contact, none = log_contact(c, making)
+    before, after = (none, contact) if making else (contact, none)
+    log_weight = np.cumsum(before)[:-1] + np.cumsum(after[::-1])[::-1][1:] + log_prior
+    weight = np.exp(log_weight - log_weight.max())
+    return weight / weight.sum()
+
+
+def _log_student(z: np.ndarray) -> np.ndarray:
+    """Log density of a standard Student-t variable (its constant is that of TAIL degrees of freedom)."""
+    return -0.98082925 - (TAIL + 1) / 2 * np.log1p(z**2 / TAIL)

@@ -1,0 +1,87 @@
+"""Pads and delays are learned from what rests: planted ones are found, and none are invented."""
+
+import numpy as np
+import pytest
+
+from experiments.boundary_worlds import World, trials_of
+from experiments.sweeps.cells import Cell
+from experiments.sweeps.trials import scene
+from hmmseg.segmentation.align import segment
+from hmmseg.segmentation.pads import Sensing, read_again
+from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading
+
+PRIOR = (2.5e-4, 0.75e-4)
+
+
+def squeeze(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=2.5e-4):
+    """A grip that closes and then holds, its force late by `delay` or filtered."""
+    rng = np.random.default_rng(seed)
+    fine = np.arange(0, 0.8, 1e-4)
+    force = 4 * np.clip(fine / 0.15, 0, 1) ** 1.5 + 0.3 * np.sin(9 * fine) * (fine > 0.15)
+    recorded = force.copy()
+    if constant:
+        for i in range(1, fine.size):
+            recorded[i] = recorded[i - 1] + 1e-4 / constant * (force[i] - recorded[i - 1])
+    t = np.arange(0.02 + delay, 0.78, step)
+    load = np.interp(t - delay, fine, recorded) + 0.012 * rng.standard_normal(t.size)
+    before = np.interp(t - step - delay, fine, recorded)
+    clock = np.arange(0.0, 0.8, step)
+    place = 0.02 - compliance * np.interp(clock, fine, force) + 2e-5 * rng.standard_normal(clock.size)
+    return Stretch(t, load, before, np.full(t.size, step), clock, place, 2e-5, 0.1)
+
+
+def test_the_slope_of_a_squeeze_is_the_compliance():
+    slope, information, residual = fitted(*reading(squeeze()), 2e-5)
+    assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5)
+    assert np.std(residual) < 4e-5
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.03, 0.1])
+def test_a_delay_is_where_the_evidence_peaks(delay):
+    grid = np.arange(0.0, 0.15, 0.01)
+    found = evidence([[squeeze(delay, seed=i) for i in range(8)]], [PRIOR], grid, False)[0]
+    assert grid[found.argmax()] == pytest.approx(delay, abs=0.0101)
+
+
+def test_a_filter_is_told_from_a_delay():
+    grid = np.arange(0.0, 0.1, 0.01)
+    own = [squeeze(constant=0.03, seed=i) for i in range(8)]
+    late, filtered = (evidence([own], [PRIOR], grid, which)[0] for which in (False, True))
+    assert filtered.max() > late.max() and grid[filtered.argmax()] == pytest.approx(0.03, abs=0.0101)
+
+
+def world(**effects):
+    _, task = scene()
+    (judged,) = trials_of(World("", Cell(rate=50.0), effects=effects), [70001])
+    (found,) = segment([judged.trial], task, judged.rig)
+    return found, np.array([s.start for s in found.spans[1:]]) - judged.boundaries
+
+
+def test_recorded_lag_is_found_and_said():
+    found, residual = world(force_lag={"delay": 0.12})
+    assert "come late" in found.remarks[0] or "filtered" in found.remarks[0]
+    assert np.median(np.abs(residual)) < 0.012
+
+
+def test_healthy_forces_are_neither_late_nor_filtered():
+    found, residual = world()
+    assert found.remarks == ()
+    assert np.median(np.abs(residual)) < 0.004
+
+
+def test_reading_again_undoes_what_was_found():
+    from hmmseg.hand.signals import Signals
+    from hmmseg.segmentation.pads import Compliance
+
+    t = np.arange(0, 1, 0.01)
+    ramp = np.clip(t - 0.3, 0, 0.4)
+    zero = np.zeros(t.size)
+    late = np.interp(t - 0.05, t, ramp)
+    known = dict.fromkeys(
+        ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"), late
+    )
+    signals = Signals(t, **known, sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01)
+    pad = Compliance(2.5e-4, 1e-6, 0.05)
+    again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
+    np.testing.assert_allclose(again.fx1[:94], ramp[:94], atol=1e-12)
+    np.testing.assert_allclose(again.x1, late)
