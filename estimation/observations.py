@@ -32,6 +32,7 @@ MAX_RATE = 50.0  # Hz; noise of finer samples is averaged before it is weighed
 NUM_ALIGNMENTS = 16
 MIN_STRETCH = 0.5
 LEAST = 1e-8  # m or N: noise of a sample is no less, which keeps rounding out of the posterior
+APART = 0.1  # s by which one finger touches or lets go after the other, at most: chosen
 MIN_FREE = 8  # samples of free motion that tell the scale of the forces there
 
 
@@ -167,8 +168,9 @@ def aligned_weights(
                 counts[move][key] = (masks[:, members].any(axis=1) & (weight > 0)).sum(axis=1)
         free = best[[s.index for s in steps if s.state == FREE]].any(axis=0)
         free &= np.isfinite(thinned.fx1 + thinned.fy1 + thinned.fx2 + thinned.fy2)
-        # The samples beside a contact change may be contact already.
-        free &= np.convolve(~free, [1, 1, 1], "same") == 0
+        # Beside a contact change one finger alone may touch, and the sample next to it be contact already.
+        beside = 1 + int(np.ceil(APART / float(np.median(np.diff(thinned.t)))))
+        free &= np.convolve(~free, np.ones(2 * beside + 1), "same") == 0
         robust = np.zeros((len(FORCE_CHANNELS), free.size))
         for row, name in zip(robust, FORCE_CHANNELS, strict=True):
             scale = _free_scale(thinned, name, free)
