@@ -18,13 +18,16 @@ from hmmseg.hmm import left_to_right, smooth
 from hmmseg.io.trial import Trial
 from hmmseg.online import layout as at
 from hmmseg.segmentation.boundaries import combine
-from hmmseg.segmentation.crossings import NEAREST, contacts
+from hmmseg.segmentation.changes import DISCREPANCY, Prior, moment
+from hmmseg.segmentation.crossings import HELD, contacts
 from hmmseg.segmentation.emissions import Parameters, log_likelihoods
 from hmmseg.segmentation.features import MAX_RATE, WINDOW, features, thin
+from hmmseg.segmentation.pads import sense
 
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter
 
+NEAREST = 6  # samples of a hold that locate the block next to a contact change
 REACH = 0.6  # s before a boundary: what is read of the subtask that it ends
 FINE = 100.0  # Hz; in faster recordings the filter itself places touches
 SCALES: tuple[str, ...] = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
@@ -45,10 +48,10 @@ def refined(
     t = np.array([each[0] for each in rows])
     if touch and 1.0 / np.median(np.diff(t)) > FINE:
         return None
-    table = np.array([each[1] for each in rows])
-    there = np.flatnonzero((~np.isnan(table)).any(axis=0))
+    read = np.array([each[1] for each in rows])
+    there = np.flatnonzero((~np.isnan(read)).any(axis=0))
     names = [filter_.channels[i] for i in there]
-    trial = Trial("stream", t, {name: table[:, filter_.channels.index(name)] for name in names})
+    trial = Trial("stream", t, {name: read[:, filter_.channels.index(name)] for name in names})
     if set(filter_.channels) - set(names) - set(filter_.optional):
         return None
     signals = thin(task_space(trial, filter_.rig), MAX_RATE, WINDOW)
@@ -72,13 +75,11 @@ def refined(
     except ValueError:
         return None
     probability = posterior.boundary[:, 0]
-    crossings, densities = contacts(signals, filter_.rig, parameters), {}
-    for n in np.flatnonzero(probability > 1e-3):
-        held = slice(n + 1, n + 1 + NEAREST) if touch else slice(max(n + 1 - NEAREST, 0), n + 1)
-        density = crossings.density(*steps, int(n), held)
-        if density is not None:
-            densities[int(n)] = density
-    out = combine(signals.t, probability, densities)
+    n, t = int(probability.argmax()), signals.t
+    near = (t[n + 1], t[n + 1] + HELD) if touch else (t[n] - HELD, t[n])
+    table = contacts(signals, sense([], [], (), parameters, filter_.rig), parameters)
+    change = table.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
+    out = combine(t, probability, {}) if change is None else moment(change, DISCREPANCY)
     median = out.quantile(0.5)
     if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
         return None  # another event than the filter's
