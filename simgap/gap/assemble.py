@@ -126,7 +126,7 @@ def _measured(given: Problem, push: np.ndarray) -> list[Candidate]:
 
 
 def _late_rates(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of speeds read late by half a sample, and smoothed over one, by a drive's differences.
+    """Columns (n, 1) of speeds that are differences of positions, late by half a sample, or smoothed.
 
     How a drive comes by its speeds rig.toml does not say: differences are as usual as a tachometer.
     """
@@ -137,8 +137,16 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
     mean = (velocity[..., :2] + velocity[..., 2:]) / 2
     rate = np.asarray(gradient(tree.t, jnp.asarray(mean)))
     bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
+    position = np.asarray(tips(tree)[0])
+    place = (position[..., :2] + position[..., 2:]) / 2
+    # What a drive that takes differences of its own readings from sample to sample would say.
+    before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
+    own = np.asarray(tips(tree._replace(rates=jnp.asarray((world.joints - before) / step)))[1])
+    own = (own[..., :2] + own[..., 2:]) / 2
+    own[:, 1:-1] = (own[:, :-2] + 4 * own[:, 1:-1] + own[:, 2:]) / 6
+    own = own - np.asarray(gradient(tree.t, jnp.asarray(place)))
     out = []
-    for change, usual in ((rate, step / 2), (bend, step**2 / 2)):
+    for change, usual in ((own, 1.0), (rate, step / 2), (bend, step**2 / 2)):
         column = np.zeros_like(weight)
         for k, channel in enumerate(("vx", "vy")):
             c = CHANNELS.index(channel)

@@ -13,6 +13,7 @@ STARTING = 0.1  # and of that with which a block comes off its support or onto i
 FADED, FADING = 0.1, 0.5  # the same of what is recorded in free motion, so many seconds from a grip
 BENT = 0.025  # share of a speed's fourth difference by which the rule for differences of positions is off
 SEEN = 2.0  # sds of that difference below which it is noise
+MOVES = 3.0  # sds of a difference by which fingers move
 NUDGE = 1e-4  # m; fingers that push unequally move a resting block by about as much
 
 
@@ -62,10 +63,20 @@ def residual_noise(s: Signals, one: dict[str, np.ndarray], rig: Rig, step: float
         root2 * f, root2 * f, f / root2, f / root2,
     ]  # fmt: skip
     out = np.stack(columns, 1)
+    out[:, 0] = np.hypot(out[:, 0], _moving((s.x1 + s.x2) / 2, x / root2))
     for channel, fingers, noise in ((4, (s.vx1, s.vx2), vx), (5, (s.vy1, s.vy2), vy)):
         unresolved = sum(_unresolved(speed, noise) for speed in fingers) / 2
         out[:, channel] = np.hypot(out[:, channel], unresolved)
     return out
+
+
+def _moving(place: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """By how much (N,) fingers move from sample to sample beyond noise: what they hold does not rest then.
+
+    The finger that touches first pushes the block for a while, and so does a hand that closes.
+    """
+    step = np.pad(np.abs(np.nan_to_num(np.diff(place))), (1, 1))
+    return np.maximum(np.maximum(step[:-1], step[1:]) - MOVES * np.sqrt(2.0) * noise, 0.0)
 
 
 def _unresolved(speed: np.ndarray, noise: np.ndarray) -> np.ndarray:

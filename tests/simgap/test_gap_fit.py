@@ -100,7 +100,7 @@ def test_what_the_rig_admits_is_a_nuisance(shared):
     plain = fit(given, Start((), neutral(given)))
     gap = gap_of(given, plain, [])
     k = given.num_properties
-    assert gap.nuisance.shape[1] == k + 2 + 2  # speeds may be read late
+    assert gap.nuisance.shape[1] == k + 2 + 3  # speeds may be read late
     push = derivatives(given, ("force_bias",), plain.u)[:, k:]
     np.testing.assert_allclose(gap.nuisance[:, k : k + 2], -push[:, [0, 3]] * [0.2, 0.1], rtol=1e-6)
 
