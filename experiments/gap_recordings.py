@@ -1,10 +1,11 @@
 """The diagnosis on labelled recordings of a stand-in rig: verdict, parameters against the truth, time.
 
-    python -m experiments.gap_recordings RECORDINGS
+    python -m experiments.gap_recordings RECORDINGS [--half 0|1] [--no-twins] [--json FILE]
 
 Four trials of every case, without `--actual` and with it, in one warm process. These recordings were in
-view while the diagnosis was built: they show that it works, the blind check shows how well. Writes
-experiments/results/gap_recordings.json.
+view while the diagnosis was built: they show that it works, the blind check shows how well. `--half` takes
+one of two random halves of the cases, to develop on one and check on the other. Writes
+experiments/results/gap_recordings.json (FILE with --json), and prints how many of each tier are right.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from estimation.actual import read_actual
 from experiments.recordings import Case, list_cases, read_case
 from simgap.gap.diagnose import diagnose
@@ -24,11 +27,35 @@ RESULT = Path(__file__).parent / "results" / "gap_recordings.json"
 TRIALS = 4
 
 
-def summary(case: Case, folder: Path, measured: bool) -> dict[str, Any]:
+def tier_of(effects: Sequence[str]) -> str:
+    """none, single, pair or outside (an effect that the catalogue does not have)."""
+    if not effects:
+        return "none"
+    if any(e.startswith("x_") for e in effects):
+        return "outside"
+    return "single" if len(effects) == 1 else "pair"
+
+
+def right(tier: str, effects: Sequence[str], found: dict[str, Any]) -> bool:
+    """Whether a verdict is right: a set that holds a single cause is."""
+    if tier in ("none", "outside"):
+        return found["verdict"] == {"none": "none", "outside": "unknown"}[tier]
+    if tier == "single" and found["verdict"] == "set":
+        return effects[0] in [*found["causes"], *found["partners"]]
+    return sorted(found["causes"]) == sorted(effects)
+
+
+def chosen_half(names: Sequence[str], half: int | None) -> list[str]:
+    """One of two random halves, always the same."""
+    order = list(np.random.default_rng(20).permutation(sorted(names)))
+    return sorted(names) if half is None else sorted(order[half::2])
+
+
+def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dict[str, Any]:
     """What one diagnosis found, and the processor and wall seconds it took."""
     actual = read_actual(folder / "actual.toml", case.task.objects) if measured else None
     start, busy = time.perf_counter(), time.process_time()
-    body = diagnose(case.trials[:TRIALS], case.task, case.rig, actual).body
+    body = diagnose(case.trials[:TRIALS], case.task, case.rig, actual, twins=twins).body
     wall, busy = time.perf_counter() - start, time.process_time() - busy
     best = body["effects"].get("+".join(body["causes"]), {"parameters": {}})
     return {
@@ -45,11 +72,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of this experiment."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("recordings", type=Path)
-    folder = parser.parse_args(arguments).recordings
+    parser.add_argument("--half", type=int, choices=(0, 1))
+    parser.add_argument("--no-twins", action="store_true")
+    parser.add_argument("--json", type=Path, default=RESULT)
+    options = parser.parse_args(arguments)
+    folder = options.recordings
     labels = {e["case"]: e for e in json.loads((folder / "labels.json").read_text(encoding="utf-8"))}
-    cases = {path.name: (read_case(path), path) for path in list_cases(folder)}
+    paths = {path.name: path for path in list_cases(folder)}
+    cases = {n: (read_case(paths[n]), paths[n]) for n in chosen_half(list(paths), options.half)}
     first = next(iter(cases.values()))
-    summary(*first, False)  # compiles
+    summary(*first, False, False)  # compiles
     rows = []
     for name, (case, path) in cases.items():
         label = labels.get(name, {})
@@ -58,11 +90,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "truth": label.get("params", {}),
         }  # fmt: skip
         for key, measured in (("blind", False), ("actual", True)):
-            row[key] = summary(case, path, measured)
+            row[key] = summary(case, path, measured, not options.no_twins)
             print(name, key, row[key]["verdict"], row[key]["causes"], row[key]["partners"],
                   row[key]["wall"], "s", flush=True)  # fmt: skip
         rows.append(row)
-    RESULT.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    options.json.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    for tier in ("none", "single", "pair", "outside"):
+        mine = [row for row in rows if tier_of(row["effects"]) == tier]
+        told = [
+            f"{key} {sum(right(tier, row['effects'], row[key]) for row in mine)}"
+            for key in ("blind", "actual")
+        ]
+        print(f"{tier}: right {', '.join(told)} of {len(mine)}")
 
 
 if __name__ == "__main__":
