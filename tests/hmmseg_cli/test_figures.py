@@ -69,7 +69,8 @@ def make_segmentation() -> Segmentation:
 
 
 def make_signals() -> Signals:
-    values = {name: np.sin(T) for name in Signals.__dataclass_fields__ if name not in ("t", "sd_force")}
+    channels = set(Signals.__dataclass_fields__) - {"t", "sd_force", "touches"}
+    values = {name: np.sin(T) for name in channels}
     return Signals(t=T, **values, sd_force=0.01)
 
 
