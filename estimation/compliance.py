@@ -108,6 +108,8 @@ def unexpected_share(shares: np.ndarray, variances: np.ndarray, stated: bool, ad
     """
     if not shares.size:
         return 0.0
+    if not stated:  # a slope's own error is a share of what truly gives
+        variances = variances - SLOPE_SD**2 + (SLOPE_SD * shares) ** 2
     order = np.argsort(shares)
     cumulative = np.cumsum(1 / variances[order])
     middle = float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)])

@@ -10,6 +10,7 @@ experiments/results/identified.json, which docs/calibration.md shows.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 kept[name] = found
                 print(*summary_lines(name, found), sep="\n", flush=True)
         if options.keep:
-            RESULTS.write_text(json.dumps(kept, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            save(RESULTS, kept)
     if options.json is not None:
         options.json.write_text(json.dumps(every, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

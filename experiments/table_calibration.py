@@ -19,6 +19,8 @@ def identified() -> str | None:
         return None
     rows = []
     for name, properties in found.items():
+        if name == "made_by":
+            continue
         for prop, s in properties.items():
             if prop != "all":
                 cells = [f"{s['count']} ({s['null']})", percent(s["median"], 3), percent(s["rms"], 3)]
