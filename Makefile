@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: bench bench-watch before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: boundaries bench bench-watch before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -74,6 +74,10 @@ calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds 
 	$(BIN)/python -m experiments.calibration_worlds
 	$(BIN)/python -m experiments.reference_posteriors
 	$(BIN)/python -m experiments.write_tables
+
+boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/segmentation_results.md
+	$(BIN)/python -m experiments.calibration_boundaries --trials 8
+	$(BIN)/python -m experiments.table_boundaries
 
 paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills docs/reproduction.md
 	$(BIN)/python -m experiments.paper

@@ -276,7 +276,8 @@ def _unnamed(task: BlockTask, design: Design) -> list[str]:
 
 def _misfits(aligned: AlignedTrials) -> list[str]:
     found = [trial.segmentation for trial in aligned.trials]
-    return [f"{s.file}: {failure}" for s in found for failure in s.failures]
+    remarks = dict.fromkeys(remark for s in found for remark in s.remarks)
+    return [*(f"{s.file}: {failure}" for s in found for failure in s.failures), *remarks]
 
 
 def _unrepeated(design: Design) -> list[str]:

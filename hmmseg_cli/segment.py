@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -70,6 +71,7 @@ def segment(
         for segmentation in found:
             out.print(spans_table(segmentation))
             warn_of_misfit(out, segmentation)
+        warn_of_rig(out, found)
         if write is not None:
             write_labels(out, write, paths, recordings, found)
         out.finish({"method": method.value, "trials": [s.to_json() for s in found]})
@@ -125,3 +127,9 @@ def warn_of_misfit(out: Output, segmentation: Segmentation) -> None:
     failed = () if segmentation.failed is None else (segmentation.failed,)
     for failure in segmentation.failures or failed:
         out.warn(f"{segmentation.file}: {failure}")
+
+
+def warn_of_rig(out: Output, found: Sequence[Segmentation]) -> None:
+    """Say once what the recordings contradict the rig in."""
+    for remark in dict.fromkeys(remark for segmentation in found for remark in segmentation.remarks):
+        out.warn(remark)
