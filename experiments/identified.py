@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from experiments.recordings import list_cases, read_case
+from experiments.saving import save
 from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
 
 Row = dict[str, Any]
