@@ -21,6 +21,7 @@ import numpy as np
 
 from estimation.actual import read_actual
 from experiments.recordings import Case, list_cases, read_case
+from experiments.saving import save
 from simgap.gap.diagnose import diagnose
 
 RESULT = Path(__file__).parent / "results" / "gap_recordings.json"
@@ -94,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(name, key, row[key]["verdict"], row[key]["causes"], row[key]["partners"],
                   row[key]["wall"], "s", flush=True)  # fmt: skip
         rows.append(row)
-    options.json.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        save(options.json, {"rows": rows})  # after every case: what is there so far counts
     for tier in ("none", "single", "pair", "outside"):
         mine = [row for row in rows if tier_of(row["effects"]) == tier]
         told = [

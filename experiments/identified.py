@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.keep:
             save(RESULTS, kept)
     if options.json is not None:
-        options.json.write_text(json.dumps(every, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        save(options.json, every)
 
 
 def _kind(row: Row) -> str:

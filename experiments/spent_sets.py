@@ -32,6 +32,7 @@ ORDER = [
     "ninth",
     "tenth",
     "eleventh",
+    "twelfth",
 ]
 SHOWN = {
     "false_alarms": "false alarms on healthy recordings",
@@ -48,7 +49,8 @@ SHOWN = {
 
 def spent_set(name: str) -> dict[str, Any]:
     """One set: where its file lies, its hash, seal, code, number of cases, figures and rivals."""
-    path = f"experiments/results/blind_check_{name}.json"
+    last = "" if name == ORDER[-1] else f"_{name}"
+    path = f"experiments/results/blind_check{last}.json"
     content = subprocess.run(
         ["git", "show", f"{COMMIT}:{path}"], cwd=ROOT, check=True, capture_output=True
     ).stdout

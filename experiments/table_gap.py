@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+from experiments import table_blind_check
 from experiments.table_text import load, markdown, percent
 
-BANKS = {
-    "nominal": "nominal bank",
-    "bootstrap": "bootstrap",
-    "calibrated": "calibrated",
-}
+
+def diagnosed() -> list[dict[str, Any]] | None:
+    """Diagnoses of labelled recordings by the present engine; None where there are none."""
+    found = load("gap_recordings")
+    return found["rows"] if isinstance(found, dict) else None
 
 
 def recordings() -> str | None:
     """docs/gap_results.md: verdicts on labelled recordings."""
-    rows = load("gap_recordings")
+    rows = diagnosed()
     if rows is None:
         return None
     head = ["recording", "verdict without `actual`", "with `actual`", "parameters found (90 % interval)",
@@ -45,23 +46,9 @@ def _verdict(found: dict[str, Any]) -> str:
     return " + ".join(found["causes"]) or found["verdict"]
 
 
-def rigs() -> str | None:
-    """docs/gap_results.md: false alarms on other rigs by the bank that judges them."""
-    found = load("gap_rigs")
-    if found is None:
-        return None
-    head = ["rig or task", "healthy cases"]
-    head += [f"{bank}, p < {level}" for bank in BANKS.values() for level in found["levels"]]
-    rows = [
-        [name, f"{row['cases']}"] + [percent(share, 0) for bank in BANKS for share in row[bank]["below"]]
-        for name, row in found["rigs"].items()
-    ]
-    return markdown(head, rows)
-
-
 def summary() -> str | None:
     """docs/results.md: how often the diagnosis is right."""
-    rows = load("gap_recordings")
+    rows = diagnosed()
     if rows is None:
         return None
     affected = [r for r in rows if r["effects"]]
@@ -72,7 +59,7 @@ def summary() -> str | None:
     }
     sets = sum(r["blind"]["verdict"] == "set" and r["effects"][0] in r["blind"]["causes"] for r in affected)
     quiet = sum(r["blind"]["verdict"] == "none" and r["actual"]["verdict"] == "none" for r in healthy)
-    blind = load("blind_check")
+    blind = table_blind_check.fresh()
     check = "" if blind is None else _blind(blind)
     slowest = max(r["blind"]["wall"] for r in rows)
     return (

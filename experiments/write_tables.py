@@ -161,7 +161,6 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/calibration.md", "misfits", misfits),
     ("docs/results.md", "gap", table_gap.summary),
     ("docs/gap_results.md", "recordings", table_gap.recordings),
-    ("docs/gap_results.md", "rigs", table_gap.rigs),
     ("docs/gap_results.md", "blind", table_blind_check.table),
     ("docs/history.md", "blind_sets", spent_sets.table),
     ("docs/benchmarks.md", "kernels", table_speed.kernels),

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.bank import Deviations, deviated, nominal, simulated_cases
 from experiments.estimates import Estimates, summarise_estimates
-from experiments.table_gap import rigs
+from experiments.table_blind_check import fresh
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, markdown
@@ -123,13 +123,9 @@ def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
     np.testing.assert_allclose(before.x1 - after.x1, give, atol=1e-9)
 
 
-def test_other_rigs_show_alarms_by_bank_and_level(monkeypatch):
-    shares = {"nominal": [0.5, 0.25], "bootstrap": [0.1, 0.0], "calibrated": [0.05, 0.01]}
-    row = {"cases": 16} | {bank: {"p": [], "below": below} for bank, below in shares.items()}
-    found = {"gap_rigs": {"levels": [0.05, 0.01], "rigs": {"100 Hz": row}}}
-    monkeypatch.setattr("experiments.table_gap.load", found.get)
-    table = rigs() or ""
-    assert "| nominal bank, p < 0.05 | nominal bank, p < 0.01 | bootstrap, p < 0.05 |" in table
-    assert "| 100 Hz | 16 | 50 % | 25 % | 10 % | 0 % | 5 % | 1 % |" in table
-    monkeypatch.setattr("experiments.table_gap.load", {}.get)
-    assert rigs() is None
+def test_a_spent_blind_set_is_no_result(monkeypatch):
+    seals = {"blind_check": {"seal": {"sha256": "a"}}, "blind_sets": {"sets": [{"seal": "a"}]}}
+    monkeypatch.setattr("experiments.table_blind_check.load", seals.get)
+    assert fresh() is None
+    seals["blind_sets"] = {"sets": [{"seal": "b"}]}
+    assert fresh() is seals["blind_check"]
