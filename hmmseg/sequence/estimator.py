@@ -1,0 +1,96 @@
+"""A scikit-learn estimator of plain ordered sequences: fit, predict, samples labelled by their state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from sklearn.base import BaseEstimator, ClusterMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from hmmseg.errors import InputError
+from hmmseg.io.task import SequenceTask, parse_task
+from hmmseg.io.trial import Trial
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.segment import segment_sequence
+
+
+class OrderedSegmenter(ClusterMixin, BaseEstimator):
+    """States that follow one another in a known order, learned without labels or from some.
+
+    `n_states`: how many, each seen once and in order; `rate` [Hz] of the samples; `random_state`: the seed.
+    X is one sequence (num_timesteps, num_channels), or a list of several. After `fit`, `model_` is the
+    learned model and `labels_` the states (num_timesteps,) of a single X, 0 to n_states - 1.
+    """
+
+    def __init__(self, n_states: Any = 2, rate: Any = 1.0, random_state: Any = None) -> None:
+        self.n_states = n_states
+        self.rate = rate
+        self.random_state = random_state
+
+    def fit(self, X: Any, y: Any = None) -> OrderedSegmenter:
+        """Learn from one sequence or several; `y`: for several, states of some (None for the others).
+
+        ValueError for what is too short, not finite or of another number of channels.
+        """
+        several = _several(X)
+        sequences = self._checked(X, reset=True)
+        trials = self._trials(sequences)
+        labels = {} if y is None or not several else self._boundaries(trials, y)
+        seed = 0 if self.random_state is None else int(self.random_state)
+        self.model_ = fit_sequence(trials, self._order(sequences[0].shape[1]), labels or None, seed)
+        self.labels_ = self.predict(X) if not several else np.concatenate(self.predict(X))
+        return self
+
+    def predict(self, X: Any) -> Any:
+        """States (num_timesteps,) of one sequence, or a list of them."""
+        check_is_fitted(self, "model_")
+        sequences = self._checked(X, reset=False)
+        order = self._order(sequences[0].shape[1])
+        out = []
+        for trial in self._trials(sequences):
+            spans = segment_sequence([trial], order, self.model_)[0].spans
+            names = list(order.sequence)
+            edges = np.array([span.start for span in spans[1:]])
+            states = np.array([names.index(span.subtask) for span in spans] or [0])
+            out.append(states[np.searchsorted(edges, trial.t, side="right")])
+        return out if _several(X) else out[0]
+
+    def _order(self, channels: int) -> SequenceTask:
+        task = parse_task({"sequence": [f"state{k}" for k in range(self.n_states)],
+                           "channels": [f"x{k}" for k in range(channels)]})  # fmt: skip
+        assert isinstance(task, SequenceTask)
+        return task
+
+    def _checked(self, X: Any, reset: bool) -> list[np.ndarray]:
+        found = []
+        for k, each in enumerate(X if _several(X) else [X]):
+            least = max(8, 2 * self.n_states)
+            found.append(
+                validate_data(self, each, reset=reset and k == 0, dtype=float, ensure_min_samples=least)
+            )
+        return found
+
+    def _trials(self, sequences: Sequence[np.ndarray]) -> list[Trial]:
+        return [
+            Trial(
+                f"sequence{k}", np.arange(len(x)) / self.rate, {f"x{c}": x[:, c] for c in range(x.shape[1])}
+            )
+            for k, x in enumerate(sequences)
+        ]
+
+    def _boundaries(self, trials: Sequence[Trial], y: Any) -> dict[str, list[float]]:
+        out = {}
+        for trial, states in zip(trials, y, strict=True):
+            if states is None:
+                continue
+            states = np.asarray(states)
+            if states.shape != trial.t.shape or (np.diff(states) < 0).any():
+                raise InputError("y", f"{trial.file} has states that go back or are not one a sample")
+            out[trial.file] = [float(trial.t[np.argmax(states >= k)]) for k in range(1, self.n_states)]
+        return out
+
+
+def _several(X: Any) -> bool:
+    return isinstance(X, list | tuple) and len(X) > 0 and np.ndim(X[0]) == 2
