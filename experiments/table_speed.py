@@ -62,6 +62,21 @@ def commands() -> str | None:
     )
 
 
+def lengths() -> str | None:
+    """docs/benchmarks.md: long recordings."""
+    found = load("benchmark_long")
+    if found is None:
+        return None
+    rows = [
+        [f"{row['seconds']:.0f} s", f"{row['rows']:,}", f"{row['found']} of {row['rounds']}",
+         f"{row['processor']:.2f} s", f"{1e6 * row['processor'] / row['rows']:.1f} µs",
+         f"{row['memory_mb']:.0f} MB"]
+        for row in found["lengths"]
+    ]  # fmt: skip
+    head = ["recording", "rows", "rounds found", "processor", "a row", "memory on top"]
+    return markdown(head, rows)
+
+
 def watch() -> str | None:
     """docs/watch.md: what `make bench-watch` measured."""
     found = load("watch")

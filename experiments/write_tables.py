@@ -166,6 +166,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/benchmarks.md", "kernels", table_speed.kernels),
     ("docs/benchmarks.md", "smoothing", table_speed.smoothing),
     ("docs/benchmarks.md", "commands", table_speed.commands),
+    ("docs/benchmarks.md", "lengths", table_speed.lengths),
     ("docs/watch.md", "watch", table_speed.watch),
     ("docs/before_after.md", "before_after", before_after.table),
 )

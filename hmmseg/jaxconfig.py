@@ -25,8 +25,13 @@ def cache_folder() -> Path:
     return Path(base) / "hmmseg"
 
 
-def configure() -> None:
-    """Double precision and the persistent cache for this whole process, JAX imported already or not."""
+def configure(steady: bool = False) -> None:
+    """Double precision and the persistent cache for this whole process, JAX imported already or not.
+
+    `steady`: for a program that calls JAX in a loop with a deadline, before its first computation. JAX then
+    computes in the calling thread; handing over to another one holds up a step in some 250 for 0.3 ms
+    (experiments/benchmarks/haptic_loop.py).
+    """
     settings: dict[str, Any] = {
         "jax_enable_x64": True,
         "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -34,6 +39,8 @@ def configure() -> None:
     }
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         settings["jax_compilation_cache_dir"] = str(cache_folder() / "jax")
+    if steady:
+        settings["jax_cpu_enable_async_dispatch"] = False
     for name, value in settings.items():  # what JAX reads when it is imported
         os.environ[name.upper()] = str(value)
     if "jax" in sys.modules:

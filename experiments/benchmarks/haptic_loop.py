@@ -3,7 +3,9 @@
     python -m experiments.benchmarks.haptic_loop [--seconds 60] [--realtime] [--output FILE.json]
 
 Rate: two blocks picked and stacked over and over at 4 kHz, every step timed on one core, memory
-watched. With `--realtime` it runs as a haptic loop would: paced by the clock, before all other
+watched, beside loops at the same pace that do nothing, or arithmetic for as long as a step takes: how
+late those are, the machine is. With
+`--realtime` it runs as a haptic loop would: paced by the clock, before all other
 processes; without, as fast as it can. Passivity: a light device, squeezed onto a block by a
 spring, feels forces that are held for a period and one sample old; port energy and remaining
 motion over a range of pad stiffness, at 1 and 4 kHz, without and with passivity control, beside
@@ -15,9 +17,11 @@ from __future__ import annotations
 import argparse
 import gc
 import itertools
+import json
 import os
 import time
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +29,12 @@ import numpy as np
 from experiments.saving import save
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
+from hmmseg.jaxconfig import configure
 from simgap.world.haptics import PassivityControl, stiffest_passive
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.scene import Surroundings
 from simgap.world.simulate import simulate_trial
-from simgap.world.virtual_model import VirtualModel
+from simgap.world.virtual_model import VirtualModel, _program
 
 TASK = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
 PADS = Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0)
@@ -50,31 +55,62 @@ def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str,
     position, velocity = column(done.motion.position), column(done.motion.velocity)
     model.prepare(1 / rate)
     steps = round(seconds * rate)
-    times = np.zeros(steps)
+
+    def step(k: int) -> None:
+        row = k % len(t)
+        if row == 0:
+            model.reset()
+        model.step(position[row], velocity[row], 1 / rate)
+
+    compiled = _program.cache_info().misses
+    wall, busy = _timed(step, steps, rate, paced)
+    empty, _ = _timed(lambda k: None, steps, rate, paced)
+    compiled = _program.cache_info().misses - compiled
+    spin = _spin(float(np.median(busy)))
+    spinning, _ = _timed(lambda k: spin(), steps, rate, paced)
+    grown = _growth(model, position, velocity, 1 / rate)
+    return {
+        "steps": steps, "mean_us": wall.mean(), "median_us": float(np.median(wall)),
+        "p99_us": float(np.percentile(wall, 99)), "p99_9_us": float(np.percentile(wall, 99.9)),
+        "worst_us": wall.max(), "late": int((wall > 1e6 / rate).sum()),
+        "processor_median_us": float(np.median(busy)), "processor_p99_9_us": float(np.percentile(busy, 99.9)),
+        "processor_worst_us": busy.max(), "processor_late": int((busy > 1e6 / rate).sum()),
+        "spinning_loop_p99_9_us": float(np.percentile(spinning, 99.9)),
+        "spinning_loop_worst_us": spinning.max(),
+        "spinning_loop_late": int((spinning > 1e6 / rate).sum()),
+        "empty_loop_worst_us": empty.max(), "empty_loop_late": int((empty > 1e6 / rate).sum()),
+        "rate_hz": 1e6 / wall.mean(), "programs_compiled_in_the_loop": compiled,
+        "grown_bytes_in_10000_steps": grown,
+    }  # fmt: skip
+
+
+def _spin(micro: float) -> Callable[[], object]:
+    """Arithmetic that touches no memory and takes about so many us of the processor."""
+    work = lambda n: sum(range(n))  # noqa: E731
+    began = time.thread_time_ns()
+    for _ in range(1000):
+        work(1000)
+    number = round(1000 * micro / ((time.thread_time_ns() - began) * 1e-6))
+    return lambda: work(number)
+
+
+def _timed(
+    step: Callable[[int], None], steps: int, rate: float, paced: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Wall and processor time [us] of every step; garbage is not collected meanwhile."""
+    wall, busy = np.zeros(steps), np.zeros(steps)
     gc.collect()
     gc.freeze()
     gc.disable()
-    used, start = time.process_time(), time.perf_counter()
+    start = time.perf_counter()
     for k in range(steps):
         if paced:
             time.sleep(max(0.0, start + k / rate - time.perf_counter()))
-        if k % len(t) == 0:
-            model.reset()
-        row = k % len(t)
-        begin = time.perf_counter()
-        model.step(position[row], velocity[row], 1 / rate)
-        times[k] = time.perf_counter() - begin
-    used = time.process_time() - used
+        used, begin = time.thread_time_ns(), time.perf_counter()
+        step(k)
+        wall[k], busy[k] = time.perf_counter() - begin, time.thread_time_ns() - used
     gc.enable()
-    grown = _growth(model, position, velocity, 1 / rate)
-    micro = 1e6 * times
-    return {
-        "steps": steps, "cpu_mean_us": 1e6 * used / steps, "mean_us": micro.mean(),
-        "median_us": float(np.median(micro)),
-        "p99_us": float(np.percentile(micro, 99)), "p99_99_us": float(np.percentile(micro, 99.99)),
-        "worst_us": micro.max(), "late": int((micro > 1e6 / rate).sum()), "rate_hz": 1e6 / micro.mean(),
-        "grown_bytes_in_10000_steps": grown,
-    }  # fmt: skip
+    return 1e6 * wall, 1e-3 * busy
 
 
 def _growth(model: VirtualModel, position: np.ndarray, velocity: np.ndarray, dt: float) -> int:
@@ -139,14 +175,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the timed run")
     parser.add_argument("--output", type=Path, default=Path("experiments/results/haptic_loop.json"))
     parser.add_argument("--realtime", action="store_true", help="real-time priority (Linux, with the right)")
+    parser.add_argument("--rate-only", action="store_true", help="keep the passivity of the run before")
     options = parser.parse_args()
+    configure(steady=True)
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     if options.realtime:  # before the first computation: its threads inherit the priority
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
     rate = measure_rate(options.seconds, paced=options.realtime) | {"realtime": options.realtime}
     if options.realtime:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    result = {"rate": rate, "passivity": measure_passivity()}
+    passivity = None
+    if options.rate_only and options.output.exists():
+        passivity = json.loads(options.output.read_text())["passivity"]
+    result = {"rate": rate, "passivity": passivity or measure_passivity()}
     options.output.parent.mkdir(parents=True, exist_ok=True)
     save(options.output, result)
     for key, value in result["rate"].items():

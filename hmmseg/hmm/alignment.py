@@ -13,6 +13,7 @@ import numpy as np
 
 from hmmseg.hmm.chain import Chain, not_numbers
 from hmmseg.hmm.inference import table, tables_of, viterbi
+from hmmseg.hmm.results import Alignment as Best
 
 Bands = tuple[np.ndarray, ...]
 
@@ -45,6 +46,7 @@ def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.nda
     if missing.any():
         raise not_numbers(ll, int(missing.any(axis=1).argmax()))
     best = viterbi(ll, chain)
+    assert isinstance(best, Best)  # of one recording
     log_evidence, _, smoothed, moves = tables_of(ll, chain, True, False, True)
     return Alignment(best.path, best.log_prob, log_evidence, smoothed, moves[0], tuple(moves[1:]))
 
