@@ -11,7 +11,15 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments import before_after, spent_sets, table_blind_check, table_calibration, table_gap, table_speed
+from experiments import (
+    before_after,
+    patch_heldout,
+    spent_sets,
+    table_blind_check,
+    table_calibration,
+    table_gap,
+    table_speed,
+)
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
@@ -161,6 +169,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
     ("docs/calibration.md", "misfits", misfits),
     ("docs/results.md", "gap", table_gap.summary),
     ("docs/gap_results.md", "recordings", table_gap.recordings),
+    ("docs/gap_results.md", "patch", patch_heldout.table),
     ("docs/gap_results.md", "blind", table_blind_check.table),
     ("docs/history.md", "blind_sets", spent_sets.table),
     ("docs/benchmarks.md", "kernels", table_speed.kernels),

@@ -1,4 +1,4 @@
-"""How often the likeliest verdict of the blind check is right, by the probability it was given."""
+"""How often what the blind check was told comes true, by the probability it was given."""
 
 from __future__ import annotations
 
@@ -8,26 +8,23 @@ from hmmseg.plot.style import BLUE, GREY, canvas
 from paper_figs.gap_results import load
 from paper_figs.results import target
 
+PANELS = (("calibration_error", "the likeliest verdict"), ("inclusion_all", "that an effect acts"))
+
 
 def main() -> None:
-    found = load()
-    bins, error = found["reliability"], found["table"]["calibration_error"]["value"]
-    with canvas(target("gap_reliability"), width=3.6, height=3.2) as figure:
-        ax = figure.subplots()
-        ax.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls="--", label="as said")
-        said = np.array([b["said"] for b in bins])
-        right = np.array([b["right"]["value"] for b in bins])
-        ends = np.array([b["right"]["interval_95"] for b in bins]).T
-        ax.errorbar(said, right, np.abs(ends - right), fmt="o", ms=4, color=BLUE, capsize=2, lw=0.9,
-                    label="found, 95 % interval")  # fmt: skip
-        for x, y, b in zip(said, right, bins, strict=True):
-            ax.annotate(f"{b['right']['count']}", (x, y), (5, -9), textcoords="offset points", fontsize=6.5)
-        ax.set_xlabel("probability of the likeliest verdict")
-        ax.set_ylabel("share that is right")
-        ax.set_xlim(0, 1.04)
-        ax.set_ylim(-0.02, 1.04)
-        ax.set_title(f"calibration error {error:.3f}; numbers are cases", loc="left")
-        ax.legend(loc="upper left")
+    found = load()["table"]
+    with canvas(target("gap_reliability"), height=3.2) as figure:
+        for ax, (key, words) in zip(figure.subplots(1, 2), PANELS, strict=True):
+            bins = found[key]["bins"]
+            ax.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls="--", label="as said")
+            said, true = (np.array([b[k] for b in bins]) for k in ("said", "true"))
+            ax.plot(said, true, "o", ms=4, color=BLUE, label="found")
+            for x, y, b in zip(said, true, bins, strict=True):
+                ax.annotate(f"{b['count']}", (x, y), (5, -9), textcoords="offset points", fontsize=6.5)
+            ax.set(xlabel=f"probability of {words}", ylabel="share that comes true")
+            ax.set(xlim=(-0.02, 1.04), ylim=(-0.02, 1.04))
+            ax.set_title(f"calibration error {found[key]['value']:.3f}; numbers are counts", loc="left")
+            ax.legend(loc="upper left")
 
 
 if __name__ == "__main__":

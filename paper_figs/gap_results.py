@@ -14,8 +14,3 @@ RESULTS = ROOT / "experiments" / "results" / "blind_check.json"
 def load(path: Path = RESULTS) -> dict[str, Any]:
     """The scored check."""
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def words(name: str) -> str:
-    """An effect's name for the eye."""
-    return name.replace("_", " ")

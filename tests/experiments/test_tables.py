@@ -5,7 +5,9 @@ import pytest
 
 from experiments.bank import Deviations, deviated, nominal, simulated_cases
 from experiments.estimates import Estimates, summarise_estimates
+from experiments.patch_heldout import table as patched
 from experiments.table_blind_check import fresh
+from experiments.patch_heldout import table as patched
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, markdown
@@ -129,3 +131,19 @@ def test_a_spent_blind_set_is_no_result(monkeypatch):
     assert fresh() is None
     seals["blind_sets"] = {"sets": [{"seal": "b"}]}
     assert fresh() is seals["blind_check"]
+
+
+def test_patched_models_show_what_they_leave(monkeypatch):
+    named = {
+        "recording": "a",
+        "verdict": "named",
+        "causes": ["force_bias"],
+        "nominal": 0.2,
+        "patched": 0.0512,
+    }
+    quiet = {"recording": "b", "verdict": "none", "causes": []}
+    monkeypatch.setattr("experiments.patch_heldout.load", {"patch_heldout": {"rows": [named, quiet]}}.get)
+    table = patched() or ""
+    assert "| a | force_bias | 0.200 | 0.051 |" in table and "| b | none |  |  |" in table
+    monkeypatch.setattr("experiments.patch_heldout.load", {}.get)
+    assert patched() is None
