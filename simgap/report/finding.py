@@ -32,6 +32,7 @@ WHEN = {
 SLOW = 1.5  # Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
 TINY = 1e-16
+MOSTLY = 0.5  # a remainder above it is the larger part of the gap
 
 
 def p_text(p: float) -> str:
@@ -66,7 +67,9 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     if verdict == "unknown":
         return "A gap that no known cause explains"
     text = named(body, rig)
-    return text[0].upper() + text[1:]
+    rest = (body.get("remainder") or {}).get("share")
+    more = ", and a larger gap that no known cause explains" if rest is not None and rest > MOSTLY else ""
+    return text[0].upper() + text[1:] + more
 
 
 def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:

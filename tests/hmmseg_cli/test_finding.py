@@ -79,6 +79,11 @@ def test_a_named_cause_is_told_with_what_it_leaves():
     assert left[1].startswith("The height difference of the fingers is off while you carry block1: 10 %")
 
 
+def test_a_cause_of_the_smaller_part_is_said_to_be_that():
+    found = body("named", ["table_tilt"], remainder={"share": 0.9, "p_value": 0.0, "where": []})
+    assert headline(found) == "A table that is not level, and a larger gap that no known cause explains"
+
+
 def test_an_unknown_gap_says_what_moves():
     found = body("unknown", [], remainder={"share": 0.7, "p_value": 1e-9, "where": []})
     first, second = moving(found)
