@@ -7,7 +7,6 @@ from experiments.bank import Deviations, deviated, nominal, simulated_cases
 from experiments.estimates import Estimates, summarise_estimates
 from experiments.patch_heldout import table as patched
 from experiments.table_blind_check import fresh
-from experiments.patch_heldout import table as patched
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, markdown
