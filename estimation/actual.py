@@ -12,7 +12,7 @@ from hmmseg.io.schema import read_toml
 
 UNITS = {"weight": "N", "width": "m", "height": "m", "friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
-DISAGREES = 4.0  # sds of both together; by chance in one of 16,000 comparisons
+DISAGREES = 4.0  # chosen: sds of both together; by chance in one of 16,000 comparisons
 
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:

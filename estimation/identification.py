@@ -27,8 +27,8 @@ from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import as_html, as_text
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
-NOT_LEVEL = 2e-3  # m; more than a tilted table or a slip in the grip make of a move on a level
-INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}
+NOT_LEVEL = 2e-3  # chosen: m; more than a tilted table or a slip in the grip make of a move on a level
+INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # chosen
 
 
 @dataclass(frozen=True, repr=False)

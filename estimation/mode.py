@@ -8,8 +8,9 @@ import numpy as np
 
 from estimation.posterior import NUM_CHANNELS, Posterior
 
-STEP = 1e-3  # of the scales, all logarithms, for derivatives by central differences
-STARTS = np.arange(-1.0, 9.0, 1.0)  # of log(share / its prior median): a large share is a mode of its own
+STEP = 1e-3  # numerics: of the scales, all logarithms, for derivatives by central differences
+# numerics: of log(share / its prior median): a large share is a mode of its own
+STARTS = np.arange(-1.0, 9.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial
 
-# A pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off by as
-# much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
+# chosen: a pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off
+# by as much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
 MOST_BENT = 0.5
 
 

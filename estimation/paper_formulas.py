@@ -28,7 +28,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import StateLabels, label_states
 
-TRIM = 0.05  # share of the carry left out at either end of the weight estimate
+TRIM = 0.05  # chosen: share of the carry left out at either end of the weight estimate
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 
 

@@ -17,8 +17,8 @@ from estimation.observations import CHANNELS
 from estimation.posterior import NUM_CHANNELS, Posterior
 from estimation.sampler import Draws
 
-NUM_REPLICATES = 400
-SMALL = 0.005
+NUM_REPLICATES = 400  # numerics
+SMALL = 0.005  # chosen
 MEANING = {
     "force": "the net vertical force while carried differs between grips",
     "distance": "the distance of the fingers while held differs between grips",

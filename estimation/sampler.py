@@ -23,18 +23,18 @@ from estimation.proposal import Proposal, proposal
 if TYPE_CHECKING:
     import emcee
 
-INDEPENDENT = 0.9  # share of independence proposals
-WALKERS = 64
-BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000
-MIN_LENGTH = 50  # steps in units of the autocorrelation time, emcee's own rule
-MIN_ESS, MAX_RHAT = 1000.0, 1.01
+INDEPENDENT = 0.9  # chosen: share of independence proposals
+WALKERS = 64  # numerics: of emcee
+BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000  # numerics
+MIN_LENGTH = 50  # cited: steps in units of the autocorrelation time, emcee's own rule
+MIN_ESS, MAX_RHAT = 1000.0, 1.01  # cited: Gelman et al. 2013, and enough for two digits of a quantile
 ENOUGH = 1.5 * MIN_ESS  # to stop at: an estimate of it is itself uncertain
-GROUPS = 4  # chains that walkers are joined into for R-hat
-KEPT = 4096  # draws of the unknowns at least, where the chain has so many
-BATCH = 256  # drawn at once
-IMPORTANCE = 4000  # independent draws that the chain is checked against
-MIN_EFFICIENCY = 0.05  # of them, for a check, and to stand in where the chain does not converge
-MAX_APART = 0.25  # of a posterior sd, between the chain's means of the scales and those draws'
+GROUPS = 4  # numerics: chains that walkers are joined into for R-hat
+KEPT = 4096  # numerics: draws of the unknowns at least, where the chain has so many
+BATCH = 256  # numerics: drawn at once
+IMPORTANCE = 4000  # numerics: independent draws that the chain is checked against
+MIN_EFFICIENCY = 0.05  # chosen: of them, for a check, and to stand in where the chain does not converge
+MAX_APART = 0.25  # chosen: of a posterior sd, between the chain's means of the scales and those draws'
 
 
 @dataclass(frozen=True)

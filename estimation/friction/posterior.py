@@ -22,11 +22,11 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 
-# While a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
+# chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
 # ratio of two small forces says little: samples below this share of the grip's median are left out.
 FIRM = 0.5
-CLEAR = 5.0  # noise sds that a normal force must reach
-FEW_FREE = 5  # samples of free motion below which they do not tell the force bias
+CLEAR = 5.0  # chosen: noise sds that a normal force must reach
+FEW_FREE = 5  # chosen: samples of free motion below which they do not tell the force bias
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Finger
 
 Array = Any  # np.ndarray or jax.Array
-ELBOW = {1: -1.0, 2: 1.0}  # sign of the turn from the line base-tip to link 1: elbows point outwards
+ELBOW = {1: -1.0, 2: 1.0}  # physics: sign of the turn from the line base-tip to link 1: elbows point outwards
 
 
 def forward(finger: Finger, q: Array) -> Array:

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-STEP = 0.02  # s; speeds are taken over this: a gripper's motor changes them no faster
-SLOWED = 0.9  # share of its speed that a closing keeps until the first touch: chosen
-ABRUPT = 0.5  # share of its speed that a closing loses from one step to the next at a hard touch: chosen
-SOFT = 0.1  # of what gives in a grip: its touch is known no better, as pads are no ideal springs; chosen
-GIVE = (1e-3, 1.5e-3)  # m, mean and sd: what pads and drive give in a grip, before anything is seen; chosen
-LEAST_CLOSING = 1e-3  # m; a smaller swing of the opening is no grip
-CLEAR = 6.0  # noise sds of a third difference: a kink
+STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
+SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first touch
+ABRUPT = 0.5  # chosen: share of its speed that a closing loses from one step to the next at a hard touch
+SOFT = 0.1  # chosen: of what gives in a grip: its touch is known no better, as pads are no ideal springs
+GIVE = (1e-3, 1.5e-3)  # chosen: m, mean and sd: what pads and drive give in a grip, before anything is seen
+LEAST_CLOSING = 1e-3  # chosen: m; a smaller swing of the opening is no grip
+CLEAR = 6.0  # chosen: noise sds of a third difference: a kink
 
 
 @dataclass(frozen=True)

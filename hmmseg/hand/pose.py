@@ -10,9 +10,9 @@ from hmmseg.errors import InputError
 from hmmseg.io.gripper import AXES, Gripper, direction
 from hmmseg.io.trial import Trial
 
-WINDOW, WIDEST = 0.1, 0.4  # s over which motion is smoothed, chosen: arms change no faster
-LEAST = 3  # samples of the same: what a parabola needs
-QUIET = 0.1  # m/s^2; the window widens until the acceleration's noise is less: a hundredth of gravity
+WINDOW, WIDEST = 0.1, 0.4  # chosen: s over which motion is smoothed: arms change no faster
+LEAST = 3  # chosen: samples of the same: what a parabola needs
+QUIET = 0.1  # chosen: m/s^2; the window widens until the acceleration's noise is less: a hundredth of gravity
 
 
 @dataclass(frozen=True)

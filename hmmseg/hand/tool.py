@@ -25,11 +25,11 @@ from hmmseg.io.gripper import Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
-ROUNDS = 20
-TAIL = 4.0  # degrees of freedom of the Student-t weights, as in the emissions
-CLEAR = 5.0  # standard errors at which a parameter shows in free motion
-TURNED = 0.02  # rad, root mean square: a hand that turns less tells nothing of its weight and centre
-SAMPLES = 20  # of free motion, at least
+ROUNDS = 20  # numerics: of an iteration that settles sooner
+TAIL = 4.0  # chosen: degrees of freedom of the Student-t weights, as in the emissions
+CLEAR = 5.0  # chosen: standard errors at which a parameter shows in free motion
+TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
+SAMPLES = 20  # chosen: of free motion, at least
 
 
 @dataclass(frozen=True)

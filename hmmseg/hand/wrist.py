@@ -21,14 +21,15 @@ from hmmseg.io.gripper import Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
-ACTIVE = 8.0  # noise scales above which the wrist feels something: chosen
-RAISED = 3e-3  # m from where it gripped: the hand has gone somewhere
-TOGETHER = 5  # samples within one smoothing window
-LOADED = 5.0  # standard errors at which a grip carries a load
-LAG = 0.012  # s; pads touch and let go off the opening's width by this, chosen: they are no ideal springs
-CLIPPED = 2.0  # noise scales
-STRAY, STRAY_TIME = 0.3, 0.1  # N, s: a touch in free motion that is told, chosen
-NOMINAL = 1.0  # N; stands for a grip of rigid pads whose force nobody measured: any will do
+ACTIVE = 8.0  # chosen: noise scales above which the wrist feels something
+RAISED = 3e-3  # chosen: m from where it gripped: the hand has gone somewhere
+TOGETHER = 5  # chosen: samples within one smoothing window
+LOADED = 5.0  # chosen: standard errors at which a grip carries a load
+# chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
+LAG = 0.012
+CLIPPED = 2.0  # chosen: noise scales
+STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is told
+NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
 HIDDEN_GRIP = (
     "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
     "[gripper] would tell"

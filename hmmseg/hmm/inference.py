@@ -23,9 +23,9 @@ from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
 from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
 
 Tables = Any  # one array, or a sequence of arrays
-_NONE = np.empty((0, 0))
+_NONE = np.empty((0, 0))  # numerics
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
-_CELLS_A_THREAD = 1 << 17  # below, another thread costs more than it saves
+_CELLS_A_THREAD = 1 << 17  # numerics: below, another thread costs more than it saves
 
 
 def table(log_likelihoods: ArrayLike, chain: Chain) -> np.ndarray:

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from hmmseg.hmm.chain import Chain, InfeasibleAlignment
 
-_SPARE = 64  # rows; the window moves to the front of its table only once in so many samples or more
-_LN2 = math.log(2)
+_SPARE = 64  # numerics: rows; the window moves to the front of its table only once in so many samples or more
+_LN2 = math.log(2)  # physics: a logarithm
 
 
 @dataclass(frozen=True)

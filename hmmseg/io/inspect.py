@@ -16,8 +16,8 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.units import unit_in_name
 
-BUCKETS = 24
-GAP = 3.0  # usual sample periods
+BUCKETS = 24  # numerics: of a small plot
+GAP = 3.0  # chosen: usual sample periods
 
 
 @dataclass(frozen=True)

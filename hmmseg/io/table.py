@@ -9,7 +9,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 
-MAX_ROWS = 200_000_000  # more is a damaged or hostile file: 13 columns of it would be 20 GB
+MAX_ROWS = 200_000_000  # numerics: more is a damaged or hostile file: 13 columns of it would be 20 GB
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from hmmseg.online.layout import AY, FX1, LAST_D, LAST_Y, SD_D, SD_VX, SD_VY, SD
 from hmmseg.segmentation.features import MAX_RATE, WINDOW
 
 SLOPE = 1.0 / MAX_RATE
-ROWS = 512  # rows looked back at, at most: 20 kHz over SLOPE
-NUM_MEANS = 8  # forces, vx, vy, y, d
+ROWS = 512  # numerics: rows looked back at, at most: 20 kHz over SLOPE
+NUM_MEANS = 8  # chosen: forces, vx, vy, y, d
 
 
 @compiled

@@ -27,9 +27,9 @@ from hmmseg.segmentation.pads import sense
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter
 
-NEAREST = 6  # samples of a hold that locate the block next to a contact change
-REACH = 0.6  # s before a boundary: what is read of the subtask that it ends
-FINE = 100.0  # Hz; in faster recordings the filter itself places touches
+NEAREST = 6  # chosen: samples of a hold that locate the block next to a contact change
+REACH = 0.6  # chosen: s before a boundary: what is read of the subtask that it ends
+FINE = 100.0  # numerics: Hz; in faster recordings the filter itself places touches
 SCALES: tuple[str, ...] = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
 
 

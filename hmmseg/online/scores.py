@@ -51,21 +51,21 @@ from hmmseg.online.layout import (
 )
 from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TAIL, TOUCHING
 
-STILL = 0.2  # prior share of samples at which a hand that may move stands still,
-JUST_LIFTED = 0.05  # ... times this while a lift begins: slow, but a motion
-ALIKE = 0.5  # prior probability that a block not met yet is like one that was
+STILL = 0.2  # chosen: prior share of samples at which a hand that may move stands still,
+JUST_LIFTED = 0.05  # chosen: ... times this while a lift begins: slow, but a motion
+ALIKE = 0.5  # chosen: prior probability that a block not met yet is like one that was
 _HALF = (TAIL + 1) / 2
 _CONSTANT = math.lgamma(_HALF) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)
-_ROOT2 = math.sqrt(2.0)
-_LEAST = -25.0  # of an edge, as in the emissions off line
+_ROOT2 = math.sqrt(2.0)  # chosen
+_LEAST = -25.0  # chosen: of an edge, as in the emissions off line
 _LOG_CLOSE, _LOG_STRAY = math.log1p(-STRAY), math.log(STRAY)
 _LOG_TOUCHED, _LOG_TOUCHING = math.log1p(-TOUCHING), math.log(TOUCHING)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
-MOST_BIAS = 2000.0  # readings that a bias remembers: sensors drift
-MOST_SCALE = 200.0  # and a scale
-LEAST = 1e-12  # N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
-FLOOR = 0.09  # ... 0.3 of a sample's own noise
+MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
+MOST_SCALE = 200.0  # chosen: and a scale
+LEAST = 1e-12  # chosen: N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
+FLOOR = 0.09  # chosen: ... 0.3 of a sample's own noise
 
 
 @compiled

@@ -31,16 +31,16 @@ from hmmseg.online.layout import (
 )
 from hmmseg.online.scores import free, held, learn, lifted, log_sum, supported
 
-LOG_DEPARTURE = math.log(1e-4)  # as in hmmseg.segmentation.departure, as are the next four
-BRIEF = 1e-8
-SETTLING = 0.2
-RINGING = 0.1
-WRONG_RISE = 3e-3
-PACE = 1.0  # s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
-NEGLIGIBLE = -28.0  # nats below the best at which a hypothesis is dropped
-SAME_STATE = 14  # hypotheses of one state that are kept apart, ...
-SAME_DEPARTED = 4  # ... and of one that is off the task
-_NUM_STAGES = 3
+LOG_DEPARTURE = math.log(1e-4)  # chosen: as in hmmseg.segmentation.departure, as are the next four
+BRIEF = 1e-8  # chosen
+SETTLING = 0.2  # chosen
+RINGING = 0.1  # chosen
+WRONG_RISE = 3e-3  # chosen
+PACE = 1.0  # chosen: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
+NEGLIGIBLE = -28.0  # chosen: nats below the best at which a hypothesis is dropped
+SAME_STATE = 14  # chosen: hypotheses of one state that are kept apart, ...
+SAME_DEPARTED = 4  # chosen: ... and of one that is off the task
+_NUM_STAGES = 3  # chosen
 
 
 @compiled

@@ -15,10 +15,10 @@ from hmmseg.io.task import BlockTask, Task
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
 
-LAG = 1.0  # s, unless another is wanted: contacts ring for a fifth of that
-SNAPSHOTS = 10  # points over the lag to which a late row returns
-GAP = 3.0  # usual intervals between rows that make a gap
-USUAL = 0.02  # how fast the usual interval follows
+LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
+SNAPSHOTS = 10  # chosen: points over the lag to which a late row returns
+GAP = 3.0  # chosen: usual intervals between rows that make a gap
+USUAL = 0.02  # chosen: how fast the usual interval follows
 
 
 class Watcher:

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING
 
-WIDTH = 7.2  # in, a journal's double column
-DPI = 200
+WIDTH = 7.2  # chosen: in, a journal's double column
+DPI = 200  # numerics: of figures
 # Okabe and Ito's palette, told apart under the common colour vision deficiencies.
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442",

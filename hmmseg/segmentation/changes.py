@@ -24,9 +24,9 @@ from hmmseg.segmentation.boundaries import (
 )
 from hmmseg.segmentation.switching import SURE, Penetration, switch_probability
 
-LIKELY = 1e-3  # least probability of an interval within which the crossing is looked at
-SURROUNDING = 2.5  # sample intervals of the alignment within which it cannot tell one from another
-DISCREPANCY, KNOWN = 1e-5, 2.0  # m; usual discrepancy of foam, worth so many contacts
+LIKELY = 1e-3  # chosen: least probability of an interval within which the crossing is looked at
+SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another
+DISCREPANCY, KNOWN = 1e-5, 2.0  # chosen: m; usual discrepancy of foam, worth so many contacts
 
 
 @dataclass(frozen=True)

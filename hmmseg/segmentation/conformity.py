@@ -28,12 +28,12 @@ from hmmseg.segmentation.free_contacts import (
     most_probable,
 )
 
-ENDING = 1e-3  # and that its recording stops before the task's end
-MAX_RATE = 50.0  # Hz
-MAX_ASSIGNMENTS = 24
-MANY = 20  # trials; of more than these one alone does not sway what most have learned
-BETWEEN_TRIALS = 2.0  # slack of like blocks: poses, pads and cables shift widths and weights as well
-WRONG_RISE = 3e-3  # m against the task's direction; blocks are taller than that, slips shorter
+ENDING = 1e-3  # chosen: and that its recording stops before the task's end
+MAX_RATE = 50.0  # chosen: Hz
+MAX_ASSIGNMENTS = 24  # numerics: tried at most
+MANY = 20  # learned: trials; of more than these one alone does not sway what most have learned
+BETWEEN_TRIALS = 2.0  # chosen: slack of like blocks: poses, pads and cables shift widths and weights as well
+WRONG_RISE = 3e-3  # chosen: m against the task's direction; blocks are taller than that, slips shorter
 
 
 @dataclass(frozen=True)

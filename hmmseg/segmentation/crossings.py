@@ -15,8 +15,8 @@ from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.switching import SURE, Penetration
 
-HELD = 0.15  # s of a hold that locate the block next to a contact change; a hand drifts over more
-STIFFEST = 1e-7  # m/N
+HELD = 0.15  # chosen: s of a hold that locate the block next to a contact change; a hand drifts over more
+STIFFEST = 1e-7  # chosen: m/N
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ from scipy.special import gammaln, log_ndtr
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
 
-TAIL = 4.0  # degrees of freedom of the Student-t residuals
-STRAY = 0.02  # share of resting samples that move for a moment (a grip settling, a bounce)
-TOUCHING = 1e-4  # share of gripped samples whose distance is not the block's (foam giving late)
-ONE_FINGER = 0.02  # prior share of free samples at which one finger alone touches
+TAIL = 4.0  # cited: degrees of freedom of the Student-t residuals
+STRAY = 0.02  # chosen: share of resting samples that move for a moment (a grip settling, a bounce)
+TOUCHING = 1e-4  # chosen: share of gripped samples whose distance is not the block's (foam giving late)
+ONE_FINGER = 0.02  # chosen: prior share of free samples at which one finger alone touches
 
 
 @dataclass(frozen=True)

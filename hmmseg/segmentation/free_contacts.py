@@ -21,14 +21,15 @@ from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods,
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
-STRAY = 1e-3  # share of resting samples that move: contacts settle in states of their own here
-STILL = 0.1  # prior share of a carry's samples at which the block is held still
-SAME_WIDTH = 1e-3  # m; grips this alike in width ...
-SAME_WEIGHT = 0.25  # ... and, relatively, in weight are grips of one block
-APART = 10  # noise sds of the grip force between free and gripped
-RAISED, ENDS = 3e-3, 3  # m from the heights at a grip's ends (medians of so many samples) to be lifted
-ROUNDS = 8
-IMPOSSIBLE = -1e3  # log-likelihood of a state that the trial never shows
+STRAY = 1e-3  # chosen: share of resting samples that move: contacts settle in states of their own here
+STILL = 0.1  # chosen: prior share of a carry's samples at which the block is held still
+SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
+SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
+APART = 10  # chosen: noise sds of the grip force between free and gripped
+# chosen: m from the heights at a grip's ends (medians of so many samples) to be lifted
+RAISED, ENDS = 3e-3, 3
+ROUNDS = 8  # numerics: of an iteration that settles sooner
+IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import contact_changes
 
-LOCAL_RATE = 100.0  # Hz; contacts are located at up to this rate, at which readings share no noise
+LOCAL_RATE = 100.0  # chosen: Hz; contacts are located at up to this rate, at which readings share no noise
 
 
 @dataclass(frozen=True)

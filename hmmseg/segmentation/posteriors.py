@@ -16,8 +16,8 @@ from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import Sensing
 from hmmseg.segmentation.spans import Span
 
-INTERVAL = (0.05, 0.95)
-NEARBY = 0.15  # s; a touch known apart from forces this near a boundary is that boundary
+INTERVAL = (0.05, 0.95)  # chosen
+NEARBY = 0.15  # chosen: s; a touch known apart from forces this near a boundary is that boundary
 Touches = tuple[tuple[float, float], ...]
 
 

@@ -22,7 +22,7 @@ from hmmseg.segmentation.departure import DEPARTURE, column, departing, settled
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts, log_evidence, most_probable
 
-GLANCE = 4096  # samples that tell which of the recording's blocks is which object
+GLANCE = 4096  # numerics: samples that tell which of the recording's blocks is which object
 
 
 def one_round(task: BlockTask) -> BlockTask:

@@ -11,10 +11,11 @@ from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.features import noise_sd
 
-SIGNIFICANT = 5.0  # sds of force noise for a contact to be sure
-SUPPORTED = 0.85  # of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
-KEPT = 0.6  # least share of a recording's samples in contact that a delay may leave there
-DEPENDENT = 0.5  # share of the samples of a stretch that are evidence of their own
+SIGNIFICANT = 5.0  # chosen: sds of force noise for a contact to be sure
+# chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
+SUPPORTED = 0.85
+KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there
+DEPENDENT = 0.5  # chosen: share of the samples of a stretch that are evidence of their own
 
 
 @dataclass(frozen=True)

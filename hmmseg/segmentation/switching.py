@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-STRAY = (
-    0.02  # share of samples at which one sensor tells another story than the model (ringing, a block pushed)
-)
-SELDOM = 0.002  # ... where that is the less likely of the two stories
-SURE = 5.0  # sds of noise for a contact to be sure
-TAIL = 4.0  # Student-t residuals, as in the emissions
+# chosen: share of samples at which one sensor tells another story than the model (ringing, a block
+# pushed)
+STRAY = 0.02
+SELDOM = 0.002  # chosen: ... where that is the less likely of the two stories
+SURE = 5.0  # chosen: sds of noise for a contact to be sure
+TAIL = 4.0  # chosen: Student-t residuals, as in the emissions
 
 
 @dataclass(frozen=True)

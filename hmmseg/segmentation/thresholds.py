@@ -27,10 +27,10 @@ from hmmseg.io.task import AnyTask, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
-FORCE_THRESHOLD = 0.05  # N
-VELOCITY_THRESHOLD = 0.05  # m/s
-NUMBERS = {FREE: 1, ABOVE_GROUND: 2, ON_GROUND: 3, SLIDING: 3}  # the paper's; 0 is none of them
-JUMP = 0.05  # share of all samples by which going on behind a missing subtask must agree better
+FORCE_THRESHOLD = 0.05  # cited: N
+VELOCITY_THRESHOLD = 0.05  # cited: m/s
+NUMBERS = {FREE: 1, ABOVE_GROUND: 2, ON_GROUND: 3, SLIDING: 3}  # cited: the paper's; 0 is none of them
+JUMP = 0.05  # chosen: share of all samples by which going on behind a missing subtask must agree better
 Rule = Literal["monotone", "first-change"]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MAX_BLOCKS = 250  # the cost table is quadratic in it
+MAX_BLOCKS = 250  # numerics: the cost table is quadratic in it
 
 
 def partition(values: np.ndarray, num_stretches: int, floor: float) -> np.ndarray:

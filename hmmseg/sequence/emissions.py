@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-DOF = 4.0  # heavy tails: a transient moves neither location nor scale much
-ONE_CELL = 1e-9
+DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
+ONE_CELL = 1e-9  # numerics
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
 
-CELLS_PER_TRIAL = 1500  # resolves a boundary to under 0.1 % of a trial's duration
-SMOOTHING = 0.01  # slope window, as a share of the median trial's duration
+CELLS_PER_TRIAL = 1500  # numerics: resolves a boundary to under 0.1 % of a trial's duration
+SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's duration
 
 
 @dataclass(frozen=True)

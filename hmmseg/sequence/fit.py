@@ -27,11 +27,11 @@ from hmmseg.sequence.labels import Labels, choose_detectors, labelled_path, read
 from hmmseg.sequence.model import SequenceModel, optional_states, weights
 from hmmseg.sequence.transitions import transitions
 
-FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # least scale of an emission, lowered as EM settles
-STEPS_PER_FLOOR = 4
-START_FLOORS = (0.1, 0.3, 0.6)  # of the partitions from which EM starts
-RANDOM_STARTS = 3
-PRESENCE_PRIOR = (1.0, 1.0)  # Beta prior of an optional state's presence
+FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
+STEPS_PER_FLOOR = 4  # numerics: of EM
+START_FLOORS = (0.1, 0.3, 0.6)  # numerics: of the partitions from which EM starts
+RANDOM_STARTS = 3  # numerics: beside the partitions
+PRESENCE_PRIOR = (1.0, 1.0)  # chosen: Beta prior of an optional state's presence
 
 
 def fit_sequence(

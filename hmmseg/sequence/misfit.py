@@ -15,11 +15,11 @@ from hmmseg.hmm import dense as ergodic
 from hmmseg.hmm.alignment import Alignment
 from hmmseg.segmentation.spans import Failure
 
-SPREADS = 6.0  # a trial this far outside the others does not fit
-LEAST_SPREAD = (2.0, 0.02)  # nats for the first score, nats per cell for the second
-FEW = 4.0
-MEASURABLE = 20.0  # cells a subtask usually lasts, for two cells to be too few
-SQUEEZED = 0.03  # of the typical duration
+SPREADS = 6.0  # chosen: a trial this far outside the others does not fit
+LEAST_SPREAD = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
+FEW = 4.0  # chosen
+MEASURABLE = 20.0  # chosen: cells a subtask usually lasts, for two cells to be too few
+SQUEEZED = 0.03  # chosen: of the typical duration
 
 
 def scores(log_likelihoods: np.ndarray, mean_cells: np.ndarray, alignment: Alignment) -> np.ndarray:

@@ -19,7 +19,7 @@ from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.labels import boundary_probabilities
 from hmmseg.sequence.model import SequenceModel, optional_states
 
-SLOPE_DRAW = 0.75  # standard deviation of a boundary's shift, as a share of a slope's reach
+SLOPE_DRAW = 0.75  # chosen: standard deviation of a boundary's shift, as a share of a slope's reach
 
 _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interval
 

@@ -18,9 +18,9 @@ from simgap.attribution.problem import Gap
 from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import LEAST, POSITIVE, alike, known, named_part
 
-ALARM = 0.01  # chance of a healthy recording to be called otherwise
-LISTED = 1e-4  # probability below which a set is one of the others
-STATED = (0.6, 1.7)  # bounds of a channel's noise over the stated one, in standard deviations
+ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
+LISTED = 1e-4  # chosen: probability below which a set is one of the others
+STATED = (0.6, 1.7)  # chosen: bounds of a channel's noise over the stated one, in standard deviations
 
 
 @dataclass(frozen=True)

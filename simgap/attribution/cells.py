@@ -9,7 +9,7 @@ from scipy.stats import chi2, false_discovery_control, norm
 
 from simgap.attribution.problem import Rows
 
-RATE = 0.05  # share of false discoveries among the cells that are listed
+RATE = 0.05  # chosen: share of false discoveries among the cells that are listed
 
 
 @dataclass(frozen=True)

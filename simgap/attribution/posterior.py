@@ -17,13 +17,14 @@ from scipy.special import gammaln
 from simgap.attribution.background import Background
 from simgap.attribution.problem import Candidate, Gap, Spectrum, spectrum
 
-STEPS = 30
-CLOSE = 0.02  # nats
-SCREEN, REFINED = 3, 5  # steps by which neighbours of a set are screened, how many of them are fitted
-WINDOW = 12.0  # nats behind the best set within which a set is kept
-BEAM = 5  # sets of each size that are extended
-MOST = 6  # effects of a set at most
-FREED = 0.9  # chance of a group to be off where an effect that acts gives it a variance of its own
+STEPS = 30  # numerics: of an iteration, at most
+CLOSE = 0.02  # numerics: nats
+# numerics: steps by which neighbours of a set are screened, how many of them are fitted
+SCREEN, REFINED = 3, 5
+WINDOW = 12.0  # chosen: nats behind the best set within which a set is kept
+BEAM = 5  # numerics: sets of each size that are extended
+MOST = 6  # chosen: effects of a set at most
+FREED = 0.9  # chosen: chance of a group to be off where an effect that acts gives it a variance of its own
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, squares_left
 
-DRAWS = 200
+DRAWS = 200  # numerics: of the posterior, for intervals
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ import numpy as np
 from simgap.attribution.invariance import Invariance
 from simgap.attribution.posterior import Forms, Model
 
-MOST = 0.5  # share of the gap left from which on it is unknown (the interface's definition)
-WIDTH = 0.25  # of that share's logarithm, logistic
-LEAST = 0.02  # share of the explained gap below which an effect is told but is no cause
-POSITIVE = float(np.log(3.0))  # nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
+MOST = 0.5  # cited: share of the gap left from which on it is unknown (the interface's definition)
+WIDTH = 0.25  # chosen: of that share's logarithm, logistic
+LEAST = 0.02  # chosen: share of the explained gap below which an effect is told but is no cause
+# cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
+POSITIVE = float(np.log(3.0))
 
 
 def named_part(f: Forms, model: Model) -> tuple[int, ...]:

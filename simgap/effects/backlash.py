@@ -10,8 +10,8 @@ from hmmseg.io.rig import Rig
 from simgap.effects.base import KINEMATICS, Effect, Parameter, World, gradient
 from simgap.effects.kinematics import moved_joints
 
-HUSH = 3.0  # sds of an angle by which it must turn on before its joint is taken to move
-CROSSED, STAYED = 0.6, 0.1  # variance midway through a rest of a joint that turns back, or goes on
+HUSH = 3.0  # chosen: sds of an angle by which it must turn on before its joint is taken to move
+CROSSED, STAYED = 0.6, 0.1  # chosen: variance midway through a rest of a joint that turns back, or goes on
 
 
 def _moves(joints: jax.Array) -> jax.Array:

@@ -74,7 +74,7 @@ class World(NamedTuple):
     events: Array
 
 
-GROSS = 100.0  # times the usual size: a fault so large has been seen on the bench
+GROSS = 100.0  # chosen: times the usual size: a fault so large has been seen on the bench
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 
@@ -233,7 +233,7 @@ def per_channel(values: Values, names: tuple[str, ...]) -> Array:
 
 
 FORCES = ("fx1", "fy1", "fx2", "fy2")
-# Both fingers alike, and as mirror images: of what points along x and y, and of what turns.
+# physics: both fingers alike, and as mirror images: of what points along x and y, and of what turns.
 FORCE_TIES = (
     ((1.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
     ((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
@@ -245,7 +245,7 @@ JOINT_TIES = (
     ((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, -1.0)),
     ((1.0, 1.0, 1.0, 1.0),),
     ((1.0, 1.0, -1.0, -1.0),),
-)
+)  # physics: the same of what turns
 
 
 def flat(performance: Performance) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from simgap.effects.base import CONTACT, Effect, Parameter, Performance, World, flat, with_force, with_load
 
-LENGTH = 0.06  # s; a pulse shorter than a sample is known as an impulse only
+LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known as an impulse only
 
 
 def _pulse(since, xp):

@@ -7,7 +7,7 @@ import numpy as np
 
 from simgap.effects.base import FILTER, SMOOTH, Effect, Parameter, Performance, flat, with_force, with_mode
 
-STARTS = (0.02, 0.06, 0.12, 0.2)
+STARTS = (0.02, 0.06, 0.12, 0.2)  # numerics
 
 
 def _times(values, xp):

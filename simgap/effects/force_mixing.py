@@ -8,7 +8,8 @@ import numpy as np
 from simgap.effects.base import FORCES, MIX, Effect, Parameter, Performance, World, flat, with_force
 
 NAMES = tuple(f"{to}_from_{of}" for to in FORCES for of in FORCES)
-NET = np.array([[1.0, 0, 1, 0], [0, 1, 0, 1], [0.5, 0, -0.5, 0], [0, 0.5, 0, -0.5]])  # net, grip, shear
+# physics: net, grip, shear
+NET = np.array([[1.0, 0, 1, 0], [0, 1, 0, 1], [0.5, 0, -0.5, 0], [0, 0.5, 0, -0.5]])
 
 
 def _correct(world: World, values, on) -> World:

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 
 from simgap.effects.base import CONTACT, SLIDING, Effect, Parameter, World, with_mode
 
-LOADED = 0.4  # N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
-HANGING = 0.9  # share of a carry, at least, that pads do not slide in: or the block would fall
+# chosen: N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
+LOADED = 0.4
+HANGING = 0.9  # chosen: share of a carry, at least, that pads do not slide in: or the block would fall
 
 
 def _correct(world: World, values, on) -> World:

@@ -7,9 +7,9 @@ import numpy as np
 from simgap.effects.base import READOUT, Effect, Parameter
 from simgap.gap.frame import CHANNELS
 
-REPEATED = 0.5  # share of repeated values that only a lattice has
-WRITTEN = 1e-5  # N; how finely forces are written that were not rounded before
-SHARES = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}  # of one sensor's variance, in net forces
+REPEATED = 0.5  # chosen: share of repeated values that only a lattice has
+WRITTEN = 1e-5  # chosen: N; how finely forces are written that were not rounded before
+SHARES = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}  # chosen: of one sensor's variance, in net forces
 
 
 def _scatter(given, residual: np.ndarray):

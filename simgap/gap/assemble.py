@@ -16,7 +16,7 @@ from simgap.gap.fit import Fitted, Problem, columns_of, derivatives, limits, neu
 from simgap.gap.frame import CHANNELS, subtask_name
 from simgap.gap.spread import Spread
 
-BANDS = (0.0, 1.0, 5.0)  # Hz; lower edges of those that are told apart
+BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of those that are told apart
 
 
 def rows_of(given: Problem) -> Rows:

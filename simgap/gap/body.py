@@ -16,9 +16,9 @@ from simgap.gap.search import Search
 
 PROPERTIES = ("weight", "width", "height")
 UNITS = {"weight": "N", "width": "m", "height": "m"}
-DRAWS = 2000
-LISTED = 8  # effects that are described
-TOLD = 0.5  # sd of the prior below which a property is told by the recordings
+DRAWS = 2000  # numerics: of the posterior, for intervals
+LISTED = 8  # chosen: effects that are described
+TOLD = 0.5  # chosen: sd of the prior below which a property is told by the recordings
 
 
 def body(

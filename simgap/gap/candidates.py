@@ -11,9 +11,9 @@ from hmmseg.io.rig import Rig
 from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
 from simgap.gap.fit import STEPS, Fitted, Problem, Start, fit, limits, slots
 
-SCREEN = 2  # steps before the best start of a form is chosen
-LEADERS = 3  # starts screened
-PROMISING = 2.0  # nats that a linear step must gain for a form to be fitted
+SCREEN = 2  # chosen: steps before the best start of a form is chosen
+LEADERS = 3  # chosen: starts screened
+PROMISING = 2.0  # chosen: nats that a linear step must gain for a form to be fitted
 
 
 def candidate_names(rig: Rig, excluded: Sequence[str] = ()) -> list[str]:

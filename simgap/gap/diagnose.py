@@ -32,7 +32,7 @@ from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.report.finding import sentence
 from simgap.report.tables import tables
 
-STAGES = 12  # that `progress` is told of, at most
+STAGES = 12  # chosen: that `progress` is told of, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 Progress = Callable[[str], None]
 

@@ -26,8 +26,8 @@ from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.writing import task_table
 
-TRIALS = 2  # that are simulated: where contacts fall between samples is chance
-ENOUGH = 5.0  # nats: the interface's detection floor
+TRIALS = 2  # chosen: that are simulated: where contacts fall between samples is chance
+ENOUGH = 5.0  # chosen: nats: the interface's detection floor
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from simgap.gap.frame import Arrays, Frame
 from simgap.gap.residuals import contact, residuals
 from simgap.gap.whitening import Whitening, whitening
 
-ROWS = 8  # coordinates that are evaluated at once, in one compiled program
-STEP = 1e-5  # of a usual deviation, for differences
-STEPS = 12
-CLOSE = 0.02  # nats
-FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # sd of a property that nothing else tells
+ROWS = 8  # numerics: coordinates that are evaluated at once, in one compiled program
+STEP = 1e-5  # numerics: of a usual deviation, for differences
+STEPS = 12  # numerics: of an iteration, at most
+CLOSE = 0.02  # numerics: nats
+FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # chosen: sd of a property that nothing else tells
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,12 @@ from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sampl
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
 PHASES = ("free", "pickup", "carry", "place", "slide")
-MAX_RATE = 30.0  # Hz; finer samples are averaged first
-TOUCHING = 5.0  # sds of a force by which a touch shows
-EITHER_SIDE = 0.02  # chance of a boundary to lie beyond a sample from which that sample is of neither side
-FIRST_TOUCH = 0.2  # s; one finger touches no earlier before the other, nor lets go later
-TRIALS = 4  # arrays are padded to multiples of it, so that few programs are compiled
+MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
+TOUCHING = 5.0  # chosen: sds of a force by which a touch shows
+# chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
+EITHER_SIDE = 0.02
+FIRST_TOUCH = 0.2  # chosen: s; one finger touches no earlier before the other, nor lets go later
+TRIALS = 4  # numerics: arrays are padded to multiples of it, so that few programs are compiled
 
 
 class Arrays(NamedTuple):

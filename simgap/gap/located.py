@@ -16,7 +16,8 @@ from simgap.effects.base import World, tips
 from simgap.gap.fit import Fitted, Problem, raw_residual_at, world_without
 from simgap.gap.frame import CHANNELS, subtask_name
 
-SHIFTED = 3.0  # sds of a sample: mean shift of a cell that counts as shifted (the interface's definition)
+# cited: sds of a sample: mean shift of a cell that counts as shifted (the interface's definition)
+SHIFTED = 3.0
 
 
 def where(given: Problem, found: Sequence[Cell], causes: Fitted | None) -> list[dict[str, Any]]:

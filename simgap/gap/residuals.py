@@ -18,18 +18,19 @@ from simgap.effects.base import CREEPING, LATE, RINGING, SLIDING, SMOOTH, YIELDI
 from simgap.effects.filters import faded, lowpass
 from simgap.gap.frame import CHANNELS, Arrays
 
-TOUCH = 2e-5  # m; the corner of contact is rounded over this depth, below the joints' resolution
-SURE = 4.0  # sds of the distance by which fingers must be nearer than the block is wide to touch it
-HELD = 0.1  # N; a grip below this holds nothing,
-CLOSED = 0.8  # share of its usual force by which a grip has closed: until then it pushes the block
-LOOSE = 0.35  # nor one below this share of its usual force: pads that let go slide by what shears they bear
-BETWEEN = 0.3  # of a bend, sd: a force read between samples
-CURVED = 0.5  # of the difference of two ways to take a slope, sd: how far it may be off
-EVEN = 0.025  # N; changes from one sample to the next below this have no corner
-SHARP = 0.75  # by how much one side is flatter, as a share of both, beyond which a force has a corner
-EITHER = 0.6  # of a force's change, sd: how a force between two samples goes from one to the other
-SLIDE = 2e-3  # m; how far a pad may slide from one sample to the next
-ANYWHERE = 0.05  # m; sd of where a grip takes its block
+TOUCH = 2e-5  # chosen: m; the corner of contact is rounded over this depth, below the joints' resolution
+SURE = 4.0  # chosen: sds of the distance by which fingers must be nearer than the block is wide to touch it
+HELD = 0.1  # chosen: N; a grip below this holds nothing,
+CLOSED = 0.8  # chosen: share of its usual force by which a grip has closed: until then it pushes the block
+# chosen: nor one below this share of its usual force: pads that let go slide by what shears they bear
+LOOSE = 0.35
+BETWEEN = 0.3  # chosen: of a bend, sd: a force read between samples
+CURVED = 0.5  # chosen: of the difference of two ways to take a slope, sd: how far it may be off
+EVEN = 0.025  # chosen: N; changes from one sample to the next below this have no corner
+SHARP = 0.75  # chosen: by how much one side is flatter, as a share of both, beyond which a force has a corner
+EITHER = 0.6  # chosen: of a force's change, sd: how a force between two samples goes from one to the other
+SLIDE = 2e-3  # chosen: m; how far a pad may slide from one sample to the next
+ANYWHERE = 0.05  # chosen: m; sd of where a grip takes its block
 
 
 def residuals(

@@ -21,11 +21,11 @@ from simgap.gap.frame import build
 from simgap.gap.realign import moved, realigned
 from simgap.gap.spread import Spread, spreads
 
-SHIFT = 0.008  # s; boundaries that move farther are taken anew
-ROUNDS = 2  # times at most
-TRIED = 3  # leading candidates that are taken out in turn where no trial fits its task
-HOPELESS = 1e4  # times the noise's square, in the mean: no effect of a hand, but another task
-WORTHY = 50.0  # nats that a candidate must gain for boundaries to be taken anew without it
+SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
+ROUNDS = 2  # numerics: times at most
+TRIED = 3  # chosen: leading candidates that are taken out in turn where no trial fits its task
+HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
+WORTHY = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
 Progress = Callable[[str], None]
 
 

@@ -8,13 +8,15 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.features import noise_sd
 
-MISFIT = 0.03  # share of a force's change between samples that no model of 20 Hz samples can tell,
-STARTING = 0.1  # and of that with which a block comes off its support or onto it: how fast is not recorded
-FADED, FADING = 0.1, 0.5  # the same of what is recorded in free motion, so many seconds from a grip
-BENT = 0.025  # share of a speed's fourth difference by which the rule for differences of positions is off
-SEEN = 2.0  # sds of that difference below which it is noise
-MOVES = 3.0  # sds of a difference by which fingers move
-NUDGE = 1e-4  # m; fingers that push unequally move a resting block by about as much
+MISFIT = 0.03  # chosen: share of a force's change between samples that no model of 20 Hz samples can tell,
+# chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
+STARTING = 0.1
+FADED, FADING = 0.1, 0.5  # chosen: the same of what is recorded in free motion, so many seconds from a grip
+# chosen: share of a speed's fourth difference by which the rule for differences of positions is off
+BENT = 0.025
+SEEN = 2.0  # chosen: sds of that difference below which it is noise
+MOVES = 3.0  # chosen: sds of a difference by which fingers move
+NUDGE = 1e-4  # chosen: m; fingers that push unequally move a resting block by about as much
 
 
 def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, np.ndarray]:

@@ -7,9 +7,9 @@ import numpy as np
 from simgap.gap.fit import Problem
 from simgap.gap.frame import CHANNELS
 
-SAMPLES = 0.5  # sds of one sample: a shift below that is not seen in any single one
-PROPERTY = 0.01  # the same, of a property
-SHARE = 0.005  # of a block's width or weight: the better half of the paper's own errors (its Table 4)
+SAMPLES = 0.5  # chosen: sds of one sample: a shift below that is not seen in any single one
+PROPERTY = 0.01  # chosen: the same, of a property
+SHARE = 0.005  # cited: of a block's width or weight: the better half of the paper's own errors (its Table 4)
 
 
 def properties_tolerated(given: Problem) -> np.ndarray:

@@ -30,10 +30,10 @@ from simgap.gap.synthetic import performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 
-MOST = 8  # twins at most
-BATCH = 4  # twins that are simulated at once
-LEAST = 1e-3  # a property below that cannot be simulated [N, m]
-QUANTILES = (0.1, 0.9)  # of what was aligned, the range that an operator's settings are drawn from
+MOST = 8  # chosen: twins at most
+BATCH = 4  # numerics: twins that are simulated at once
+LEAST = 1e-3  # chosen: a property below that cannot be simulated [N, m]
+QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
 Progress = Callable[[str], None]
 
 

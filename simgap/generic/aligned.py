@@ -14,7 +14,7 @@ from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import SequenceModel
 from hmmseg.sequence.segment import segment_sequence
 
-SPREAD = (0.05, 0.95)  # quantiles whose distance is a channel's scale
+SPREAD = (0.05, 0.95)  # chosen: quantiles whose distance is a channel's scale
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,15 @@ from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
 from simgap.generic.shrinkage import fraction, heldout, shrinkage, sizes
 from simgap.generic.verdict import joined, probabilities
 
-ALARM = 0.01  # chance that two ensembles alike are called different
-MOST = 6  # effects that may act together
-GAIN = 5.0  # nats that a further effect must add
-WORTH = 0.98  # it must leave no more than this share of the excess square
-TIE = 3.0  # nats (tempered): candidates this near the best cannot be told from it
-TEMPERATURE = 1.5  # least; covariances come from a few trials
-UNKNOWN = 0.15  # share of the gap left at which it is as likely of another cause
-RINGS = 0.2  # share of the square after an event that an oscillation must explain
-SHORTEST = 16  # samples of a window in which an oscillation is looked for
+ALARM = 0.01  # chosen: chance that two ensembles alike are called different
+MOST = 6  # chosen: effects that may act together
+GAIN = 5.0  # chosen: nats that a further effect must add
+WORTH = 0.98  # chosen: it must leave no more than this share of the excess square
+TIE = 3.0  # chosen: nats (tempered): candidates this near the best cannot be told from it
+TEMPERATURE = 1.5  # chosen: least; covariances come from a few trials
+UNKNOWN = 0.15  # chosen: share of the gap left at which it is as likely of another cause
+RINGS = 0.2  # chosen: share of the square after an event that an oscillation must explain
+SHORTEST = 16  # numerics: samples of a window in which an oscillation is looked for
 Progress = Callable[[str], None]
 
 

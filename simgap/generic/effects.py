@@ -25,11 +25,11 @@ from simgap.generic.features import (
     windowed,
 )
 
-FINE = 2048  # points of the mean course
-SMALLEST = 1e-6  # s; a shorter time constant is none
-KEPT = 4000  # spectra kept
-SMOOTH = 9  # coefficients over which a spectrum is smoothed
-LEAST = 4  # coefficients that a mean power is taken of
+FINE = 2048  # numerics: points of the mean course
+SMALLEST = 1e-6  # numerics: s; a shorter time constant is none
+KEPT = 4000  # numerics: spectra kept
+SMOOTH = 9  # chosen: coefficients over which a spectrum is smoothed
+LEAST = 4  # chosen: coefficients that a mean power is taken of
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,14 @@ from scipy.integrate import cumulative_trapezoid
 
 from simgap.generic.aligned import SPREAD, Cut, Ensembles
 
-BINS = 16  # parts of a subtask whose means are compared, of which
-EARLY = 6  # lie in the time after its event,
-EVENT = 0.5  # s, or a quarter of the shortest
-SUB_BANDS = 8  # of fast power, evenly spaced in log frequency
-BANDS = 3  # into which they are gathered where cells are listed
-LOWEST = 6  # half periods in the window that fast power starts from
-FEWEST = 3  # coefficients of a sub-band; a window must give a band at least
-FLOOR = 1e-4  # of a channel's scale: power below this is no different from none
+BINS = 16  # chosen: parts of a subtask whose means are compared, of which
+EARLY = 6  # chosen: lie in the time after its event,
+EVENT = 0.5  # chosen: s, or a quarter of the shortest
+SUB_BANDS = 8  # chosen: of fast power, evenly spaced in log frequency
+BANDS = 3  # chosen: into which they are gathered where cells are listed
+LOWEST = 6  # chosen: half periods in the window that fast power starts from
+FEWEST = 3  # chosen: coefficients of a sub-band; a window must give a band at least
+FLOOR = 1e-4  # chosen: of a channel's scale: power below this is no different from none
 SLOW, FAST, DURATION = range(3)
 
 

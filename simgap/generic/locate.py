@@ -18,14 +18,14 @@ from scipy.special import fdtrc, ndtr, ndtri
 
 from simgap.generic.features import FAST, SLOW, Layout
 
-PERMUTATIONS = 999
-ENOUGH = 100  # different exchanges; with fewer the F distribution and Bonferroni's bound serve
-MODERATION = 4.0  # degrees of freedom that a cell's mean variance is worth
-PACE = 0.02  # of a duration: clocks repeat themselves exactly, and nobody minds less
-NOTHING = 1e-6  # of a channel's scale: no sd is smaller
-CHUNK = 50  # exchanges at a time
-LEVEL = 0.05  # family-wise, of the cells that are listed
-Z_LARGEST = 37.0  # beyond, probabilities underflow
+PERMUTATIONS = 999  # numerics: of labels, at most
+ENOUGH = 100  # chosen: different exchanges; with fewer the F distribution and Bonferroni's bound serve
+MODERATION = 4.0  # chosen: degrees of freedom that a cell's mean variance is worth
+PACE = 0.02  # chosen: of a duration: clocks repeat themselves exactly, and nobody minds less
+NOTHING = 1e-6  # numerics: of a channel's scale: no sd is smaller
+CHUNK = 50  # numerics: exchanges at a time
+LEVEL = 0.05  # chosen: family-wise, of the cells that are listed
+Z_LARGEST = 37.0  # numerics: beyond, probabilities underflow
 
 
 @dataclass(frozen=True)

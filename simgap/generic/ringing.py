@@ -15,13 +15,13 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 
-DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)
-HEAVIEST = 0.25  # damping beyond which a course is no ring
-FREQUENCIES = 80
-SWING = 1 / 3  # of a window within which the largest swing is looked for
-LEAST = 12  # samples
-PERIODS = 1.5  # of the slowest oscillation looked for that a window holds
-HIGHEST = 0.4  # of the sampling rate
+DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # chosen: where searches start
+HEAVIEST = 0.25  # chosen: damping beyond which a course is no ring
+FREQUENCIES = 80  # numerics: where searches start
+SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
+LEAST = 12  # chosen: samples
+PERIODS = 1.5  # chosen: of the slowest oscillation looked for that a window holds
+HIGHEST = 0.4  # chosen: of the sampling rate
 
 
 @dataclass(frozen=True)

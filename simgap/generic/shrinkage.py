@@ -17,7 +17,7 @@ from simgap.generic.effects import Scene
 from simgap.generic.fit import Block, Fitted, at
 from simgap.generic.locate import both_variances, cell_means
 
-RESAMPLES = 1000
+RESAMPLES = 1000  # numerics: of a bootstrap
 
 
 @dataclass(frozen=True)

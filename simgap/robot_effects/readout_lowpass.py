@@ -7,7 +7,7 @@ import numpy as np
 from simgap.robot_effects.base import RobotEffect, Setting, onset
 from simgap.simulators.protocol import Parameter
 
-SHORTEST = 1e-9  # s: below this nothing is smoothed
+SHORTEST = 1e-9  # numerics: s: below this nothing is smoothed
 
 
 def lowpass(since: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:

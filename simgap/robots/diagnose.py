@@ -32,8 +32,8 @@ from simgap.robots.whiten import NONE, covariances, learned
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-REFITS = 3
-STAGES = 14  # what a progress bar counts at most
+REFITS = 3  # chosen
+STAGES = 14  # chosen: what a progress bar counts at most
 
 Tell = Callable[[str], None]
 

@@ -13,7 +13,7 @@ from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
 from simgap.robots.whiten import Whitener
 
-BANDS = (0.0, 1.0, 5.0)  # Hz, lower edges of the bands that are told apart
+BANDS = (0.0, 1.0, 5.0)  # chosen: Hz, lower edges of the bands that are told apart
 
 
 def fitted_along(composed: Composed) -> tuple[str, ...]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-UNSEEN = 1.0  # noise deviations: what a parameter's usual size must move all samples by, together
-EXACT, CLOSE = 1e-6, 0.02  # share of a parameter's sensitivity that is its own, at most
-LARGEST = 6  # parameters of a set
+UNSEEN = 1.0  # chosen: noise deviations: what a parameter's usual size must move all samples by, together
+EXACT, CLOSE = 1e-6, 0.02  # chosen: share of a parameter's sensitivity that is its own, at most
+LARGEST = 6  # numerics: parameters of a set
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import LEAST, MOST, WIDTH
 from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
 
-RIVALS = 8  # sets that are compared on held-out rows
-TWENTY = 20.0  # to one: odds from which on a rival is ruled out
+RIVALS = 8  # chosen: sets that are compared on held-out rows
+TWENTY = 20.0  # chosen: to one: odds from which on a rival is ruled out
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Rows
 from simgap.simulators.protocol import Channels, run_all
 
-STEP = 0.05  # of a parameter's standard deviation: the finite difference
-START_STEP = 0.3  # of a start's
+STEP = 0.05  # numerics: of a parameter's standard deviation: the finite difference
+START_STEP = 0.3  # numerics: of a start's
 
 
 @dataclass(frozen=True)

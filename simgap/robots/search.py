@@ -20,10 +20,10 @@ from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
 from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances, learned
 
-ROUNDS = 10
-LEADERS = 24  # candidates that a search goes on with
-STEPS = 8  # evaluations of a least-squares fit
-SETTLED = 2.0  # nats that a further round must gain
+ROUNDS = 10  # numerics: of an iteration that settles sooner
+LEADERS = 24  # chosen: candidates that a search goes on with
+STEPS = 8  # numerics: evaluations of a least-squares fit
+SETTLED = 2.0  # chosen: nats that a further round must gain
 
 Tell = Callable[[str], None]
 

@@ -25,13 +25,14 @@ from scipy.optimize import minimize
 from simgap.robots.linear import Linear
 from simgap.robots.windows import Window
 
-TAU = 0.1  # s, chosen: unmodelled torques last for tenths of a second
-SPREAD = 1.0  # sd of a window's log multiplier, chosen: the model is off by e (sd) from window to window
-GRID = (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0)
-WORTH = 3.0  # nats that a discrepancy must gain to be there at all
-FREEDOM = 4.0  # of Student's t, chosen: heavy tails, finite variance
-ENOUGH = 40  # windows from which discrepancies are learned
-BLOCK = 400  # rows of a window that are whitened together, where no start ties them
+TAU = 0.1  # chosen: s: unmodelled torques last for tenths of a second
+# chosen: sd of a window's log multiplier: the model is off by e (sd) from window to window
+SPREAD = 1.0
+GRID = (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0)  # numerics
+WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
+FREEDOM = 4.0  # chosen: of Student's t: heavy tails, finite variance
+ENOUGH = 40  # learned: windows from which discrepancies are learned
+BLOCK = 400  # chosen: rows of a window that are whitened together, where no start ties them
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def covariances(
 
 
 CLOCK = "clock"  # a source whose s [s] is the sd of samples' times
-INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}
+INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # chosen
 
 
 def _sources(linear: Linear, block: slice, kinds: Mapping[str, str], free: bool) -> dict[str, np.ndarray]:

@@ -16,11 +16,13 @@ from simgap.simulators.protocol import RATE, Simulator
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
 
-LENGTH = 0.4  # s
-FEWEST = 6  # samples of a window
-REACH = 0.03  # s of samples on either side that a start is smoothed from, and at least NEIGHBOURS of them
-NEIGHBOURS = 5
-DOUBT = 3.0  # a start's error over what noise alone makes it: the window's own samples settle the rest
+LENGTH = 0.4  # numerics: s
+FEWEST = 6  # chosen: samples of a window
+# chosen: s of samples on either side that a start is smoothed from, and at least NEIGHBOURS of them
+REACH = 0.03
+NEIGHBOURS = 5  # chosen: samples
+# chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
+DOUBT = 3.0
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from hmmseg.io.task import GROUND, BlockTask, Move
 from simgap.world.properties import Blocks
 
-MIDDLE = 0.13  # m; the middle of the hand's workspace
-NUDGE = 0.005  # m; a slide where there is no room for more
-ORDERS = 12  # of the piles, tried to leave room for slides
+MIDDLE = 0.13  # chosen: m; the middle of the hand's workspace
+NUDGE = 0.005  # chosen: m; a slide where there is no room for more
+ORDERS = 12  # numerics: of the piles, tried to leave room for slides
 
 
 def standing_heights(on: Mapping[str, str], heights: Mapping[str, float]) -> dict[str, float]:

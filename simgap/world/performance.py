@@ -17,7 +17,7 @@ from jax import Array
 from simgap.world.dynamics import Loads, Physics, Scalar, State, Tips, drift, interact, kick
 
 Values = Any  # a jax Array in compiled code, a NumPy array after it
-CONTROL_PERIOD = 1e-3  # s; commands and records are this far apart
+CONTROL_PERIOD = 1e-3  # numerics: s; commands and records are this far apart
 
 
 class Impedance(NamedTuple):

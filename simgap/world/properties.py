@@ -15,7 +15,7 @@ from estimation.actual import read_actual
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask
 
-DEFAULT_FRICTION = 1.2  # of foam on a block, where nothing says otherwise
+DEFAULT_FRICTION = 1.2  # chosen: of foam on a block, where nothing says otherwise
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 
 
@@ -37,7 +37,7 @@ class Block:
 
 Blocks = Mapping[str, Block]
 
-# The blocks of the paper's Table 4, weighed and measured with calipers.
+# cited: the blocks of the paper's Table 4, weighed and measured with calipers.
 PAPER_BLOCKS: Blocks = {"block1": Block(0.343, 0.0159, 0.0160), "block2": Block(0.437, 0.0254, 0.0127)}
 
 

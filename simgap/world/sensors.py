@@ -8,10 +8,11 @@ from hmmseg.hand.kinematics import inverse, joint_velocity, require_reach
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial
 
-DEFAULT_RATE = 20.0  # Hz, the paper's
-# Standard deviations of one sample where a rig leaves them to be learned.
-DEFAULT_NOISE = {"angle": 2e-4, "position": 3e-5, "velocity": 0.03, "force": 0.012}  # rad, m, rad/s, N
-DEFAULT_CARTESIAN_VELOCITY = 0.004  # m/s
+DEFAULT_RATE = 20.0  # cited: Hz, the paper's
+# chosen: standard deviations of one sample where a rig leaves them to be learned
+# chosen: rad, m, rad/s, N
+DEFAULT_NOISE = {"angle": 2e-4, "position": 3e-5, "velocity": 0.03, "force": 0.012}
+DEFAULT_CARTESIAN_VELOCITY = 0.004  # chosen: m/s
 
 
 def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig,

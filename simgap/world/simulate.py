@@ -23,9 +23,10 @@ from simgap.world.properties import Blocks
 from simgap.world.scene import Surroundings, physics, substeps_for
 from simgap.world.sensors import DEFAULT_RATE, record
 
-BUCKET = 4000  # control periods; commands are padded to multiples, so that few programs are compiled
-BATCH = 16  # trials integrated side by side
-MOVING = 2e-3  # m/s; a slide begins and ends where the block's speed passes this
+# numerics: control periods; commands are padded to multiples, so that few programs are compiled
+BUCKET = 4000
+BATCH = 16  # numerics: trials integrated side by side
+MOVING = 2e-3  # chosen: m/s; a slide begins and ends where the block's speed passes this
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from hmmseg.io.trial import Trial
 from simgap.world.properties import UNITS, Blocks
 from simgap.world.simulate import SimulatedTrial
 
-DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # decimals by a channel's first letter
+DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals by a channel's first letter
 
 
 def write_trials(folder: str | Path, task: BlockTask, rig: Rig, blocks: Blocks,

@@ -9,7 +9,7 @@ from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import ahead, at, doubles_at, singles_at, value_at
 from hmmseg.hmm.kernels.steps import viterbi_step
 
-LENGTH = 512  # samples of a block
+LENGTH = 512  # numerics: samples of a block
 
 
 @compiled

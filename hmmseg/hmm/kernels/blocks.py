@@ -13,10 +13,10 @@ from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import ahead, at, bits_of, double_of, doubles_at, singles_at, value_at
 from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, exponentials, forward_step, logarithms, renormalise
 
-PAD = 8
-FIRST = 7
-RENORMALISE = 16  # samples; mantissas change by less than 2^4 a sample
-CELLS = 1 << 12  # of a block
+PAD = 8  # numerics: states; tables are padded to multiples of it
+FIRST = 7  # numerics: states of a vector
+RENORMALISE = 16  # numerics: samples; mantissas change by less than 2^4 a sample
+CELLS = 1 << 12  # numerics: of a block
 
 
 @compiled

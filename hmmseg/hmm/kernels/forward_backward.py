@@ -33,7 +33,7 @@ from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import at, bits_of, double_of
 from hmmseg.hmm.kernels.steps import IMPOSSIBLE_EXPONENT, ZERO_EXPONENT, joint_step, plain, weigh
 
-LN2 = math.log(2)
+LN2 = math.log(2)  # physics: a logarithm
 
 
 @compiled

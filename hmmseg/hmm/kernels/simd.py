@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import extending, types
 from numba.core import cgutils
 
-WIDTH = 8
+WIDTH = 8  # numerics: numbers of a vector
 intrinsic: Any = extending.intrinsic  # what it makes is called without its first argument
 I32, I64, F32, F64 = ir.IntType(32), ir.IntType(64), ir.FloatType(), ir.DoubleType()
 _REVERSED = list(range(WIDTH - 1, -1, -1))
@@ -120,8 +120,8 @@ class Vec:
         return self.shuffled([WIDTH, *range(WIDTH - 1)], first)
 
 
-MAGIC = 6755399441055744.0  # 1.5 2^52: adding it rounds to an integer in the lowest bits
-MAGIC_BITS = 0x4338000000000000
+MAGIC = 6755399441055744.0  # numerics: 1.5 2^52: adding it rounds to an integer in the lowest bits
+MAGIC_BITS = 0x4338000000000000  # numerics: the bits of MAGIC
 
 
 class Lanes:

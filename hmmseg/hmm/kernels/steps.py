@@ -13,13 +13,13 @@ from numba import types
 
 from hmmseg.hmm.kernels.simd import MAGIC, MAGIC_BITS, Lanes, Vec, vector_function
 
-ZERO_EXPONENT = -(1 << 60)  # of a weight that is zero; sums of a few of them still fit 64 bits
-LEAST_LOG = -7e14  # a log weight below counts as -inf
-IMPOSSIBLE_EXPONENT = -(1 << 49)  # a weight of a smaller exponent is zero
-_LOG2E = 1.4426950408889634
-_LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10  # the first has 33 significant bits
-_ONE = 0x3FF0000000000000
-_MANTISSA = 0x000FFFFFFFFFFFFF
+ZERO_EXPONENT = -(1 << 60)  # numerics: of a weight that is zero; sums of a few of them still fit 64 bits
+LEAST_LOG = -7e14  # numerics: a log weight below counts as -inf
+IMPOSSIBLE_EXPONENT = -(1 << 49)  # numerics: a weight of a smaller exponent is zero
+_LOG2E = 1.4426950408889634  # physics: a logarithm
+_LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10  # physics: the first has 33 significant bits
+_ONE = 0x3FF0000000000000  # numerics: the bits of 1.0
+_MANTISSA = 0x000FFFFFFFFFFFFF  # numerics: the bits of a mantissa
 
 
 def _power_of_two(exponent: Vec) -> Vec:

@@ -16,7 +16,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
 
-MAX_WIDTH = 64  # numbers a row: images are no channels
+MAX_WIDTH = 64  # numerics: numbers a row: images are no channels
 
 
 def parts(path: Path) -> list[str]:

@@ -19,9 +19,9 @@ from simgap.simulators.mjcf.settable import Setting, names_of, setting_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
-SHARE = 0.03  # of the torques that a joint shows: the usual size of what a model lacks there
-SIZE = 0.1  # of a value that the model states, likewise
-GEOMS = 4  # pairs of touching geoms, those that touch most, whose contact is offered
+SHARE = 0.03  # chosen: of the torques that a joint shows: the usual size of what a model lacks there
+SIZE = 0.1  # chosen: of a value that the model states, likewise
+GEOMS = 4  # chosen: pairs of touching geoms, those that touch most, whose contact is offered
 
 
 def offered(

@@ -17,7 +17,7 @@ from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, 
 from simgap.simulators.recording import Recording
 
 APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
-BATCH = 4e7  # numbers that one batch of rollouts holds at most
+BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
 
 
 @dataclass
@@ -254,7 +254,8 @@ class Held:
         return np.diff(whole) / np.diff(self.edges)
 
 
-LASTING = 0.04  # s that a change of contact must last, chosen: sensors' noise makes and breaks contacts
+# chosen: s that a change of contact must last: sensors' noise makes and breaks contacts
+LASTING = 0.04
 
 
 def lasting_changes(t: np.ndarray, sets: Sequence[Any]) -> list[float]:

@@ -11,7 +11,7 @@ from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.recording import Recording
 
-SPAN = 0.06  # s over which a motion is smoothed by a cubic
+SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
 
 
 @dataclass(frozen=True)
