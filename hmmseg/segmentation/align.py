@@ -22,6 +22,7 @@ from hmmseg.segmentation.pooling import Pool, Reading, pooled, unfitted
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import cut, merge_point, one_round, part, round_tasks, slices
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.standing import standing
 from hmmseg.segmentation.tables import trials_table
 from hmmseg.tables import as_html, as_text
 
@@ -179,8 +180,16 @@ def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity,
     every = to_spans(shown.steps, found, *ends)
     spans = (*every[: shown.num_before], *every[len(every) - shown.num_after :])
     step = steps[verdict.failing]
-    reason = explain(verdict, steps, [span.start for span in every])
+    reason = explain(verdict, steps, [span.start for span in every], _stands(reading.thinned, every))
     return _Piece(boundaries, spans, Failure(step.index, step.name, step.object, reason), evidence, *ends)
+
+
+def _stands(s: Signals, spans: Sequence[Span]) -> np.ndarray:
+    """Times [s] at which a finger stands on something."""
+    free = np.zeros(s.t.size, bool)
+    for span in spans:
+        free |= (span.state == FREE) & (s.t >= span.start) & (s.t < span.end)
+    return s.t[standing(s, free)]
 
 
 def _joined(

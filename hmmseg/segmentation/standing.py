@@ -1,0 +1,39 @@
+"""Fingers that stand on the ground, or on anything that the task does not name.
+
+A pad that holds a block by its side passes on at most its friction: |fy| <= mu |fx| (Coulomb). A finger that
+pushes down harder than that stands on something.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmmseg.hand.signals import Signals
+
+FRICTION = 1.5  # cited: rubber on dry solids reaches about 1 to 1.4 (Persson, J. Chem. Phys. 115, 2001)
+CLEAR = 6.0  # numerics: standard deviations, so that no noise of an hour at 1 kHz is taken for a touch
+BRIEF = 0.05  # s; physics: an impact of hard parts rings no longer
+
+
+def standing(signals: Signals, free: np.ndarray) -> np.ndarray:
+    """Booleans (num_timesteps,): samples of stretches in which a finger stands on something.
+
+    `free` (num_timesteps,) marks free motion: offsets and spread of the vertical forces are learned there.
+    """
+    out = np.zeros(signals.t.size, bool)
+    for across, along in ((signals.fx1, signals.fy1), (signals.fx2, signals.fy2)):
+        rest = along[free & np.isfinite(along)]
+        centre = float(np.median(rest)) if rest.size else 0.0
+        spread = 1.4826 * float(np.median(np.abs(rest - centre))) if rest.size else 0.0
+        limit = FRICTION * np.abs(np.nan_to_num(across)) + CLEAR * max(spread, signals.sd_force)
+        out |= _lasting(centre - np.nan_to_num(along, nan=np.inf) > limit, signals.t)
+    return out
+
+
+def _lasting(found: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Those stretches of `found` that last longer than an impact."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], found, [False]])))
+    out = np.zeros_like(found)
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        out[start:stop] = stop - start > 1 and t[stop - 1] - t[start] >= BRIEF
+    return out

@@ -1,0 +1,49 @@
+"""A finger that pushes down harder than friction could carry stands on something."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segmentation.align import align
+from hmmseg.segmentation.standing import standing
+
+T = np.arange(0.0, 4.0, 0.02)
+GRIPPED = T > 2.0
+
+
+def make(fy1: np.ndarray, grip: float = 3.0) -> np.ndarray:
+    """Stretches found where finger 1 pushes with `fy1` and both grip from 2 s on."""
+    channels = sorted(set(Signals.__dataclass_fields__) - {"t", "sd_force", "touches"})
+    values = {name: np.zeros_like(T) for name in channels}
+    values |= {"fx1": grip * GRIPPED, "fx2": -grip * GRIPPED, "fy1": fy1}
+    return standing(Signals(t=T, **values, sd_force=0.02), ~GRIPPED & (T < 1.0))
+
+
+def test_a_push_within_friction_is_none():
+    assert not make(-2.0 * GRIPPED).any()
+
+
+def test_a_push_beyond_friction_is_told_with_its_moment():
+    pushed = (T >= 1.5) & (T < 2.5)
+    found = make(-6.0 * pushed)
+    np.testing.assert_array_equal(found, pushed)
+
+
+def test_an_impact_and_an_offset_are_none():
+    assert not make(np.where(np.abs(T - 1.5) < 0.03, -6.0, 0.0)).any()
+    assert not make(np.full_like(T, -0.8)).any()
+
+
+def test_fingers_pressed_on_the_table_are_told(shared):
+    folder = shared / "panda" / "pick_low_5"
+    if not folder.exists():
+        pytest.skip("../shared/panda is absent")
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    found = align([read_trial(folder / "trial_01.csv", rig)], task, rig).segmentations[0]
+    assert found.failed is not None
+    assert "a finger pushed down on something at 1.8" in found.failed.reason
