@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from experiments.bank import deviated, draw_deviations
+from experiments.saving import save
 from experiments.scoring import boundaries_covered, boundary_residuals
 from experiments.sweeps.cells import Cell
 from experiments.sweeps.trials import GRASP_SPREAD, disturbed, recording_rig, scene
@@ -288,8 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             scored = [score(found) for found in replicates(ROWS[name], num)]
             document["rows"][name] = summary(scored) | {"seconds": sum(s["seconds"] for s in scored)}
             document["rows"] = {n: document["rows"][n] for n in ROWS if n in document["rows"]}
-            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-            options.output.write_text(text, encoding="utf-8")
+            save(options.output, document)
         print(line(name, document["rows"][name]), flush=True)
     from experiments.figure_calibration import draw
 

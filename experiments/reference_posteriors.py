@@ -11,7 +11,6 @@ experiments/results/reference_posteriors.json.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from estimation.mode import find_mode
 from estimation.posterior import NUM_CHANNELS, REACH, STEP, Posterior, posterior
 from estimation.proposal import proposal
 from estimation.sampler import BURN_IN, WALKERS, draw_unknowns, effective_sample_size, sample
+from experiments.saving import save
 from experiments.sbc import design_of, drawn
 from hmmseg.jaxconfig import double_precision
 
@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     speed = {f"{b} x {t}": densities_a_second(b, t) for b, t in ((2, 4), (12, 50))}
     print("log densities a second:", {k: round(v) for k, v in speed.items()})
     document = {"tasks": rows, "log_densities_a_second": speed}
-    RESULTS.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    save(RESULTS, document)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from estimation.design import PROPERTIES, Design, Unknown
 from estimation.nuisance import Nuisance
 from estimation.posterior import posterior
 from estimation.sampler import sample
+from experiments.saving import save
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "sbc.json"
@@ -147,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for prop, s in document["properties"].items():
         print(f"{prop:7} {s['count']} ranks, p {s['p_value']:.3f}, 68 %: {100 * s['coverage_68']:.1f}, "
               f"95 %: {100 * s['coverage_95']:.1f}")  # fmt: skip
-    RESULTS.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    save(RESULTS, document)
     draw(document, HERE.parent / "docs" / "figures" / "sbc.png")
 
 

@@ -15,6 +15,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from experiments.saving import save
+
 OUT = Path(__file__).parents[1] / "results" / "benchmark_commands.json"
 REPEATS = 5
 # Each program ends where its stage does; a stage is the difference to the one before.
@@ -64,7 +66,7 @@ def main() -> None:
         processor(arguments)
         commands[name] = {"warm": min(processor(arguments) for _ in range(REPEATS))}
     document = {"repeats": REPEATS, "stages": stages, "commands": commands}
-    OUT.write_text(json.dumps(document, indent=1) + "\n")
+    save(OUT, document)
     print(json.dumps(document, indent=1))
 
 

@@ -26,6 +26,7 @@ import numba
 import numpy as np
 
 import hmmseg.hmm as hmm
+from experiments.saving import save
 from hmmseg.jaxconfig import configure
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_kernels.json"
@@ -205,7 +206,7 @@ def main() -> None:
     for name, key in (("hmmlearn", "hmmlearn's kernel"), ("dynamax", "dynamax")):
         if key not in document["one trial"]["viterbi"]:
             versions[name] = None  # not there, or not to be imported beside the others
-    OUT.write_text(json.dumps(document, indent=1) + "\n")
+    save(OUT, document)
     print(json.dumps(document, indent=1))
 
 

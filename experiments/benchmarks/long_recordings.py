@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.saving import save
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
@@ -63,7 +64,7 @@ def main() -> None:
         done = subprocess.run([*command, "--rounds", str(rounds)], check=True, capture_output=True, text=True)
         rows.append(json.loads(done.stdout))
         print(rows[-1], flush=True)
-    OUT.write_text(json.dumps({"lengths": rows}, indent=1) + "\n")
+    save(OUT, {"lengths": rows})
 
 
 if __name__ == "__main__":

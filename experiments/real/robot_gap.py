@@ -8,10 +8,10 @@ KIND is xl330 or so101, FOLDER that of the logs (see experiments/real/xl330.py, 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from experiments.real.hiro_gap import rounded
+from experiments.saving import save
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.recording import read_recording
@@ -73,8 +73,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
-    text = json.dumps(run(given.kind, given.folder), indent=1, allow_nan=False) + "\n"
-    (given.output or RESULTS / f"{given.kind}.json").write_text(text, encoding="utf-8")
+    save(given.output or RESULTS / f"{given.kind}.json", run(given.kind, given.folder))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from experiments.saving import commit_of, save
+from experiments.saving import ROOT, commit_of, save
 
 
 def test_a_result_says_which_code_made_it(tmp_path):
@@ -35,3 +35,11 @@ def test_nan_is_refused(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         save(tmp_path / "found.json", {"value": float("nan")})
     assert not (tmp_path / "found.json").exists()
+
+
+def test_every_result_says_which_code_made_it():
+    known = {"blind_seal.json"}  # a list of hashes, each with the commits that drew and diagnosed the set
+    for path in sorted((ROOT / "experiments" / "results").rglob("*.json")):
+        if path.name not in known:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            assert {"made_by", "commits"} & found.keys(), path.name
