@@ -38,7 +38,7 @@ wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, 
 	$(BIN)/python .ci/check_wheel.py
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
-	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs
 
 constants: $(INSTALLED)  ## docs/constants.md: every numeric constant with its kind and reason
 	$(BIN)/python -m experiments.constants

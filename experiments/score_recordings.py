@@ -37,7 +37,7 @@ Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
 
 def by_hmm(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation], dict]:
     """Spans of the switching model and properties of the Bayesian model."""
-    from estimation.identification import identify  # JAX takes seconds to import; the rules do without
+    from estimation import identify  # its modules take long to import; the rules do without
 
     found = identify(case.trials[group], case.task, case.rig, seed)
     return found.segmentations, found.to_json()["properties"]
