@@ -1,6 +1,6 @@
 """Does a patched model reproduce recordings that took no part in it? Half of each set's trials judge.
 
-    python -m experiments.patch_heldout RECORDINGS
+    python -m experiments.patch_heldout RECORDINGS [--only NAME...]
 
 For every folder of labelled recordings: `hmmseg diagnose --patch` on the first half of the trials, then the
 virtual model is driven by the motions of the other half, nominal and patched, and the forces it predicts
@@ -79,8 +79,11 @@ def table() -> str | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", type=Path)
-    rows = []
-    for task in sorted(parser.parse_args().recordings.glob("*/task.toml")):
+    parser.add_argument("--only", nargs="+", help="these folders alone")
+    given, rows = parser.parse_args(), []
+    for task in sorted(given.recordings.glob("*/task.toml")):
+        if given.only and task.parent.name not in given.only:
+            continue
         rows.append(measured(task.parent))
         print(json.dumps(rows[-1]), flush=True)
     save(RESULTS / "patch_heldout.json", {"rows": rows})

@@ -45,7 +45,7 @@ def main(args: Sequence[str] | None = None) -> int:
     judge.add_argument("--sealed", type=Path, required=True)
     judge.add_argument("--results", type=Path, required=True)
     judge.add_argument("--json", type=Path, default=RESULTS)
-    judge.add_argument("--first", type=int, help="judge this many cases only: a run that was cut short")
+    judge.add_argument("--only", nargs="+", default=[], help="cases FROM:TO only: a run that was cut short")
     given = parser.parse_args(args)
     return {"generate": _generate, "untidy": _untidy, "diagnose": _diagnose, "score": _score}[given.step](
         given
@@ -85,7 +85,8 @@ def _diagnose(given: argparse.Namespace) -> int:
 def _score(given: argparse.Namespace) -> int:
     from experiments.blind_check.score import score
 
-    found = score(given.sealed, given.results, given.first)
+    ranges = [(int(a), int(b)) for a, b in (r.split(":") for r in given.only)]
+    found = score(given.sealed, given.results, ranges)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(table(found))

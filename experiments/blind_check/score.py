@@ -20,16 +20,18 @@ SIZES = (0.0, 0.1, 0.3, 1.0)
 BRACKETED = ("false_alarms", "named_right", "outside_right")
 
 
-def score(folder: Path, results: Path, first: int | None = None) -> dict[str, Any]:
+def score(folder: Path, results: Path, ranges: Sequence[tuple[int, int]] = ()) -> dict[str, Any]:
     """All figures of a sealed set. BrokenSeal where labels changed, ValueError where results lack.
 
-    `first` judges only so many cases, for a run that its time cut short: their order tells nothing.
+    `ranges` [from, to) judges those cases only, for a run that its time cut short: numbers tell nothing.
     """
     rows = []
-    for entry in unseal(folder)["cases"][:first]:
+    every = unseal(folder)["cases"]
+    chosen = [entry for a, b in ranges for entry in every[a:b]] if ranges else every
+    for entry in chosen:
         file = results / f"{entry['case']}.json"
         if not file.exists():
-            raise ValueError(f"{file}: no result; run diagnose to the end first, or give --first")
+            raise ValueError(f"{file}: no result; run diagnose to the end first, or give --only")
         rows.append(judge_case(entry, json.loads(file.read_text(encoding="utf-8"))))
     code = json.loads((results / "code.json").read_text(encoding="utf-8"))["sha256"]
     seal = json.loads((folder / "seal.json").read_text(encoding="utf-8"))
