@@ -54,8 +54,8 @@ def _correct(document: tomlkit.TOMLDocument, effect: str, found: Mapping[str, An
     if effect == "fingertip_compliance":
         pads = _table(document, "fingertip")
         return {k: _pad(pads, k, found[k]) for k in PADS if k in found}
-    if effect == "link_length" and "scale" in found and "fingers" in document:
-        return {"scale": _links(document, found["scale"])}
+    if effect == "link_length" and "fingers" in document:
+        return _links(document, found)
     known = catalogue().get(effect)
     if known is None or not (known.apply or known.scene or known.finish):
         document.add(tomlkit.comment(f"{effect}: found, but nothing that `hmmseg simulate` can put in"))
@@ -86,12 +86,17 @@ def _pad(pads: Table, name: str, p: Mapping[str, Any]) -> str:
     return f"fingertip.{name}"
 
 
-def _links(document: tomlkit.TOMLDocument, p: Mapping[str, Any]) -> str:
-    for finger in document["fingers"].values():  # type: ignore[union-attr]
+def _links(document: tomlkit.TOMLDocument, found: Mapping[str, Any]) -> dict[str, str]:
+    """Links longer by `scale`, all of them, or each by its own: link11 is finger 1's first."""
+    common = found["scale"]["mean"] if "scale" in found else 0.0
+    for name, finger in document["fingers"].items():  # type: ignore[union-attr]
         before = [float(v) for v in finger["links"]]
-        finger["links"] = [_number(v * (1 + p["mean"])) for v in before]
-        finger["links"].comment(f"was {before}; scale {p['mean']:+.4g}, {_told(p)}")
-    return "fingers.links.scale"
+        own = [found.get(f"link{name}{k}") for k in (1, 2)]
+        factors = [1 + common + (p["mean"] if p else 0.0) for p in own]
+        finger["links"] = [_number(v * f) for v, f in zip(before, factors, strict=True)]
+        told = [_told(p) for p in (found.get("scale"), *own) if p]
+        finger["links"].comment(f"was {before}; share longer: {'; '.join(told)}")
+    return {k: f"fingers.links.{k}" for k in found}
 
 
 def _told(p: Mapping[str, Any]) -> str:

@@ -75,6 +75,10 @@ def test_the_rig_keeps_its_text_and_says_what_was_found():
 def test_links_are_corrected_in_place_and_nothing_is_written_without_a_cause():
     text = files(RIG, found({"link_length": {"scale": (0.02, "1")}}))["rig.toml"]
     assert parse_rig(tomllib.loads(text)).finger(1).links == pytest.approx((0.1224, 0.1224))
+    each = {"link11": (0.02, "1"), "link12": (0.0, "1"), "link21": (0.0, "1"), "link22": (-0.01, "1")}
+    rig = parse_rig(tomllib.loads(files(RIG, found({"link_length": each}))["rig.toml"]))
+    assert rig.finger(1).links == pytest.approx((0.1224, 0.12)) and not rig.effects
+    assert rig.finger(2).links == pytest.approx((0.12, 0.1188))
     assert files(RIG, {"causes": [], "effects": {}}) == {}
     with pytest.raises(InputError, match=r"effects\.gravity_wave"):
         checked({"gravity_wave": {"size": 1.0}}, "rig.toml")
