@@ -85,8 +85,8 @@ def segment(
     >>> trial = pd.read_csv(folder / "trial_01.csv")  # a table will do as well as a path
     >>> found = segment(trial, folder / "task.toml", folder / "rig.toml")[0]
     >>> carry = found.spans[2]
-    >>> carry.subtask, carry.object, round(carry.start, 1), round(carry.end, 1)
-    ('carry', 'block1', 2.3, 3.8)
+    >>> carry.subtask, carry.object, round(carry.end - carry.start, 1)
+    ('carry', 'block1', 1.6)
     """
     order = Task.read(task)
     if isinstance(order, SequenceTask):

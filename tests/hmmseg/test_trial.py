@@ -187,9 +187,9 @@ def test_files_refused(tmp_path):
         ("a.doc", b"t\n", r"a\.doc: unknown kind of file '.doc'; expected .csv, .tsv, "),
         ("a.csv", b"t,\xe9\n", r"a\.csv: cannot be read .*; expected a table with a header row"),
         ("a.parquet", b"not parquet", r"a\.parquet: cannot be read "),
-        ("a.npz", b"not npz", r"a\.npz: cannot be read "),
-        ("b.npz", b"", r"b\.npz: cannot be read "),
-        ("c.npz", b"PK\x03\x04 cut off", r"c\.npz: cannot be read "),
+        ("a.npz", b"not npz", r"a\.npz: is no archive of NumPy"),
+        ("b.npz", b"", r"b\.npz: is no archive of NumPy"),
+        ("c.npz", b"PK\x03\x04 cut off", r"c\.npz: is no archive of NumPy"),
     ]:
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=message) as caught:
