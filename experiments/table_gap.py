@@ -31,7 +31,7 @@ def _row(row: dict[str, Any]) -> list[str]:
     )
     truth = "; ".join(f"{k} {_shown(v)}" for k, v in row["truth"].items())
     return [row["case"], _verdict(row["blind"]), _verdict(row["actual"]), values, truth,
-            f"{row['blind']['wall']:.0f} s"]  # fmt: skip
+            f"{row['blind']['processor']:.0f} s"]  # fmt: skip
 
 
 def _shown(value: Any) -> str:
@@ -61,12 +61,12 @@ def summary() -> str | None:
     quiet = sum(r["blind"]["verdict"] == "none" and r["actual"]["verdict"] == "none" for r in healthy)
     blind = table_blind_check.fresh()
     check = "" if blind is None else _blind(blind)
-    slowest = max(r["blind"]["wall"] for r in rows)
+    slowest = max(r["blind"]["processor"] for r in rows)
     return (
         f"On {len(rows)} labelled recordings of the stand-in, which were in view while it was built: "
-        f"{quiet} of {len(healthy)} healthy ones called healthy; of {len(affected)} with one effect "
+        f"{quiet} of {len(healthy)} healthy ones called healthy, of {len(affected)} with one effect "
         f"{right['blind']} named without knowing the blocks' properties ({sets} more as a set that holds "
-        f"the cause), {right['actual']} with them; {slowest:.0f} s at most for four trials in a warm process."
+        f"the cause), {right['actual']} with them; {slowest:.0f} s of processor at most for four trials."
         f"{check}"
     )
 

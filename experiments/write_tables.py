@@ -56,13 +56,10 @@ def results() -> str | None:
     for level, target in (("95", "92-97 %"), ("68", "63-73 %")):
         cells = [covered(x["all"], f"coverage_{level}") for x in p]
         rows.append([f"{level} % property intervals cover", target, *cells, "none given"])
-    speed = load("benchmark_identify")
+    speed = load("benchmark_commands")
     if speed is not None:
-        one = speed["trials"]["1"]
-        text = f"{one['warm']['wall']:.1f} s ({one['warm']['processor']:.1f} s processor)"
+        text = f"{speed['commands']['identify']['warm']:.1f} s of processor"
         rows.append(["`hmmseg identify`, one trial, warm cache", "<= 6 s", text, "", ""])
-        text = f"{one['first']['wall']:.1f} s ({one['first']['processor']:.1f} s processor)"
-        rows.append(["`hmmseg identify`, first run ever", "<= 25 s", text, "", ""])
     single = [found["recordings"]["single"], found["bank"]["single"]]
     rms = [", ".join(percent(c["properties"][k]["rms"], 2) for k in PROPERTIES) for c in single]
     rows.append(["weight, width, height from a single trial", "", *rms, ""])
