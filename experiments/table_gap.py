@@ -76,6 +76,8 @@ def _blind(found: dict[str, Any]) -> str:
     t = found["table"]
 
     def share(name: str) -> str:
+        if t[name]["value"] is None:
+            return "none to judge"
         low, high = t[name]["interval_95"]
         return f"{percent(t[name]['value'], 0)} ({100 * low:.0f} to {100 * high:.0f})"
 

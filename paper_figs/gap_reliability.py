@@ -8,7 +8,10 @@ from hmmseg.plot.style import BLUE, GREY, canvas
 from paper_figs.gap_results import load
 from paper_figs.results import target
 
-PANELS = (("calibration_error", "the likeliest verdict"), ("inclusion_all", "that an effect acts"))
+PANELS = (
+    ("calibration_error", "probability of the likeliest verdict"),
+    ("inclusion_all", "probability that an effect acts"),
+)
 
 
 def main() -> None:
@@ -21,7 +24,7 @@ def main() -> None:
             ax.plot(said, true, "o", ms=4, color=BLUE, label="found")
             for x, y, b in zip(said, true, bins, strict=True):
                 ax.annotate(f"{b['count']}", (x, y), (5, -9), textcoords="offset points", fontsize=6.5)
-            ax.set(xlabel=f"probability of {words}", ylabel="share that comes true")
+            ax.set(xlabel=words, ylabel="share that comes true")
             ax.set(xlim=(-0.02, 1.04), ylim=(-0.02, 1.04))
             ax.set_title(f"calibration error {found[key]['value']:.3f}; numbers are counts", loc="left")
             ax.legend(loc="upper left")
