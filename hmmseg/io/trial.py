@@ -22,6 +22,7 @@ JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq2
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
 CARTESIAN_OPTIONAL = ("vx1", "vy1", "vx2", "vy2")
 MIN_SAMPLES = 8  # chosen: fewer show no task
+LARGEST = 1e9  # physics: m, N or rad; no hand's sensor reads as much, and squares of it are far from overflow
 MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
 
@@ -121,6 +122,8 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
         if theirs_name not in table.columns:
             continue
         values = _mapped(numbers(table, theirs_name), name, columns, table)
+        if task is None:
+            _check_size(values, theirs_name, table)
         if np.isfinite(values).any():
             channels[name] = values
         elif name not in optional:  # an optional one without values is as good as absent
@@ -130,6 +133,15 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
     return Trial(table.file, t, channels, origin, between)
+
+
+def _check_size(values: np.ndarray, name: str, table: Table) -> None:
+    """InputError for the first row of a hand's channel (num_rows,) that no sensor can have read."""
+    beyond = np.flatnonzero(np.abs(np.nan_to_num(values)) > LARGEST)
+    if beyond.size:
+        raise InputError(f"{table.file}: row {table.rows[beyond[0]]}, column {name}",
+                         f"{values[beyond[0]]:.3g} is no reading of a hand's sensor",
+                         f"at most {LARGEST:.0g} in SI units")  # fmt: skip
 
 
 def _channels(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:

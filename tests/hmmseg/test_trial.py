@@ -127,9 +127,9 @@ REFUSED_CSV = [
     (csv(lambda lines: [lines[0], *(line + ",1" for line in lines[1:])]),
      "row 2: has 14 cells; expected 13"),
     (csv(lambda lines: [*lines[:-1], "0.55,0.3"]), "row 13: has 2 cells; expected 13 as in the header"),
-    (cell(5, "fy2", "x"), "row 5, column fy2: x is not a finite number; expected a number or an empty cell"),
-    (cell(5, "fy2", "inf"), "row 5, column fy2: inf is not a finite number"),
-    (cell(5, "fy2", "0.1.2"), "row 5, column fy2: 0.1.2 is not a finite number"),
+    (cell(5, "fy2", "x"), "row 4, column fy2: x is not a finite number; expected a number or an empty cell"),
+    (cell(5, "fy2", "inf"), "row 4, column fy2: inf is not a finite number"),
+    (cell(5, "fy2", "0.1.2"), "row 4, column fy2: 0.1.2 is not a finite number"),
     (cell(2, "t", "soon"), "row 2, column t: soon is not a finite number"),
     (cell(4, "t", ""), "row 4, column t: missing; expected a time in s"),
     (cell(4, "t", "0.05"), "row 4, column t: 0.05 after 0.05; expected strictly increasing times"),
@@ -180,6 +180,13 @@ def test_plain_task_refusals():
 def test_cartesian_hand_needs_its_columns():
     with pytest.raises(InputError, match="column x1: missing; expected t, x1, y1, vx1"):
         read_trial(table(JOINT_CHANNELS), CARTESIAN)
+
+
+def test_readings_that_no_sensor_gives_are_refused():
+    frame = table(CARTESIAN_CHANNELS)
+    frame.loc[3, "fy2"] = -1e300
+    with pytest.raises(InputError, match=r"row 4, column fy2: -1e\+300 is no reading of a hand's sensor"):
+        read_trial(frame, CARTESIAN)
 
 
 def test_files_refused(tmp_path):
