@@ -142,16 +142,16 @@ def remains(body: Body) -> list[str]:
         return [f"Nothing that stands out of the noise remains: {percent(rest['share'])} of the gap{sure}."]
     return [
         f"{percent(rest['share'])} of the gap remains{sure}.",
-        *moving({"where": rest.get("where") or []}),
+        *moving({"where": rest.get("where") or []}, of="what remains"),
     ]
 
 
-def moving(body: Body, most: int = 3) -> list[str]:
-    """The largest parts of `where` (of a small gap or remainder) as sentences."""
-    return [_said(place, cells) for place, cells in list(by_place(body).items())[:most]]
+def moving(body: Body, most: int = 3, of: str = "the gap") -> list[str]:
+    """The largest parts of `where` as sentences; shares are those `of` the gap, or of what remains."""
+    return [_said(place, cells, of) for place, cells in list(by_place(body).items())[:most]]
 
 
-def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> str:
+def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]], of: str) -> str:
     channel, subtask = key
     what = CHANNELS.get(channel, channel)
     share = share_of(cells)
@@ -164,7 +164,7 @@ def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> str:
         verb = f"moves otherwise above {plain(low, 2)} Hz"
     trials = len({c["trial"] for c in cells})
     often = f"{trials} trial{'s' if trials > 1 else ''}"
-    return f"{what[0].upper()}{what[1:]} {verb} {when(subtask)}: {percent(share)} of the gap, in {often}."
+    return f"{what[0].upper()}{what[1:]} {verb} {when(subtask)}: {percent(share)} of {of}, in {often}."
 
 
 def when(subtask: str) -> str:

@@ -76,7 +76,9 @@ def test_a_named_cause_is_told_with_what_it_leaves():
     assert "93 %" in told and "It explains 87 % of the gap (90 % interval 80 to 91 %)" in told
     left = remains(found)
     assert left[0].startswith("13 % of the gap remains")
-    assert left[1].startswith("The height difference of the fingers is off while you carry block1: 10 %")
+    assert left[1].startswith(
+        "The height difference of the fingers is off while you carry block1: 10 % of what remains"
+    )
 
 
 def test_a_cause_of_the_smaller_part_is_said_to_be_that():
