@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from experiments.table_text import load, markdown, percent
 
-ORDER = ("hmmseg, float64, as called", "hmmseg, float32, as called", "hmmseg, JAX inside jit",
-         "hmmlearn's kernel", "dynamax")  # fmt: skip
-CASES = {"one trial": "one trial, 200 x 9", "4,096 trials": "4,096 trials of 150 to 200 x 9",
-         "one stream": "one stream, 1,000,000 x 9", "many states": "one stream, 100,000 x 101"}  # fmt: skip
+OURS = ("hmmseg, float64, as called", "hmmseg, float32, as called", "hmmseg, JAX inside jit, float64",
+        "hmmseg, JAX inside jit, float32")  # fmt: skip
+ORDER = (*OURS, "hmmlearn's kernel", "dynamax")
+CASES = {"one trial": "one trial, 200 x 9", "4,096 trials": "4,096 trials, 150 to 200 x 9",
+         "one stream": "one stream, 1,000,000 x 9", "many states": "one stream, 100,000 x 101",
+         "long and many": "one stream, 1,000,000 x 101"}  # fmt: skip
 
 
 def kernels() -> str | None:
@@ -20,15 +22,34 @@ def kernels() -> str | None:
         case = found[key]
         cells = [f"{case['viterbi'][name]['ratio']:.2f}" if name in case["viterbi"] else "" for name in ORDER]
         rows.append([title, f"{1e3 * case['limit']:.3f} ms", *cells])
-    versions = ", ".join(f"{k} {v or 'not to be had'}" for k, v in found["versions"].items())
-    moved = found["exactness"]
-    agree = all(row.get("same_path", True) for key in CASES for row in found[key]["viterbi"].values())
-    told = (
+    versions = ", ".join(f"{k} {v or 'not installed'}" for k, v in found["versions"].items())
+    agree = all(row["same_path"] is not False for key in CASES for row in found[key]["viterbi"].values())
+    moved, above = found["exactness"], found["memory"]
+    shares = ", ".join(f"{name} {share:.2f}" for name, share in above["shares"].items() if share is not None)
+    told = [
         f"Versions: {versions}. Repeats: {found['repeats']}. All paths "
-        f"{'are the same' if agree else 'are NOT the same'}. Labels that single precision moves in "
-        f"{moved['samples']:,} samples of states half a standard deviation apart: {moved['moved']}."
-    )
-    return markdown(["case", "limit", *ORDER], rows) + "\n\n" + told
+        f"{'are the same' if agree else 'are NOT the same'}.",
+        f"Samples of {moved['samples']:,}, states half a standard deviation apart, that single precision "
+        + "gives another label: " + ", ".join(f"{k} {v}" for k, v in moved["moved"].items()) + ".",
+        f"Highest memory above the input, {above['samples']:,} x 9, as a share of it: {shares}.",
+    ]  # fmt: skip
+    change = found["one trial"]["viterbi"].get("ruptures")
+    if change is not None:
+        told.append(f"ruptures finds eight changes in the trial's signal in {change['ratio']:.0f} limits.")
+    return markdown(["case", "limit", *ORDER], rows) + "\n\n" + "\n".join(told)
+
+
+def kernels_short() -> str | None:
+    """README.md: the same, of few rows and columns."""
+    found = load("benchmark_kernels")
+    if found is None:
+        return None
+    names = (OURS[0], *ORDER[-2:])
+    rows = []
+    for key in ("one trial", "4,096 trials", "one stream", "many states"):
+        own, *others = (found[key]["viterbi"][name]["seconds"] for name in names)
+        rows.append([CASES[key], f"{1e3 * own:.3g} ms", *(f"{other / own:.1f} x" for other in others)])
+    return markdown(["most probable alignment", "`hmmseg.hmm`", *ORDER[-2:]], rows)
 
 
 def smoothing() -> str | None:
@@ -39,10 +60,24 @@ def smoothing() -> str | None:
     rows = []
     for key in ("one trial", "one stream", "many states"):
         case, times = found[key], found[key]["smoothing"]
-        other = times.get("hmmlearn's kernels")
+        others = [f"{times[n] / times['hmmseg']:.1f}" if n in times else "" for n in ORDER[-2:]]
         rows.append([CASES[key], f"{1e3 * times['hmmseg']:.3f} ms", f"{case['smoothing_over_viterbi']:.1f}",
-                     "" if other is None else f"{other / times['hmmseg']:.1f}"])  # fmt: skip
-    head = ["case", "`smooth`", "over its own `viterbi`", "hmmlearn's forward and backward over it"]
+                     *others])  # fmt: skip
+    head = ["case", "`smooth`", "over its own `viterbi`", "hmmlearn over it", "dynamax over it"]
+    return markdown(head, rows)
+
+
+def samplers() -> str | None:
+    """docs/benchmarks.md: effective samples a second on the same log density."""
+    found = load("reference_posteriors")
+    if found is None:
+        return None
+    rows = []
+    for task in found["tasks"]:
+        own, nuts, plain = (task[f"{kind}ess_per_second"] for kind in ("", "nuts_", "stretch_"))
+        rows.append([f"{task['blocks']} x {task['trials']}", f"{own:,.0f}", f"{nuts:,.0f}", f"{plain:,.0f}",
+                     f"{own / max(nuts, plain):.1f}"])  # fmt: skip
+    head = ["blocks x trials", "`identify`", "NumPyro's NUTS", "emcee as it comes", "ahead of the better by"]
     return markdown(head, rows)
 
 
@@ -75,6 +110,30 @@ def lengths() -> str | None:
     ]  # fmt: skip
     head = ["recording", "rows", "rounds found", "processor", "a row", "memory on top"]
     return markdown(head, rows)
+
+
+def solvers() -> str | None:
+    """docs/benchmarks.md: which solver for which problem."""
+    found = load("benchmark_solvers")
+    if found is None:
+        return None
+    rows = []
+    for problem, of in found["problems"].items():
+        for name, row in of["solvers"].items():
+            rows.append([f"{problem} ({of['number']})", name, *(f"{row[k]:.3f} s" for k in TIMES),
+                         f"{row['above_best']:.1e}"])  # fmt: skip
+    head = [
+        "problem (how many)",
+        "solver",
+        "first call",
+        "from the disk's cache",
+        "warm",
+        "cost above the best",
+    ]
+    return markdown(head, rows) + f"\n\nRecording: {found['recording']}; code of {found['made_by']}."
+
+
+TIMES = ("first", "cached", "warm")
 
 
 def watch() -> str | None:

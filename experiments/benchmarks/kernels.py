@@ -2,21 +2,20 @@
 
     python -m experiments.benchmarks.kernels [--small]
 
-Writes experiments/results/benchmark_kernels.json. Every time is the least of several repeats on the
-processor's clock (wall time of a busy machine says little), one thread; ratios are to the limit, a plain
-loop over the band compiled by numba. A peer that is not installed (`pip install hmmseg[bench]`) is left out
-and said so.
+Writes experiments/results/benchmark_kernels.json and docs/figures/benchmarks.png. Every time is the least of
+several repeats on the processor's clock (wall time of a busy machine says little), one thread, libraries in
+turn; ratios are to the limit, a plain loop over the band compiled by numba. Memory is the highest of a
+process of its own above what it held with the input made.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import json
 import os
 import platform
-import time
-from collections.abc import Callable
+import subprocess
+import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -26,11 +25,15 @@ import numba
 import numpy as np
 
 import hmmseg.hmm as hmm
+from experiments.benchmarks import peers
+from experiments.benchmarks.timing import least
 from experiments.saving import save
 from hmmseg.jaxconfig import configure
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_kernels.json"
+FIGURE = Path(__file__).parents[2] / "docs" / "figures" / "benchmarks.png"
 SEPARATION = 2.0  # sds between the states' means: paths are determined, not trivial
+CHUNK = 1 << 16  # samples made at a time
 
 
 @numba.njit(nogil=True)
@@ -60,161 +63,197 @@ def limit(x: np.ndarray, chain: hmm.Chain) -> np.ndarray:
     return starts
 
 
-def problem(num_samples: int, num_states: int, seed: int = 0) -> np.ndarray:
-    """Log-likelihoods of a signal that goes through the states in turn."""
+def signal_of(num_samples: int, num_states: int, seed: int = 0, separation: float = SEPARATION) -> np.ndarray:
+    """A signal that goes through the states in turn."""
     rng = np.random.default_rng(seed)
     state = np.minimum(np.arange(num_samples) * num_states // num_samples, num_states - 1)
-    signal = SEPARATION * state + rng.normal(size=num_samples)
-    return -0.5 * (signal[:, None] - SEPARATION * np.arange(num_states)) ** 2
+    return separation * state + rng.normal(size=num_samples)
 
 
-def least(function: Callable[[], object], seconds: float, most: int = 2000) -> float:
-    """Least processor time [s] of a call, after one that warms up; calls repeat over `seconds`."""
-    function()
-    times: list[float] = []
-    until = time.process_time() + seconds
-    while len(times) < 3 or (time.process_time() < until and len(times) < most):
-        began = time.process_time_ns()
-        function()
-        times.append((time.process_time_ns() - began) * 1e-9)
-    return min(times)
+def problem(num_samples: int, num_states: int, seed: int = 0, separation: float = SEPARATION,
+            dtype: type = np.float64) -> np.ndarray:  # fmt: skip
+    """Its log-likelihoods (num_samples, num_states), made without holding more than them."""
+    signal = signal_of(num_samples, num_states, seed, separation)
+    out = np.empty((num_samples, num_states), dtype)
+    for at in range(0, num_samples, CHUNK):
+        part = slice(at, at + CHUNK)
+        out[part] = -0.5 * (signal[part, None] - separation * np.arange(num_states)) ** 2
+    return out
 
 
-def matrix(chain: hmm.Chain) -> np.ndarray:
-    """Transition probabilities (num_states, num_states), which libraries of general models take."""
-    return np.diag(np.exp(chain.bands[0])) + np.diag(np.exp(chain.bands[1]), 1)
+def chain_of(num_samples: int, num_states: int) -> hmm.Chain:
+    """A chain in which all states last alike on average."""
+    return hmm.left_to_right([num_samples / num_states] * num_states)
 
 
-def peers(x: np.ndarray, chain: hmm.Chain) -> dict[str, Callable[[], np.ndarray]]:
-    """Viterbi paths by other libraries and by ours, as functions of nothing that give states or starts."""
-    import jax
-    import jax.numpy as jnp
-
-    from hmmseg.hmm import banded
-
-    found: dict[str, Callable[[], np.ndarray]] = {}
-    dense, num_states = matrix(chain), x.shape[1]
-    start = np.eye(num_states)[0]
-    ended = np.array(x)
-    ended[-1, :-1] = -np.inf  # they have no end-state constraint
-    try:
-        from hmmlearn import _hmmc
-
-        found["hmmlearn's kernel"] = lambda: np.asarray(_hmmc.viterbi(start, dense, ended)[1])
-    except ImportError:
-        pass
-    try:
-        from dynamax.hidden_markov_model.inference import hmm_posterior_mode
-
-        mode = jax.jit(hmm_posterior_mode)
-        arguments = [jnp.asarray(a) for a in (start, dense, ended)]
-        found["dynamax"] = lambda: np.asarray(mode(*arguments))
-    except ImportError:
-        pass
-    jitted = jax.jit(lambda ll, stay, advance: banded.viterbi(ll, stay, advance).path)
-    inside = [jnp.asarray(a) for a in (x, *chain.bands)]
-    found["hmmseg, JAX inside jit"] = lambda: np.asarray(jitted(*inside))
-    single = x.astype(np.float32)
-    found["hmmseg, float32, as called"] = lambda: hmm.viterbi(single, chain).starts
-    found["hmmseg, float64, as called"] = lambda: hmm.viterbi(x, chain).starts
-    return found
-
-
-def one_stream(num_samples: int, num_states: int, seconds: float, slow: bool = True) -> dict:
-    """One recording: times, ratios to the limit, and whether the paths agree."""
-    x = problem(num_samples, num_states)
-    chain = hmm.left_to_right([num_samples / num_states] * num_states)
+def one_stream(num_samples: int, num_states: int, seconds: float, general: bool = True,
+               smoothed: bool = True) -> dict:  # fmt: skip
+    """One recording: times, ratios to the limit, whether the paths agree; `general`: other libraries too."""
+    x, chain = problem(num_samples, num_states), chain_of(num_samples, num_states)
     reference = limit(x, chain)
-    least_time = least(lambda: limit(x, chain), seconds)
-    rows = {}
-    for name, function in peers(x, chain).items():
-        if not slow and name.startswith(("hmmlearn", "dynamax")) and num_states > 50:
-            continue
+    functions = peers.paths(x, chain, jax_too=general)
+    if not general:
+        functions.pop(peers.HMMLEARN, None)
+    same = {}
+    for name, function in functions.items():
         path = function()
         starts = path if path.size == num_states else np.searchsorted(path, np.arange(num_states))
-        rows[name] = {"seconds": least(function, seconds), "same_path": bool((starts == reference).all())}
-    smoothing = {"hmmseg": least(lambda: hmm.smooth(x, chain), seconds)}
-    try:
-        from hmmlearn import _hmmc
-
-        if num_states <= 50:
-            dense, start = matrix(chain), np.eye(num_states)[0]
-            smoothing["hmmlearn's kernels"] = least(
-                lambda: (_hmmc.forward_log(start, dense, x), _hmmc.backward_log(start, dense, x)), seconds
-            )
-    except ImportError:
-        pass
-    for row in rows.values():
-        row["ratio"] = row["seconds"] / least_time
-    own = rows["hmmseg, float64, as called"]["seconds"]
-    return {
-        "samples": num_samples, "states": num_states, "limit": least_time, "viterbi": rows,
-        "smoothing": smoothing, "smoothing_over_viterbi": smoothing["hmmseg"] / own,
-    }  # fmt: skip
+        same[name] = bool((starts == reference).all())
+    if num_samples < 1000:
+        functions |= peers.change_points(signal_of(num_samples, num_states), num_states)
+    times = least({"limit": lambda: limit(x, chain), **functions}, seconds)
+    rows = {name: {"seconds": times[name], "ratio": times[name] / times["limit"], "same_path": same.get(name)}
+            for name in functions}  # fmt: skip
+    found = {"samples": num_samples, "states": num_states, "limit": times["limit"], "viterbi": rows}
+    if smoothed:
+        smoothers = least({"viterbi": functions[peers.DOUBLE], **peers.smoothers(x, chain)}, seconds)
+        own = smoothers.pop("viterbi")
+        found |= {"smoothing": smoothers, "smoothing_over_viterbi": smoothers["hmmseg"] / own}
+    return found
 
 
 def many(num: int, seconds: float) -> dict:
     """Trials of ragged lengths up to 200 in one batch, one thread each."""
-    rng = np.random.default_rng(1)
-    tables = [problem(int(n), 9, seed) for seed, n in enumerate(rng.integers(150, 201, num))]
+    lengths = np.random.default_rng(1).integers(150, 201, num)
+    tables = [problem(int(n), 9, seed) for seed, n in enumerate(lengths)]
     chain = hmm.left_to_right([22.0] * 9)
     reference = np.array([limit(x, chain) for x in tables])
-    limit_time = least(lambda: [limit(x, chain) for x in tables], seconds)
-    ours = least(lambda: hmm.viterbi(tables, chain), seconds)
     found = hmm.viterbi(tables, chain)
-    row = {"seconds": ours, "ratio": ours / limit_time, "same_path": bool((found.starts == reference).all())}
-    rows = {"hmmseg, float64, as called": row}
+    assert isinstance(found, hmm.Alignments)
+    functions = {"limit": lambda: [limit(x, chain) for x in tables],
+                 peers.DOUBLE: lambda: hmm.viterbi(tables, chain)}  # fmt: skip
+    single = [x.astype(np.float32) for x in tables]
+    functions[peers.SINGLE] = lambda: hmm.viterbi(single, chain)
+    try:
+        import jax
+        import jax.numpy as jnp
+        from dynamax.hidden_markov_model.inference import hmm_posterior_mode
+
+        padded = np.zeros((num, 200, 9))  # of one length, as it takes no others
+        for row, x in zip(padded, tables, strict=True):
+            row[: len(x)] = x
+        mode = jax.jit(jax.vmap(hmm_posterior_mode, (None, None, 0)))
+        arguments = [jnp.asarray(a) for a in (np.eye(9)[0], peers.matrix(chain), padded)]
+        functions[peers.DYNAMAX] = lambda: np.asarray(mode(*arguments))
+    except ImportError:
+        pass
     try:
         from hmmlearn import _hmmc
 
-        dense, start = matrix(chain), np.eye(9)[0]
-        t = least(lambda: [_hmmc.viterbi(start, dense, x) for x in tables], seconds)
-        rows["hmmlearn's kernel"] = {"seconds": t, "ratio": t / limit_time}
+        dense, start = peers.matrix(chain), np.eye(9)[0]
+        functions[peers.HMMLEARN] = lambda: [_hmmc.viterbi(start, dense, x) for x in tables]
     except ImportError:
         pass
-    return {"trials": num, "limit": limit_time, "viterbi": rows}
+    times = least(functions, seconds)
+    rows = {name: {"seconds": times[name], "ratio": times[name] / times["limit"], "same_path": None}
+            for name in functions if name != "limit"}  # fmt: skip
+    rows[peers.DOUBLE]["same_path"] = bool((found.starts == reference).all())
+    return {"trials": num, "limit": times["limit"], "viterbi": rows}
 
 
 def exactness(num_samples: int) -> dict:
     """Labels that single precision moves, states half a standard deviation apart."""
-    rng = np.random.default_rng(2)
-    state = np.minimum(np.arange(num_samples) * 9 // num_samples, 8)
-    signal = 0.5 * state + rng.normal(size=num_samples)
-    single = (-0.5 * (signal[:, None] - 0.5 * np.arange(9)) ** 2).astype(np.float32)
-    chain = hmm.left_to_right([num_samples / 9] * 9)
-    moved = hmm.viterbi(single, chain).starts != hmm.viterbi(single.astype(np.float64), chain).starts
-    return {"samples": num_samples, "moved": int(moved.sum())}
+    import jax.numpy as jnp
+
+    from hmmseg.hmm import banded
+
+    single = problem(num_samples, 9, 2, 0.5, np.float32)
+    chain = chain_of(num_samples, 9)
+    starts = {"host": hmm.viterbi(single, chain).starts}
+    bands = [jnp.asarray(band, jnp.float32) for band in chain.bands]
+    path = np.asarray(banded.viterbi(single, *bands).path)
+    starts["JAX"] = np.searchsorted(path, np.arange(9))
+    reference = hmm.viterbi(single.astype(np.float64), chain).starts
+    moved = {name: int(np.abs(found - reference).sum()) for name, found in starts.items()}
+    return {"samples": num_samples, "moved": moved}
+
+
+def memory(num_samples: int) -> dict:
+    """Memory above the input [as a share of it] of one path, each in a process of its own."""
+    shares = {}
+    for name in (peers.DOUBLE, peers.SINGLE, peers.HMMLEARN, peers.DYNAMAX):
+        command = [sys.executable, "-m", "experiments.benchmarks.kernels", "--memory", name, str(num_samples)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        shares[name] = float(done.stdout) if done.returncode == 0 else None
+    return {"samples": num_samples, "shares": shares}
+
+
+def memory_of(name: str, num_samples: int) -> float:
+    """Highest memory of this process during one path above that before it, over the input's size."""
+    dtype = np.float32 if name in (peers.SINGLE, peers.DYNAMAX) else np.float64
+    x, chain = problem(num_samples, 9, dtype=dtype), chain_of(num_samples, 9)
+    x[-1, :-1] = -np.inf
+    short = x[-1000:].copy()
+    dense, start = peers.matrix(chain).astype(dtype), np.eye(9, dtype=dtype)[0]
+    if name == peers.HMMLEARN:
+        from hmmlearn import _hmmc
+
+        run = lambda ll: _hmmc.viterbi(start, dense, ll)  # noqa: E731
+    elif name == peers.DYNAMAX:
+        import jax
+        from dynamax.hidden_markov_model.inference import hmm_posterior_mode
+
+        x, short = jax.numpy.asarray(x), jax.numpy.asarray(short)
+        run = lambda ll: jax.jit(hmm_posterior_mode)(start, dense, ll).block_until_ready()  # noqa: E731
+    else:
+        run = lambda ll: hmm.viterbi(ll, chain).starts  # noqa: E731
+    run(short)
+    Path("/proc/self/clear_refs").write_text("5")  # the highest so far is what is held now
+    before = _held("VmRSS")
+    run(x)
+    return (_held("VmHWM") - before) / x.nbytes
+
+
+def _held(which: str) -> float:
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(which))
+    return 1024.0 * float(line.split()[1])
+
+
+def draw(document: dict) -> None:
+    """Times of every library over the limit, one group of bars a case."""
+    from experiments.table_speed import CASES
+    from hmmseg.plot.style import BLUE, GREEN, GREY, ORANGE, RED, SKY, canvas
+
+    names = (peers.DOUBLE, peers.SINGLE, peers.JAX_DOUBLE, peers.JAX_SINGLE, peers.HMMLEARN, peers.DYNAMAX)
+    with canvas(FIGURE, 7.2, 2.9) as figure:
+        axes = figure.subplots()
+        for i, (name, colour) in enumerate(zip(names, (BLUE, SKY, GREEN, ORANGE, GREY, RED), strict=True)):
+            at = [(c, document[case]["viterbi"][name]["ratio"]) for c, case in enumerate(CASES)
+                  if name in document[case]["viterbi"]]  # fmt: skip
+            axes.bar(
+                [c + 0.13 * (i - 2.5) for c, _ in at], [r for _, r in at], 0.12, color=colour, label=name
+            )
+        axes.axhline(1.0, color="k", linewidth=0.6)
+        axes.set(yscale="log", ylabel="time over a plain compiled loop", xticks=range(len(CASES)))
+        axes.set_xticklabels([title.replace(", ", "\n", 1) for title in CASES.values()])
+        axes.legend(ncols=3, loc="upper left", bbox_to_anchor=(0.0, 1.28))
 
 
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="a tenth of the samples and repeats")
+    parser.add_argument("--memory", nargs=2, metavar=("NAME", "SAMPLES"), help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.memory:
+        print(memory_of(args.memory[0], int(args.memory[1])))
+        return
     configure()
     scale, seconds = (10, 0.2) if args.small else (1, 1.0)
-    versions = {name: _version(name) for name in ("hmmlearn", "dynamax", "jax", "numba", "numpy", "hmmseg")}
     document = {
-        "versions": versions, "machine": platform.machine(), "small": args.small,
-        "repeats": f"least of those that fit in {seconds} s of processor, at least 3",
+        "versions": peers.versions(), "machine": platform.machine(), "small": args.small,
+        "repeats": f"least of those that fit in {seconds} s of processor, at least 3, in turn",
         "one trial": one_stream(200, 9, seconds),
         "4,096 trials": many(4096 // scale, seconds),
         "one stream": one_stream(1_000_000 // scale, 9, seconds),
-        "many states": one_stream(100_000 // scale, 101, seconds, slow=False),
+        "many states": one_stream(100_000 // scale, 101, seconds),
+        "long and many": one_stream(1_000_000 // scale, 101, seconds, general=False, smoothed=False),
         "exactness": exactness(10_000_000 // scale),
+        "memory": memory(10_000_000 // scale),
     }  # fmt: skip
-    for name, key in (("hmmlearn", "hmmlearn's kernel"), ("dynamax", "dynamax")):
-        if key not in document["one trial"]["viterbi"]:
-            versions[name] = None  # not there, or not to be imported beside the others
     save(OUT, document)
+    draw(document)
     print(json.dumps(document, indent=1))
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 if __name__ == "__main__":

@@ -17,12 +17,14 @@ from hmmseg._lazy import lazily
 
 if TYPE_CHECKING:
     from hmmseg.hmm.chain import Chain, InfeasibleAlignment, left_to_right
+    from hmmseg.hmm.durations import DurationChain, lasting
     from hmmseg.hmm.inference import forward, k_best, log_evidence, sample, smooth, viterbi
     from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
     from hmmseg.hmm.streaming import Step, StreamingFilter, Window
 
 _MODULES = {
     "chain": ("Chain", "InfeasibleAlignment", "left_to_right"),
+    "durations": ("DurationChain", "lasting"),
     "inference": ("forward", "k_best", "log_evidence", "sample", "smooth", "viterbi"),
     "results": ("Alignment", "Alignments", "Filtered", "Posterior"),
     "streaming": ("Step", "StreamingFilter", "Window"),
@@ -33,6 +35,7 @@ __all__ = [
     "Alignment",
     "Alignments",
     "Chain",
+    "DurationChain",
     "Filtered",
     "InfeasibleAlignment",
     "Posterior",
@@ -41,6 +44,7 @@ __all__ = [
     "Window",
     "forward",
     "k_best",
+    "lasting",
     "left_to_right",
     "log_evidence",
     "sample",

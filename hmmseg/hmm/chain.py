@@ -122,20 +122,36 @@ def left_to_right(mean_samples: ArrayLike, presence: ArrayLike | None = None) ->
     there = np.ones(leave.size) if presence is None else np.asarray(presence, dtype=float)
     if there.shape != leave.shape or leave.ndim != 1:
         raise ValueError(f"presence: shape {there.shape}, expected {leave.shape}, one number a state")
-    if not leave.size or not (leave > 0).all() or not ((there > 0) & (there <= 1)).all():
+    if not leave.size or not (leave > 0).all():
         raise ValueError("left_to_right: expected means above 0 and probabilities in (0, 1]")
+    jumps, initial, final = jumps_between(there)
     with np.errstate(divide="ignore"):
-        present, absent, leaving = np.log(there), np.log1p(-there), np.log(leave)
-        stay = np.log1p(-leave)
+        leaving, stay = np.log(leave), np.log1p(-leave)
     stay[-1] = 0.0
+    jumps = [leaving[: jump.size] + jump for jump in jumps]
+    return Chain(stay, jumps[0], jumps[1:] or None, log_initial=initial, log_final=final)
+
+
+def jumps_between(presence: ArrayLike) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Log probabilities of what comes next where states occur with these probabilities.
+
+    From k to k + d (num_states - d,) for d = 1, 2, ... as far as any states can be passed over; of the first
+    state that occurs, and of the last (num_states,). ValueError outside of (0, 1].
+    """
+    there = np.asarray(presence, dtype=float)
+    if there.ndim != 1 or not ((there > 0) & (there <= 1)).all():
+        raise ValueError(f"presence: {there.tolist()}, expected probabilities in (0, 1]")
+    with np.errstate(divide="ignore"):
+        present, absent = np.log(there), np.log1p(-there)
     longest = max((len(run) for run in "".join("x" if p < 1 else " " for p in there).split()), default=0)
+    n = there.size
     jumps = [
-        np.array([leaving[k] + absent[k + 1 : k + d].sum() + present[k + d] for k in range(leave.size - d)])
+        np.array([absent[k + 1 : k + d].sum() + present[k + d] for k in range(n - d)])
         for d in range(1, longest + 2)
     ]
-    initial = np.array([absent[:k].sum() + present[k] for k in range(leave.size)])
-    final = np.array([absent[k + 1 :].sum() for k in range(leave.size)])
-    return Chain(stay, jumps[0], jumps[1:] or None, log_initial=initial, log_final=final)
+    initial = np.array([absent[:k].sum() + present[k] for k in range(n)])
+    final = np.array([absent[k + 1 :].sum() for k in range(n)])
+    return jumps, initial, final
 
 
 def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:

@@ -19,16 +19,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmmseg.hmm import durations
 from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
+from hmmseg.hmm.durations import DurationChain
 from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
 
 Tables = Any  # one array, or a sequence of arrays
+AnyChain = Chain | DurationChain
 _NONE = np.empty((0, 0))  # numerics
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _CELLS_A_THREAD = 1 << 17  # numerics: below, another thread costs more than it saves
 
 
-def table(log_likelihoods: ArrayLike, chain: Chain) -> np.ndarray:
+def table(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
     """The log-likelihoods as the kernels take them; ValueError where their shape is not the chain's."""
     ll = np.asarray(log_likelihoods)
     if ll.dtype != _DOUBLE and ll.dtype != _SINGLE:
@@ -57,21 +60,21 @@ def filled(ll: np.ndarray) -> np.ndarray:
     return x
 
 
-def viterbi(log_likelihoods: Tables, chain: Chain | Sequence[Chain],
+def viterbi(log_likelihoods: Tables, chain: AnyChain | Sequence[AnyChain],
             lengths: Sequence[int] | np.ndarray | None = None) -> Alignment | Alignments:  # fmt: skip
     """Most probable alignment; of each recording where there are several. A tie goes to staying.
 
     Several recordings: a sequence of tables, or one array (num_recordings, num_samples, num_states)
     with the `lengths` (num_recordings,) of what is no padding; with one chain or one for each.
     """
-    if getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, Chain):
+    if getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain):
         return _viterbi_one(table(log_likelihoods, chain), chain)
     return _viterbi_many(*recordings(log_likelihoods, chain, lengths))
 
 
 def recordings(
-    log_likelihoods: Tables, chain: Chain | Sequence[Chain], lengths: Sequence[int] | np.ndarray | None
-) -> tuple[list[np.ndarray], list[Chain]]:
+    log_likelihoods: Tables, chain: AnyChain | Sequence[AnyChain], lengths: Sequence[int] | np.ndarray | None
+) -> tuple[list[np.ndarray], list[AnyChain]]:
     """Tables and chains of several recordings."""
     tables = list(log_likelihoods)
     if lengths is not None:
@@ -81,13 +84,15 @@ def recordings(
             if not 0 < n <= len(tables[i]):
                 raise ValueError(f"lengths: {n} for recording {i}, expected 1 to {len(tables[i])}")
         tables = [each[:n] for each, n in zip(tables, lengths, strict=True)]
-    chains = [chain] * len(tables) if isinstance(chain, Chain) else list(chain)
+    chains = [chain] * len(tables) if isinstance(chain, AnyChain) else list(chain)
     if len(chains) != len(tables):
         raise ValueError(f"chain: {len(chains)} given, expected {len(tables)}, one a recording")
     return [table(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
 
 
-def _viterbi_one(ll: np.ndarray, chain: Chain) -> Alignment:
+def _viterbi_one(ll: np.ndarray, chain: AnyChain) -> Alignment:
+    if isinstance(chain, DurationChain):
+        return durations.k_best(filled(ll), chain, 1)[0]
     if len(chain.bands) > 2:
         from hmmseg.hmm.kernels.general import best_general
 
@@ -109,11 +114,12 @@ def _viterbi_one(ll: np.ndarray, chain: Chain) -> Alignment:
     return Alignment(starts, len(ll), log_prob)
 
 
-def _viterbi_many(tables: list[np.ndarray], chains: list[Chain]) -> Alignments:
+def _viterbi_many(tables: list[np.ndarray], mixed: list[AnyChain]) -> Alignments:
     lengths = np.array([len(ll) for ll in tables], dtype=np.int64)
-    if len({(c.num_states, c.varying, len(c.bands), ll.dtype) for c, ll in zip(chains, tables, strict=True)
-            }) > 1 or (chains and len(chains[0].bands) > 2):  # fmt: skip
-        each = [_viterbi_one(ll, c) for ll, c in zip(tables, chains, strict=True)]
+    chains = [c for c in mixed if isinstance(c, Chain)]
+    kinds = {(c.num_states, c.varying, len(c.bands), ll.dtype) for c, ll in zip(chains, tables, strict=False)}
+    if len(chains) < len(mixed) or len(kinds) > 1 or (chains and len(chains[0].bands) > 2):
+        each = [_viterbi_one(ll, c) for ll, c in zip(tables, mixed, strict=True)]
         return Alignments(np.array([a.starts for a in each]), lengths, np.array([a.log_prob for a in each]))
     if not tables:
         return Alignments(np.empty((0, 0), np.int64), lengths, np.empty(0))
@@ -191,25 +197,33 @@ def tables_of(ll: np.ndarray, chain: Chain, logs: bool, filtered: bool, smoothed
     return log_evidence, online, state, moves
 
 
-def log_evidence(log_likelihoods: ArrayLike, chain: Chain) -> float:
+def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain) -> float:
     """Log of the summed weight of all paths."""
+    if isinstance(chain, DurationChain):
+        return durations.forward(filled(table(log_likelihoods, chain)), chain)[0]
     return tables_of(table(log_likelihoods, chain), chain, False, False, False)[0]
 
 
-def forward(log_likelihoods: ArrayLike, chain: Chain) -> Filtered:
+def forward(log_likelihoods: ArrayLike, chain: AnyChain) -> Filtered:
     """Filtered probabilities: what each sample says together with those before it."""
+    if not isinstance(chain, Chain):
+        raise ValueError("chain: tables of durations, expected a Chain")
     found = tables_of(table(log_likelihoods, chain), chain, False, True, False)
     return Filtered(found[0], found[1])
 
 
-def smooth(log_likelihoods: ArrayLike, chain: Chain) -> Posterior:
+def smooth(log_likelihoods: ArrayLike, chain: AnyChain) -> Posterior:
     """Probabilities of states and boundaries given the whole recording."""
+    if isinstance(chain, DurationChain):
+        return durations.smooth(filled(table(log_likelihoods, chain)), chain)
     found = tables_of(table(log_likelihoods, chain), chain, False, False, True)
     return Posterior(found[0], found[2], found[3])
 
 
-def sample(log_likelihoods: ArrayLike, chain: Chain, num_draws: int, seed: int = 0) -> Alignments:
+def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: int = 0) -> Alignments:
     """Independent exact draws from the posterior over alignments; `log_prob` is NaN."""
+    if isinstance(chain, DurationChain):
+        return durations.sample(filled(table(log_likelihoods, chain)), chain, num_draws, seed)
     from hmmseg.hmm.kernels.general import draw_starts
 
     ll = table(log_likelihoods, chain)
@@ -220,13 +234,15 @@ def sample(log_likelihoods: ArrayLike, chain: Chain, num_draws: int, seed: int =
     return Alignments(starts, np.full(num_draws, len(ll)), np.full(num_draws, np.nan))
 
 
-def k_best(log_likelihoods: ArrayLike, chain: Chain, k: int) -> Alignments:
+def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int) -> Alignments:
     """The k most probable alignments, best first; fewer where fewer are possible."""
     from hmmseg.hmm.kernels.general import best_k
 
     if not 0 < k < 1 << 16:
         raise ValueError(f"k: {k}, expected 1 to 65535")
     ll = table(log_likelihoods, chain)
+    if isinstance(chain, DurationChain):
+        return durations.k_best(filled(ll), chain, k)
     starts, log_prob = np.empty((k, chain.num_states), np.int64), np.empty(k)
     best_k(filled(ll), chain.stacked(), chain.varying, chain.log_initial, chain.log_final, starts, log_prob)
     if not np.isfinite(log_prob[0]):

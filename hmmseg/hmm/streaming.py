@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmmseg.hmm.chain import Chain, InfeasibleAlignment
+from hmmseg.hmm.durations import DurationChain
 
 _SPARE = 64  # numerics: rows; the window moves to the front of its table only once in so many samples or more
 _LN2 = math.log(2)  # physics: a logarithm
@@ -55,7 +56,9 @@ class StreamingFilter:
     or a negative lag.
     """
 
-    def __init__(self, chain: Chain, lag: int) -> None:
+    def __init__(self, chain: Chain | DurationChain, lag: int) -> None:
+        if not isinstance(chain, Chain):
+            raise ValueError("chain: tables of durations, expected a Chain: they would need the whole stream")
         if chain.varying:
             raise ValueError(
                 "chain: varies in time, expected one that does not, as a stream has no known end"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from hmmseg.hmm.banded import InfeasibleAlignment
+from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.hmm.em import em, from_starts
 
 STAY = 0.8

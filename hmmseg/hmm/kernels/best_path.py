@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.hmm.kernels.blocks import FIRST, PAD, doubles, load, row_width
+from hmmseg.hmm.kernels.blocks import FIRST, PAD, any_missing, doubles, load, row_width
 from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import ahead, at, doubles_at, singles_at, value_at
 from hmmseg.hmm.kernels.steps import viterbi_step
@@ -28,16 +28,6 @@ def decide(delta, rows, count, num_states, stay, advance, stay_step, advance_ste
                 at(advance, v + 8 * c), left,
             )  # fmt: skip
             left = following
-
-
-@compiled
-def any_missing(rows, count):
-    """Whether there is a NaN among `count` numbers."""
-    missing = 0
-    for i in range(count):
-        value = value_at(ahead(rows, i))
-        missing += value != value
-    return missing > 0
 
 
 @compiled

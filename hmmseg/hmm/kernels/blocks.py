@@ -70,6 +70,16 @@ def load(address, single, num_states, start, stop, out):
 
 
 @compiled
+def any_missing(rows, count):
+    """Whether there is a NaN among `count` numbers."""
+    missing = 0
+    for i in range(count):
+        value = value_at(ahead(rows, i))
+        missing += value != value
+    return missing > 0
+
+
+@compiled
 def doubles(size, value):
     """So many doubles of one value (np.full takes seconds to compile)."""
     out = np.empty(size)
@@ -99,6 +109,31 @@ def to_weights(logs, size, mantissa, exponent):
     """exp of `size` numbers from PAD on."""
     for i in range(PAD, PAD + size, 8):
         exponentials(at(logs, i), at(mantissa, i), at(exponent, i))
+
+
+@compiled
+def emissions(address, single, num_rows, num_states, start, stop, x, mantissa, exponent):
+    """Rows [start, stop) of log-likelihoods as weights, x for a copy where one is needed; as `load`.
+
+    Vectors reach beyond the last row and know no NaN: only where there are neither, nothing is copied.
+    """
+    begin, size = start * num_states, (stop - start) * num_states
+    if begin + size + PAD <= num_rows * num_states:
+        if single:
+            ones = ahead(singles_at(address), begin)
+            if not any_missing(ones, size):
+                for i in range(0, size, 8):
+                    exponentials(ahead(ones, i), at(mantissa, PAD + i), at(exponent, PAD + i))
+                return -1
+        else:
+            twos = ahead(doubles_at(address), begin)
+            if not any_missing(twos, size):
+                for i in range(0, size, 8):
+                    exponentials(ahead(twos, i), at(mantissa, PAD + i), at(exponent, PAD + i))
+                return -1
+    bad = load(address, single, num_states, start, stop, x)
+    to_weights(x, size, mantissa, exponent)
+    return bad
 
 
 @compiled

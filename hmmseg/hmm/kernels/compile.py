@@ -12,8 +12,26 @@ from typing import Any
 
 import numba
 import numba.core.config
+from numba.core.caching import FunctionCache
 
 _config: Any = numba.core.config
+_TRIED = "0.68."  # numerics: of numba
+
+
+class _Cache(FunctionCache):
+    """Kernels from the disk, without the registries that only compiling needs.
+
+    Numba fills them before each load (a quarter of a second, scipy.linalg among it); what is compiled fills
+    them anyway. Memory management is all that a loaded kernel needs of it. Only where numba is as it was
+    when this was tried.
+    """
+
+    def load_overload(self, sig, target_context):
+        from numba.core.runtime.nrt import rtsys
+
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 @cache
@@ -37,7 +55,10 @@ def compiled(function: Callable) -> Any:
     before = _config.CACHE_DIR
     _config.CACHE_DIR = cache_folder(Path(inspect.getfile(function)).parent)
     try:
-        return numba.njit(function, nogil=True, error_model="numpy", cache=True)
+        made: Any = numba.njit(function, nogil=True, error_model="numpy", cache=True)
+        if numba.__version__.startswith(_TRIED):
+            made._cache = _Cache(made.py_func)
+        return made
     except (RuntimeError, OSError):  # no folder that could be written to
         return numba.njit(function, nogil=True, error_model="numpy")
     finally:

@@ -18,6 +18,7 @@ from hmmseg.hmm.kernels.blocks import (
     block_length,
     copy_row,
     doubles,
+    emissions,
     empty_row,
     first_row,
     forward_block,
@@ -31,7 +32,14 @@ from hmmseg.hmm.kernels.blocks import (
 )  # fmt: skip
 from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import at, bits_of, double_of
-from hmmseg.hmm.kernels.steps import IMPOSSIBLE_EXPONENT, ZERO_EXPONENT, joint_step, plain, weigh
+from hmmseg.hmm.kernels.steps import (
+    IMPOSSIBLE_EXPONENT,
+    ZERO_EXPONENT,
+    joint_step,
+    plain,
+    probable_step,
+    weigh,
+)
 
 LN2 = math.log(2)  # physics: a logarithm
 
@@ -56,10 +64,10 @@ def total(am, ae, r, final_m, final_e, num_states):
 
 
 @compiled
-def read_block(ll, single, num_states, stay, advance, varying, start, stop, x, pm, pe, sm, se, vm, ve):
+def read_block(ll, single, num_rows, num_states, stay, advance, varying, start, stop, x, pm, pe, sm, se,
+               vm, ve):  # fmt: skip
     """Emissions of samples [start, stop) as weights, and the transitions into them where they vary."""
-    bad = load(ll, single, num_states, start, stop, x)
-    to_weights(x, (stop - start) * num_states, pm, pe)
+    bad = emissions(ll, single, num_rows, num_states, start, stop, x, pm, pe)
     if varying:
         load(stay, False, num_states, start - 1, stop - 1, x)
         to_weights(x, (stop - start) * num_states, sm, se)
@@ -129,8 +137,9 @@ def smooth(ll, single, num_rows, num_states, stay, advance, varying, initial, fi
         # Block -1 is the first sample alone, which no transition leads to.
         start, stop = max(1 + b * length, 0), min(1 + (b + 1) * length, num_rows)
         bad = read_block(
-            ll, single, num_states, stay, advance, varying and b >= 0, start, stop, x, pm, pe, sm, se, vm, ve
-        )
+            ll, single, num_rows, num_states, stay, advance, varying and b >= 0, start, stop, x, pm, pe,
+            sm, se, vm, ve,
+        )  # fmt: skip
         if bad >= 0:
             return 0.0, bad
         if b < 0:
@@ -166,11 +175,15 @@ def smooth(ll, single, num_rows, num_states, stay, advance, varying, initial, fi
                 gm[PAD + k], ge[PAD + k] = am[count, i] * bm[j], ae[count, i] + be[j]
         else:
             if b < num_blocks - 1:
-                read_block(ll, single, num_states, stay, advance, varying, start, stop, x, pm, pe,
+                read_block(ll, single, num_rows, num_states, stay, advance, varying, start, stop, x, pm, pe,
                            sm, se, vm, ve)  # fmt: skip
                 copy_row(kept_m, kept_e, b, am, ae, 0)
                 forward_block(am, ae, pm, pe, sm, se, vm, ve, stay_step, advance_step, start, stop - start,
                               num_states)  # fmt: skip
+            if b > 0 and not logs:
+                backward_plain(am, ae, bm, be, pm, pe, sm, se, vm, ve, stay_step, advance_step, start,
+                               stop - start, num_states, sum_e, 1 / sum_m, flat, crossed)  # fmt: skip
+                continue
             backward_block(am, ae, bm, be, pm, pe, sm, se, vm, ve, stay_step, advance_step, start,
                            stop - start, num_states, gm, ge, xm, xe)  # fmt: skip
             put(xm, xe, (stop - start) * (num_states - 1), sum_e, 1 / sum_m, logs, log_evidence, x, crossed,
@@ -208,6 +221,40 @@ def backward_block(am, ae, bm, be, pm, pe, sm, se, vm, ve, stay_step, advance_st
                 cm[FIRST + c], ce[FIRST + c], at(bm, PAD + c), at(be, PAD + c), at(fm, old + k),
                 at(fe, old + k), at(gm, g + k), at(ge, g + k), at(xm, PAD + r * last + k),
                 at(xe, PAD + r * last + k),
+            )  # fmt: skip
+        if (first + r) % RENORMALISE == 0:
+            renormalise_row(bm, be, width)
+
+
+@compiled
+def backward_plain(am, ae, bm, be, pm, pe, sm, se, vm, ve, stay_step, advance_step, first, count,
+                   num_states, offset, factor, state, crossed):  # fmt: skip
+    """`backward_block` that writes probabilities right away: weights over factor 2^offset, not for block 0.
+
+    Vectors reach below a row's first state into the row before, which is written after it.
+    """
+    width = bm.size
+    fm, fe = am.reshape(am.size), ae.reshape(ae.size)
+    cm, ce = empty_row(num_states)
+    for r in range(count - 1, -1, -1):
+        p, last = PAD + r * num_states, num_states - 1
+        s, v, old = PAD + r * stay_step, PAD + r * advance_step, r * width + FIRST
+        cm[FIRST], ce[FIRST] = bm[FIRST] * pm[p + last], be[FIRST] + pe[p + last]
+        for c in range(0, last, 8):
+            k = last - 8 - c
+            weigh(at(bm, PAD + c), at(be, PAD + c), at(pm, p + k), at(pe, p + k), at(cm, PAD + c),
+                  at(ce, PAD + c))  # fmt: skip
+        bm[FIRST], be[FIRST] = cm[FIRST] * sm[s + last], ce[FIRST] + se[s + last]
+        row = first - 1 + r
+        apart = fe[old + last] + be[FIRST] - offset
+        share = fm[old + last] * bm[FIRST] * factor
+        state[row * num_states + last] = 0.0 if apart <= -1000 else share * double_of((apart + 1023) << 52)
+        for c in range(0, last, 8):
+            k = last - 8 - c
+            probable_step(
+                at(cm, PAD + c), at(ce, PAD + c), at(sm, s + k), at(se, s + k), at(vm, v + k), at(ve, v + k),
+                cm[FIRST + c], ce[FIRST + c], at(bm, PAD + c), at(be, PAD + c), at(fm, old + k),
+                at(fe, old + k), offset, factor, at(state, row * num_states + k), at(crossed, row * last + k),
             )  # fmt: skip
         if (first + r) % RENORMALISE == 0:
             renormalise_row(bm, be, width)

@@ -101,13 +101,18 @@ def renormalise(lanes: Lanes, mantissa, exponent):
     lanes.store(total.maximum(ZERO_EXPONENT), exponent)
 
 
+def _plain(m: Vec, exponent: Vec, offset: Vec, factor: Vec) -> Vec:
+    e = (exponent - offset).maximum(-1022)
+    value = m * _power_of_two((e > 1000).where(e * 0 + 1000, e)) * factor
+    return (e > -1000).where(value, 0.0)
+
+
 @vector_function(types.void)
 def plain(lanes: Lanes, mantissa, exponent, offset, factor, out):
     """Weights as ordinary numbers: m 2^(e - offset) factor; zero below 1e-300."""
-    e = (lanes.load(exponent) - lanes.same(offset)).maximum(-1022)
-    gone = e > -1000
-    value = lanes.load(mantissa) * _power_of_two((e > 1000).where(e * 0 + 1000, e)) * lanes.same(factor)
-    lanes.store(gone.where(value, 0.0), out)
+    lanes.store(
+        _plain(lanes.load(mantissa), lanes.load(exponent), lanes.same(offset), lanes.same(factor)), out
+    )
 
 
 @vector_function(types.void)
@@ -140,10 +145,8 @@ def backward_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute):
     lanes.store(exponent, oute)
 
 
-@vector_function(types.void)
-def joint_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute,
-               fm, fe, gm, ge, xm, xe):  # fmt: skip
-    """`backward_step`, and with forward weights f the joint weights g of states and x of advances."""
+def _joint(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute, fm, fe) -> tuple[Vec, Vec, Vec, Vec]:
+    """`backward_step`, and with forward weights f the joint weights of states and of advances."""
     after, at = lanes.load(m), lanes.load(e)
     stays, stays_e = after * lanes.load(sm, back=True), at + lanes.load(se, back=True)
     leaves = after.shifted(leftm) * lanes.load(am, back=True)
@@ -152,7 +155,23 @@ def joint_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute,
     lanes.store(total, outm)
     lanes.store(exponent, oute)
     forward, forward_e = lanes.load(fm, back=True), lanes.load(fe, back=True)
-    lanes.store(forward * total, gm, back=True)
-    lanes.store(forward_e + exponent, ge, back=True)
-    lanes.store(forward * leaves, xm, back=True)
-    lanes.store(forward_e + leaves_e, xe, back=True)
+    return forward * total, forward_e + exponent, forward * leaves, forward_e + leaves_e
+
+
+@vector_function(types.void)
+def joint_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute,
+               fm, fe, gm, ge, xm, xe):  # fmt: skip
+    """`backward_step`, and with forward weights f the joint weights g of states and x of advances."""
+    found = _joint(lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute, fm, fe)
+    for vector, out in zip(found, (gm, ge, xm, xe), strict=True):
+        lanes.store(vector, out, back=True)
+
+
+@vector_function(types.void)
+def probable_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute,
+                  fm, fe, offset, factor, state, crossed):  # fmt: skip
+    """`joint_step` that stores probabilities, the joint weights over 2^offset times `factor`."""
+    gm, ge, xm, xe = _joint(lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute, fm, fe)
+    norm = lanes.same(offset), lanes.same(factor)
+    lanes.store(_plain(gm, ge, *norm), state, back=True)
+    lanes.store(_plain(xm, xe, *norm), crossed, back=True)
