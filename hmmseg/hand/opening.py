@@ -18,6 +18,12 @@ SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first 
 ABRUPT = 0.5  # chosen: share of its speed that a closing loses from one step to the next at a hard touch
 SOFT = 0.1  # chosen: of what gives in a grip: its touch is known no better, as pads are no ideal springs
 GIVE = (1e-3, 1.5e-3)  # chosen: m, mean and sd: what pads and drive give in a grip, before anything is seen
+WRONG = 0.2  # chosen: how often one of the estimates of the touch is of something else
+TAIL, NODES, GRID = (
+    4.0,
+    400,
+    1e-4,
+)  # numerics: degrees of freedom of the prior; its grid, and least extent [m]
 LEAST_CLOSING = 1e-3  # chosen: m; a smaller swing of the opening is no grip
 CLEAR = 6.0  # chosen: noise sds of a third difference: a kink
 
@@ -81,7 +87,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tup
         width, sd = held + give, 0.0
     else:
         told = [_touch(t, opening, begun, first, held), *_release(t, opening, active, last, opened, held)]
-        width, sd = _together([*told, (held + GIVE[0], GIVE[1])], held)
+        width, sd = _together(told, held, ceiling)
     start = int(inside[np.argmax(opening[inside] <= width)])
     after = np.flatnonzero(opening[last : opened + 1] > width)
     stop = int(last + after[0]) if after.size else opened + 1
@@ -151,14 +157,19 @@ def _release(t: np.ndarray, opening: np.ndarray, active: np.ndarray, last: int, 
     return found
 
 
-def _together(told: list[tuple[float, float]], held: float) -> tuple[float, float]:
-    """Estimates and sds weighed [m]; where they disagree, as uncertain as that."""
-    values, sds = np.array(told).T
-    sds = np.maximum(sds, 1e-6)
-    width = float((values / sds**2).sum() / (1 / sds**2).sum())
-    for _ in range(10):  # one that is far off (a finger that drags the block on) counts for less
-        weights = 1 / (sds**2 + (values - width) ** 2 / 3)
-        width = float((values * weights).sum() / weights.sum())
-    width = max(width, held)
-    sd = max(float((1 / sds**2).sum() ** -0.5), float(weights.sum() ** -0.5))
-    return width, max(sd, SOFT * (width - held))
+def _together(told: list[tuple[float, float]], held: float, top: float) -> tuple[float, float]:
+    """Mean and sd [m] of the opening at the touch, between the one held and the widest, `top`.
+
+    What pads and drive give is the prior (Student-t); each estimate is right within its sd, or is of
+    something else (a finger that drags the block on, an opening in two steps) and tells nothing.
+    """
+    width = np.linspace(held, max(top, held + GRID), NODES)
+    log_density = -(TAIL + 1) / 2 * np.log1p(((width - held - GIVE[0]) / GIVE[1]) ** 2 / TAIL)
+    for value, sd in told:
+        sd = max(sd, float(width[1] - width[0]))
+        right = np.exp(-0.5 * ((width - value) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
+        log_density += np.log((1 - WRONG) * right + WRONG / float(width[-1] - width[0]))
+    density = np.exp(log_density - log_density.max())
+    density /= density.sum()
+    mean = float(density @ width)
+    return mean, max(float(np.sqrt(density @ (width - mean) ** 2)), SOFT * (mean - held))

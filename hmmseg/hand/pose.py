@@ -17,7 +17,7 @@ QUIET = 0.1  # chosen: m/s^2; the window widens until the acceleration's noise i
 
 @dataclass(frozen=True)
 class Pose:
-    """Motion of the pads' middle in the world.
+    """Motion of the pads' middle in the world at t (num_timesteps,) [s].
 
     `position`, `velocity`, `acceleration` (num_timesteps, 3) [m, m/s, m/s^2], the latter two smoothed
     over `window` [s]; `turned` (num_timesteps, 3, 3): from the
@@ -25,6 +25,7 @@ class Pose:
     along the closing.
     """
 
+    t: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
@@ -51,7 +52,7 @@ def pose_of(trial: Trial, gripper: Gripper) -> Pose:
         raise InputError(where, problem, "the tool's axis along which they close")
     window = _window(t, position)
     velocity, acceleration = (smooth(t, position, deriv, window) for deriv in (1, 2))
-    return Pose(position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)
+    return Pose(t, position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)
 
 
 def _window(t: np.ndarray, position: np.ndarray) -> float:

@@ -41,7 +41,9 @@ class Signals:
     sd_vx: np.ndarray
     sd_vy: np.ndarray
     sd_force: float
+    derived: bool = False  # velocities are differences of positions
     touches: tuple[tuple[float, float], ...] = ()  # times of touch and release known apart, and sds [s]
+    timing: np.ndarray | None = None  # sd of when a force changed that changes there [s]
 
     @property
     def x(self) -> np.ndarray:
@@ -98,6 +100,7 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
     """Signals of a trial: forward kinematics, and the Jacobian for velocities, of the rig."""
     channels, noise, n = trial.channels, rig.noise, trial.t.size
     out: dict[str, np.ndarray] = {f: channels[f] for f in ("fx1", "fy1", "fx2", "fy2")}
+    derived = False
     variances = {"x": np.zeros(n), "y": np.zeros(n), "vx": np.zeros(n), "vy": np.zeros(n)}
     for i in (1, 2):
         if rig.jointed:
@@ -117,21 +120,23 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
                 out[f"{axis}{i}"] = position
                 velocity, variance = channels.get(f"v{axis}{i}"), _square(noise.velocity)
                 if velocity is None:
-                    velocity, window = _derivative(trial.t, position)
+                    derived = True
+                    velocity, window = central_differences(trial.t, position)
                     variance = 2 * _square(noise.position) / window**2
                 out[f"v{axis}{i}"] = velocity
                 variances[axis] += _square(noise.position) / 2
                 variances[f"v{axis}"] += variance / 2
     sds = {f"sd_{name}": np.sqrt(variance) for name, variance in variances.items()}
     force = np.nan if noise.force is None else noise.force
-    return Signals(t=trial.t, **out, **sds, sd_force=force, touches=trial.touches)  # type: ignore[arg-type]
+    return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,  # type: ignore[arg-type]
+                   touches=trial.touches, timing=trial.timing)  # fmt: skip
 
 
 def _square(sd: float | None) -> float:
     return np.nan if sd is None else sd**2
 
 
-def _derivative(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def central_differences(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Central differences over the samples that are there, and the time [s] each spans.
 
     NaN where the sample is missing.

@@ -3,13 +3,14 @@
 With F what the sensor reads, R the turn from the tool's axes to the world's, a and v the acceleration and
 velocity of the tool, g gravity and f what the tool does to its environment, in its axes,
 
-    F = b + Q (m_a R^T a - m R^T g + d R^T v + f),
+    F = b + Q (m_a R^T (a + tau da/dt) - m R^T g + d R^T v + f),
 
 b the sensor's offset, m the tool's mass, d the drag of cables and hoses, and Q the axes of the sensor, with
-det Q = -1 where it reads the reaction. m_a is m for a rigid tool; gears that spin with the arm make it
-appear larger, so it is found apart. In free motion f = 0, so all of them follow from how F goes with the
-motion (robust least squares; Q by Kabsch's 1976 solution of the orthogonal Procrustes problem). An arm
-that never turns its hand tells b only together with the tool's weight, which does not matter: it is the same
+det Q = -1 where it reads the reaction. tau is by how much later than the wrench the pose was taken. m_a is
+m for a rigid tool; gears that spin with the arm make it appear larger, so it is found apart. In free motion
+f = 0, so all of them follow from how F goes with the motion (robust least squares; Q by Kabsch's 1976
+solution of the orthogonal Procrustes problem). An arm that never turns its hand tells b only together with
+the tool's weight, which does not matter: it is the same
 throughout.
 """
 
@@ -37,8 +38,9 @@ class Tool:
     """What free motion tells of the tool: `axes` Q (3, 3), `offset` and `drift` (3,) [N, N/s].
 
     `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
-    [N s/m]; `noise` [N]: scale of one component of F in free motion about the model;
-    `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns tell it.
+    [N s/m]; `jerked` [kg s]: of how the acceleration changes, which is by how much later than the wrench the
+    pose was taken, times the inertia; `noise` [N]: scale of one component of F in free motion about the
+    model; `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns tell it.
     """
 
     axes: np.ndarray
@@ -46,6 +48,7 @@ class Tool:
     weighed: bool
     inertia: float
     drag: float
+    jerked: float
     offset: np.ndarray
     drift: np.ndarray
     noise: float
@@ -65,9 +68,11 @@ def _in_tool(pose: Pose, gripper: Gripper, vectors: np.ndarray) -> np.ndarray:
 
 
 def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
-    """Acceleration, minus gravity and velocity (3, num_timesteps, 3) in those axes."""
+    """Acceleration, minus gravity, velocity and jerk (4, num_timesteps, 3) in those axes."""
     weight = np.broadcast_to(gravity * pose.up, pose.acceleration.shape)
-    return np.stack([_in_tool(pose, gripper, v) for v in (pose.acceleration, weight, pose.velocity)])
+    jerk = np.gradient(pose.acceleration, pose.t, axis=0)
+    every = (pose.acceleration, weight, pose.velocity, jerk)
+    return np.stack([_in_tool(pose, gripper, v) for v in every])
 
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
@@ -100,8 +105,9 @@ def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
     centre = _centre_of_mass(trial, gripper, axes, mass, free, terms[0] + terms[1])
     offset, drift = axes @ fitted.offset, axes @ fitted.drift
     return Tool(
-        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, offset, drift, scale, centre
-    )
+        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, offset, drift, scale,
+        centre,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,7 @@ class _Fitted:
     inertia: float
     mass: float | None
     drag: float
+    jerked: float
     offset: np.ndarray
     drift: np.ndarray
     residual: np.ndarray
@@ -122,19 +129,21 @@ def _regressed(weights: np.ndarray, force: np.ndarray, terms: np.ndarray, time: 
     """Least squares of F in the tool's axes (n, 3) on the terms; what is not there is left out."""
     n = len(force)
     constant = np.broadcast_to(np.eye(3), (n, 3, 3))  # row, axis, parameter
-    columns = [terms[0][:, :, None], terms[2][:, :, None], constant, constant * time[:, None, None]]
+    moved, hung, dragged, jerk = (term[:, :, None] for term in terms)
+    columns = [moved, dragged, jerk, constant, constant * time[:, None, None]]
     left = force if given is None else force - given * terms[1]
     if turns and given is None:
-        columns.insert(2, terms[1][:, :, None])
+        columns.insert(3, hung)
     rows = np.concatenate(columns, axis=2)
     root = np.sqrt(weights)[:, None]
     flat = (rows * root[:, :, None]).reshape(3 * n, -1)
     found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
     information = flat.T @ flat
     errors = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-9)))[:2]
-    mass = given if given is not None else float(found[2]) if turns else None
+    mass = given if given is not None else float(found[3]) if turns else None
     residual = left - rows @ found
-    return _Fitted(float(found[0]), mass, float(found[1]), found[-6:-3], found[-3:], residual, errors)
+    inertia, drag, jerked = (float(each) for each in found[:3])
+    return _Fitted(inertia, mass, drag, jerked, found[-6:-3], found[-3:], residual, errors)
 
 
 def _spread(vectors: np.ndarray) -> float:
@@ -201,8 +210,8 @@ def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     gripper = rig.gripper
     assert gripper is not None
     reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - trial.t.mean())[:, None]
-    moved, hung, dragged = _terms(pose, gripper, rig.gravity)
-    own = tool.inertia * moved + tool.drag * dragged
+    moved, hung, dragged, jerk = _terms(pose, gripper, rig.gravity)
+    own = tool.inertia * moved + tool.drag * dragged + tool.jerked * jerk
     if tool.weighed:
         own = own + tool.mass * hung
     force = reading @ tool.axes - own

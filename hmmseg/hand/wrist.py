@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from hmmseg.hand.gripper_signs import counts_closing, lifts_pull
 from hmmseg.hand.opening import Grip, closings, grip_of
@@ -27,6 +28,7 @@ TOGETHER = 5  # chosen: samples within one smoothing window
 LOADED = 5.0  # chosen: standard errors at which a grip carries a load
 # chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
 LAG = 0.012
+TILT = 0.01  # chosen: rad; an arm whose orientation is not recorded holds its hand level by about as much
 CLIPPED = 2.0  # chosen: noise scales
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is told
 NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
@@ -89,7 +91,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     lifts = [load for load in loads if load]
     if lifts and max(lifts) < 0:
         raise lifts_pull(trial, rig, min(lifts))
-    if grips and not loaded and _carries(-opening, trial, pose, force, tool):
+    if grips and not lifts and _carries(-opening, trial, pose, force, tool):
         raise counts_closing(trial, rig)
     return _as_fingers(trial, rig, pose, tool, opening, force, loaded or grips, pressing)
 
@@ -204,9 +206,44 @@ def _as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndar
     sds = [each.width_sd for each in grips]
     touch_sd = float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
     touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
-    return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches,
+    assert rig.gripper is not None
+    wrong = _inertia(t, pose, tool, rig.gripper.turns, rig.gravity)
+    timing = _timing(t, pose, np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)), fy, tool.noise)
+    return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip
+
+
+def _inertia(t: np.ndarray, pose: Pose, tool: Tool, turns: bool, gravity: float) -> np.ndarray:
+    """By how much the tool's inertia may be wrong, across and up (num_timesteps, 2) [N].
+
+    The acceleration is smoothed. Where it jumps (a block that is set down stops the hand) the tool's share
+    is wrong for as long as the window, by about what a window twice as wide makes of it in turn (root mean
+    square). What free motion leaves unexplained is the tool's own too, and a tilt that is not recorded turns
+    its weight sideways.
+    """
+    axes = np.stack([pose.across, pose.up], axis=1)
+    once, wider = (smooth(t, pose.position, 2, times * pose.window) @ axes for times in (1, 2))
+    mean = uniform_filter1d((wider - once) ** 2, _around(t, pose), axis=0)
+    wrong = tool.inertia * np.sqrt(np.maximum(mean, 0.0))  # a running sum's rounding goes below 0
+    wrong = np.hypot(wrong, tool.noise)
+    if not turns:
+        wrong[:, 0] = np.hypot(wrong[:, 0], tool.mass * gravity * TILT)
+    return wrong
+
+
+def _timing(t: np.ndarray, pose: Pose, wrong: np.ndarray, load: np.ndarray, noise: float) -> np.ndarray:
+    """How uncertain a load [N] that is `wrong` [N] makes the moment of its change (num_timesteps,) [s].
+
+    A load that changes by so much per second is off by that much of its time.
+    """
+    pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(load), t)), _around(t, pose))
+    return np.minimum(wrong / np.maximum(pace, noise / float(np.median(np.diff(t)))), pose.window / 2)
+
+
+def _around(t: np.ndarray, pose: Pose) -> int:
+    """Samples of the smoothing window, an odd number."""
+    return max(3, round(pose.window / float(np.median(np.diff(t)))) // 2 * 2 + 1)
 
 
 def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:

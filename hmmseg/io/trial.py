@@ -34,7 +34,10 @@ class Trial:
     channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
     `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
     reason. `touch_sd` [m]: how well the distance is known at which the fingers touch a block, beside noise;
-    `touches` [s]: times of touch and release known apart from forces, with their standard deviations.
+    `touches` [s]: times of touch and release known apart from forces, with their standard deviations;
+    `timing` (num_timesteps,) [s]: how uncertain it is when a force changed that changes there. Of a sensor
+    in the wrist, whose forces are halved between the fingers, `inertia` (num_timesteps, 2) [N]: by how much
+    the tool's own share may be wrong across and up; None of fingertips.
     """
 
     file: str
@@ -47,6 +50,8 @@ class Trial:
     hidden: dict[str, str] = field(default_factory=dict)
     touch_sd: float = 0.0
     touches: tuple[tuple[float, float], ...] = ()
+    timing: np.ndarray | None = None
+    inertia: np.ndarray | None = None
 
     @staticmethod
     def read(source: Any, rig: Any = None, task: Any = None) -> Trial:

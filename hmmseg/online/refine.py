@@ -18,7 +18,7 @@ from hmmseg.hmm import left_to_right, smooth
 from hmmseg.io.trial import Trial
 from hmmseg.online import layout as at
 from hmmseg.segmentation.boundaries import combine
-from hmmseg.segmentation.changes import DISCREPANCY, Prior, moment
+from hmmseg.segmentation.changes import Disagreement, Prior, moment
 from hmmseg.segmentation.crossings import HELD, contacts
 from hmmseg.segmentation.emissions import Parameters, log_likelihoods
 from hmmseg.segmentation.features import MAX_RATE, WINDOW, features, thin
@@ -79,7 +79,7 @@ def refined(
     near = (t[n + 1], t[n + 1] + HELD) if touch else (t[n] - HELD, t[n])
     table = contacts(signals, sense([], [], (), parameters, filter_.rig), parameters)
     change = table.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
-    out = combine(t, probability, {}) if change is None else moment(change, DISCREPANCY)
+    out = combine(t, probability, {}) if change is None else moment(change, Disagreement())
     median = out.quantile(0.5)
     if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
         return None  # another event than the filter's

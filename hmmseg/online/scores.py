@@ -1,11 +1,11 @@
-"""Log-likelihood of one reading under one hypothesis, and what the hypothesis learns from it.
+"""Log-likelihood of one reading under one hypothesis.
 
 The emissions are those of hmmseg.segmentation.emissions (tested against them), with what is not yet known
 integrated out: an unknown weight, width or level has a broad density over the range seen, and known ones
 add their variance. And a hand that is free, or carries, may halt: without what follows, a halt would pass
 for a rest on something, as that predicts positions so much better. What was just lifted moves: a block held
 still on its support would pass for one carried at rest, whose weight is what the fingers happen to bear.
-Learning is one step of robust (Student-t) conjugate updates.
+What a hypothesis learns is in `learning`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.online.densities import log_between, log_broad, log_mostly, log_student, log_sum
 from hmmseg.online.layout import (
-    ABOVE_KIND,
     AY,
     BIAS,
     CARRY,
     FORCE,
-    FREE_KIND,
     FX1,
     FX2,
     FY1,
@@ -49,59 +48,15 @@ from hmmseg.online.layout import (
     D,
     Y,
 )
-from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TAIL, TOUCHING
+from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TOUCHING
 
 STILL = 0.2  # chosen: prior share of samples at which a hand that may move stands still,
 JUST_LIFTED = 0.05  # chosen: ... times this while a lift begins: slow, but a motion
 ALIKE = 0.5  # chosen: prior probability that a block not met yet is like one that was
-_HALF = (TAIL + 1) / 2
-_CONSTANT = math.lgamma(_HALF) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)
-_ROOT2 = math.sqrt(2.0)  # chosen
-_LEAST = -25.0  # chosen: of an edge, as in the emissions off line
 _LOG_CLOSE, _LOG_STRAY = math.log1p(-STRAY), math.log(STRAY)
 _LOG_TOUCHED, _LOG_TOUCHING = math.log1p(-TOUCHING), math.log(TOUCHING)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
-MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
-MOST_SCALE = 200.0  # chosen: and a scale
-LEAST = 1e-12  # chosen: N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
-FLOOR = 0.09  # chosen: ... 0.3 of a sample's own noise
-
-
-@compiled
-def log_sum(a, b):
-    """log(exp(a) + exp(b))."""
-    high, low = (a, b) if a > b else (b, a)
-    return high + math.log1p(math.exp(low - high)) if low > -math.inf else high
-
-
-@compiled
-def log_student(residual, variance):
-    """Log density of a Student-t residual whose squared scale is `variance`; 0 where missing."""
-    if math.isnan(residual):
-        return 0.0
-    return _CONSTANT - 0.5 * math.log(variance) - _HALF * math.log1p(residual * residual / variance / TAIL)
-
-
-@compiled
-def _log_normal_cdf(z):
-    return math.log(0.5 * math.erfc(-z / _ROOT2)) if z > -30.0 else -450.0
-
-
-@compiled
-def log_between(value, low, high, scale, span):
-    """Log density of a uniform on [low, high] of width `span` with noise-softened edges."""
-    if math.isnan(value):
-        return 0.0
-    soft = _log_normal_cdf((value - low) / scale) + _log_normal_cdf((high - value) / scale)
-    return max(soft, _LEAST) - math.log(span)
-
-
-@compiled
-def _log_mostly(residual, variance, log_close, log_stray, span):
-    if math.isnan(residual):
-        return 0.0
-    return log_sum(log_close + log_student(residual, variance), log_stray - math.log(span))
 
 
 @compiled
@@ -196,19 +151,14 @@ def _standing(h, x, spans):
 
 
 @compiled
-def _broad(value, span):
-    return 0.0 if math.isnan(value) else -math.log(span)
-
-
-@compiled
 def free(h, x, spans):
     """Log-likelihood of a reading in free motion."""
     still = _standing(h, x, spans)
     if not math.isnan(x[D] - x[LAST_D]):
         variance = 2 * x[SD_D] ** 2 + scale2(h, WIDTH_SCALE)
         still += log_student(x[D] - x[LAST_D], variance) + math.log(spans[SPAN_D])
-    broad = _broad(x[VX], spans[SPAN_VX]) + _broad(x[VY], spans[SPAN_VY])
-    broad += _broad(x[Y], spans[SPAN_Y]) + _broad(x[D], spans[SPAN_D])
+    broad = log_broad(x[VX], spans[SPAN_VX]) + log_broad(x[VY], spans[SPAN_VY])
+    broad += log_broad(x[Y], spans[SPAN_Y]) + log_broad(x[D], spans[SPAN_D])
     return _ungripped(h, x, spans[SPAN_FORCE]) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
 
 
@@ -241,7 +191,9 @@ def lifted(h, block, x, spans, gravity, num_blocks, settled):
     factor = 1.0 if math.isnan(x[AY]) else 1.0 + x[AY] / gravity
     out = _log_known(_net_force(h, x), factor, h, OBJECTS + 4 * block, scale2(h, CARRY), 0.0, num_blocks,
                      spans[SPAN_FORCE], True)  # fmt: skip
-    out += _broad(x[VX], spans[SPAN_VX]) + _broad(x[VY], spans[SPAN_VY]) + _broad(x[Y], spans[SPAN_Y])
+    out += (
+        log_broad(x[VX], spans[SPAN_VX]) + log_broad(x[VY], spans[SPAN_VY]) + log_broad(x[Y], spans[SPAN_Y])
+    )
     still = STILL * max(settled, JUST_LIFTED)
     return out + log_sum(math.log1p(-still), math.log(still) + _standing(h, x, spans))
 
@@ -259,85 +211,13 @@ def supported(h, kind, block, x, spans, pads, levels):
         most, soft = span, math.sqrt(scale2(h, CARRY))
     out = log_between(_net_force(h, x), -span, most, soft, span + most)
     moving = scale2(h, VELOCITY)
-    out += _log_mostly(x[VY], x[SD_VY] ** 2 + moving, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_VY])
+    out += log_mostly(x[VY], x[SD_VY] ** 2 + moving, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_VY])
     if kind == GROUND_KIND:
-        out += _log_mostly(x[VX], x[SD_VX] ** 2 + moving, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_VX])
+        out += log_mostly(x[VX], x[SD_VX] ** 2 + moving, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_VX])
     else:
-        out += _broad(x[VX], spans[SPAN_VX])
+        out += log_broad(x[VX], spans[SPAN_VX])
     if not levels or h[LEVEL + 1] <= 0.0:
-        return out + _broad(x[Y], spans[SPAN_Y])
+        return out + log_broad(x[Y], spans[SPAN_Y])
     spread = x[SD_Y] * x[SD_Y] + scale2(h, LEVEL_SCALE) + 1.0 / h[LEVEL + 1]
     height = held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1]
-    return out + _log_mostly(height, spread, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_Y])
-
-
-@compiled
-def _learn_mean(h, at, value, variance, share, most):
-    """Robust conjugate update of a mean by a value of this variance, worth `share` of a reading."""
-    if math.isnan(value):
-        return
-    precision = h[at + 1]
-    robust = 1.0
-    if precision > 0.0:
-        residual = value - h[at] / precision
-        robust = (TAIL + 1) / (TAIL + residual * residual / (variance + 1.0 / precision))
-    add = share * robust / variance
-    h[at] += add * value
-    h[at + 1] += add
-    if h[at + 1] > most / variance:
-        forget = most / variance / h[at + 1]
-        h[at] *= forget
-        h[at + 1] *= forget
-
-
-@compiled
-def _learn_scale(h, which, residual, share, least):
-    """Robust update of a squared scale, which stays above `least`."""
-    if math.isnan(residual):
-        return
-    at = SCALES + 2 * which
-    r2 = residual * residual
-    robust = (TAIL + 1) / (TAIL + r2 / (h[at] / h[at + 1]))
-    h[at] += share * robust * r2
-    h[at + 1] += share
-    if h[at + 1] > MOST_SCALE:
-        forget = MOST_SCALE / h[at + 1]
-        h[at] *= forget
-        h[at + 1] *= forget
-    h[at] = max(h[at], max(least, LEAST) * h[at + 1])
-
-
-@compiled
-def learn(h, kind, block, x, pads, gravity, share, levels):
-    """Update a hypothesis by a reading taken in its state; `share`: of an independent reading."""
-    if kind == FREE_KIND:
-        noise = scale2(h, FORCE)
-        for c in range(4):
-            residual = x[FX1 + c] - h[BIAS + 2 * c] / h[BIAS + 2 * c + 1]
-            _learn_mean(h, BIAS + 2 * c, x[FX1 + c], noise, share, MOST_BIAS)
-            _learn_scale(h, FORCE, residual, share / 4, LEAST)
-        return
-    fx1, fy1 = x[FX1] - h[BIAS] / h[BIAS + 1], x[FY1] - h[BIAS + 2] / h[BIAS + 3]
-    fx2, fy2 = x[FX2] - h[BIAS + 4] / h[BIAS + 5], x[FY2] - h[BIAS + 6] / h[BIAS + 7]
-    noise = scale2(h, FORCE)
-    _learn_scale(h, NET_X, fx1 + fx2, share, noise)
-    _learn_scale(h, SHEAR, (fy1 - fy2) / 2, share, noise)
-    weight, width = OBJECTS + 4 * block, OBJECTS + 4 * block + 2
-    found = held_width(h, x, pads)
-    if h[width + 1] > 0.0:
-        _learn_scale(h, WIDTH_SCALE, found - h[width] / h[width + 1], share, FLOOR * x[SD_D] ** 2)
-    _learn_mean(h, width, found, x[SD_D] * x[SD_D] + scale2(h, WIDTH_SCALE), share, math.inf)
-    if kind == ABOVE_KIND:
-        factor = 1.0 if math.isnan(x[AY]) else 1.0 + x[AY] / gravity
-        fy = fy1 + fy2
-        if h[weight + 1] > 0.0:
-            _learn_scale(h, CARRY, fy - factor * h[weight] / h[weight + 1], share, noise)
-        if factor > 0.1:  # in free fall a force says nothing of the weight
-            _learn_mean(h, weight, fy / factor, scale2(h, CARRY) / (factor * factor), share, math.inf)
-        return
-    _learn_scale(h, VELOCITY, x[VY], share, FLOOR * x[SD_VY] ** 2)
-    if levels:
-        height = held_height(h, x, pads)
-        if h[LEVEL + 1] > 0.0:
-            _learn_scale(h, LEVEL_SCALE, height - h[LEVEL] / h[LEVEL + 1], share, FLOOR * x[SD_Y] ** 2)
-        _learn_mean(h, LEVEL, height, x[SD_Y] ** 2 + scale2(h, LEVEL_SCALE), share, math.inf)
+    return out + log_mostly(height, spread, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_Y])

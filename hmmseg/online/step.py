@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.online.densities import log_sum
 from hmmseg.online.layout import (
     ABOVE_KIND,
     CROSSED,
@@ -29,7 +30,8 @@ from hmmseg.online.layout import (
     WEIGHT,
     T,
 )
-from hmmseg.online.scores import free, held, learn, lifted, log_sum, supported
+from hmmseg.online.learning import learn
+from hmmseg.online.scores import free, held, lifted, supported
 
 LOG_DEPARTURE = math.log(1e-4)  # chosen: as in hmmseg.segmentation.departure, as are the next four
 BRIEF = 1e-8  # chosen

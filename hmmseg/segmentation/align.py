@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
+from hmmseg.hand.rates import timely
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -102,7 +103,8 @@ def align(
     of the result has its number of rounds (of several recordings with an unknown number, the most).
     `signals`: to be read instead of the trials' own.
     """
-    signals = [task_space(trial, rig) for trial in trials] if signals is None else signals
+    if signals is None:
+        signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
     judged = [features(thin(s, MAX_RATE), rig) for s in signals]
     if task.repeat == 1 or insist:
         every = [[slice(0, s.t.size)] for s in signals]
@@ -156,7 +158,7 @@ def _rounds(
 
 def _aligned(reading: Reading, steps: tuple[Subtask, ...], pool: Pool, j: int) -> _Piece:
     alignment, t = pool.fit.posteriors[j], reading.thinned.t
-    boundaries = boundary_posteriors(pool.changes[j], pool.discrepancy, t, alignment, reading.fine.touches)
+    boundaries = boundary_posteriors(pool.changes[j], pool.disagreement, t, alignment, reading.fine.touches)
     evidence = float(alignment.log_evidence)
     return _Piece(boundaries, to_spans(steps, boundaries, *reading.ends), None, evidence, *reading.ends)
 
@@ -173,7 +175,7 @@ def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity,
             reading.fine, reading.thinned, pool.sensing, shown.steps, own.parameters, alignment
         )
         found = boundary_posteriors(
-            changes, pool.discrepancy, reading.thinned.t, alignment, reading.fine.touches
+            changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
         )
     ends = reading.ends
     boundaries = spread(shown, found, len(steps), *ends)

@@ -42,7 +42,8 @@ class Crossing:
 
     `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise.
     `kind`: "smooth" motion through the crossing; "impact": the crossing stops it (a touch, a
-    touchdown); "launch": it sets in with the crossing (a block that was held down lifts off).
+    touchdown); "launch": it sets in with the crossing (a block that was held down lifts off). `anywhere`:
+    probability that it happened at some moment of the interval, whatever the motion.
     """
 
     left: float
@@ -53,6 +54,7 @@ class Crossing:
     sd_right: float
     sd_v: float
     kind: Kind = "smooth"
+    anywhere: float = 0.0
 
     @property
     def known(self) -> bool:
@@ -114,7 +116,7 @@ def _single_density(c: Crossing, h: float) -> np.ndarray:
     u = (np.arange(POINTS) + 0.5) / POINTS
     log_density = (_log_smooth if c.kind == "smooth" else _log_launch)(c, h, u)
     density = np.exp(log_density - log_density.max())
-    return density / density.sum()
+    return (1 - c.anywhere) * density / density.sum() + c.anywhere / POINTS
 
 
 def _log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 Force and position must agree where there is contact. By how much they do not, at the contacts nearest to
 the changes of one kind in all recordings at hand (a block that a first finger pushed, a table that
-yields, pads that creep), is a discrepancy [m] that positions are then allowed.
+yields, pads that creep), is a discrepancy [m] that positions are then allowed. How often a force is silent
+while positions still find the pad pressed is the share of contacts that end abruptly.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from hmmseg.segmentation.boundaries import (
     ONSET,
     POINTS,
+    UNIFORM,
     BoundaryPosterior,
     Crossing,
     Kind,
@@ -51,6 +54,20 @@ class Prior:
         inside = (t >= self.limits[0]) & (t <= self.limits[1])
         with np.errstate(divide="ignore"):
             return np.log(out * inside)
+
+
+ROUNDS = 20  # numerics: of expectation and maximisation
+SEEN = 4.0  # chosen: contacts that the prior of an abrupt end is worth
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Model error of changes of one sort: `position` [m] that positions are allowed where there is contact;
+    `abrupt`: share of contacts that end at once, by a pad that slips off or turns, before it is relaxed.
+    """
+
+    position: float = DISCREPANCY
+    abrupt: float = UNIFORM
 
 
 @dataclass(frozen=True)
@@ -90,37 +107,80 @@ def cut(change: Change) -> Change | None:
         return None
     index = index[near[0] : near[-1] + 2]
     return replace(change, contacts=tuple(
-        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[index])
+        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
         for c in change.contacts
     ))  # fmt: skip
 
 
-def discrepancies(changes: Sequence[Change]) -> dict[tuple[Kind, int], float]:
-    """How far [m] force and position disagree at the contacts next to changes of each sort."""
-    found: dict[tuple[Kind, int], list[tuple[float, float]]] = {}
+def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
+    """What the changes of each sort show of where force and position disagree."""
+    sorts = dict.fromkeys(change.sort for change in changes)
+    return {
+        sort: Disagreement(_discrepancy(own), _abruptness(own))
+        for sort in sorts
+        for own in [[c for c in changes if c.sort == sort]]
+    }
+
+
+def _discrepancy(changes: Sequence[Change]) -> float:
+    """How far [m] force and position disagree at the contacts next to the changes."""
+    found = []
     for change in changes:
         for c in change.contacts:
-            probability = switch_probability(c, change.log_prior, change.making)
-            n = int(probability.argmax()) + change.making
+            n = _interval(c, change) + change.making
             beside = slice(n, n + 2) if change.making else slice(max(n - 1, 0), n + 1)
             sure = np.flatnonzero(c.pressed[beside] > SURE * c.sd_pressed)
             if sure.size:
                 i = beside.start + (sure[0] if change.making else sure[-1])
                 apart = c.place[i] - (0.0 if c.hidden else c.pressed[i])
                 if np.isfinite(apart):
-                    found.setdefault(change.sort, []).append((float(apart), c.sd_place))
-    out = {}
-    for sort, pairs in found.items():
-        apart, noise = np.array(pairs).T
-        # Of a normal distribution; half of the contacts may be anything.
-        excess = max(float(np.median(apart**2 - noise**2 * 0.455)) / 0.455, 0.0)
-        out[sort] = float(np.sqrt((apart.size * excess + KNOWN * DISCREPANCY**2) / (apart.size + KNOWN)))
-    return out
+                    found.append((float(apart), c.sd_place))
+    if not found:
+        return DISCREPANCY
+    apart, noise = np.array(found).T
+    # Of a normal distribution; half of the contacts may be anything.
+    excess = max(float(np.median(apart**2 - noise**2 * 0.455)) / 0.455, 0.0)
+    return float(np.sqrt((apart.size * excess + KNOWN * DISCREPANCY**2) / (apart.size + KNOWN)))
 
 
-def moment(change: Change, discrepancy: float) -> BoundaryPosterior:
-    """Posterior of the moment of a change."""
-    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, discrepancy))) for c in change.contacts]
+def _abruptness(changes: Sequence[Change]) -> float:
+    """Share of contacts that end before the position's way is spent: by maximum likelihood, and its prior."""
+    z = np.array([_inside(c, _last_pressed(c, _interval(c, change))) for change in changes
+                  if not change.making for c in change.contacts])  # fmt: skip
+    z = z[np.isfinite(z)]
+    share = UNIFORM
+    for _ in range(ROUNDS):
+        share = (_abrupt(share, z).sum() + UNIFORM * SEEN) / (z.size + SEEN)
+    return float(share)
+
+
+def _abrupt(share: float, z: np.ndarray | float) -> np.ndarray:
+    """Probability that a contact ended abruptly whose place is z sds inside when its force is silent.
+
+    A relaxed pad is then anywhere outside, of an abrupt end the place is as likely inside.
+    """
+    return np.asarray(share / (share + (1 - share) * 2 * ndtr(-np.asarray(z))))
+
+
+def _inside(c: Penetration, n: int) -> float:
+    """How far inside, in sds of noise, a contact's place still is at the end of interval n."""
+    return float(c.place[n + 1] / c.sd_place)
+
+
+def _last_pressed(c: Penetration, n: int) -> int:
+    """The interval up to n at whose start the force last shows contact, whatever positions say."""
+    sure = np.flatnonzero(c.pressed[: n + 1] > SURE * c.sd_pressed)
+    return int(sure[-1]) if sure.size else n
+
+
+def _interval(c: Penetration, change: Change) -> int:
+    """The interval in which a contact most likely switched."""
+    return int(switch_probability(c, change.log_prior, change.making).argmax())
+
+
+def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
+    """Posterior of the moment of a change, with what is `known` of its sort."""
+    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
     t, making = contacts[0].t, change.making
     found = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
     combined = crossing_density if making else first_of
@@ -131,7 +191,7 @@ def moment(change: Change, discrepancy: float) -> BoundaryPosterior:
         for chosen, mass in _shares(found, n, making):
             if mass < LIKELY:
                 continue
-            deciding = [_crossing(contacts[i], n, making, change.kind) for i in chosen]
+            deciding = [_crossing(contacts[i], n, change, known.abrupt) for i in chosen]
             density = combined(deciding if all(x.known for x in deciding) else [], width)
             if not np.isfinite(density).all():
                 density = combined([], width)
@@ -154,14 +214,17 @@ def _shares(found: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ..
     return [((0, 1), float(a * b)), ((0,), float(a * done[1])), ((1,), float(b * done[0]))]
 
 
-def _crossing(c: Penetration, n: int, making: bool, kind: Kind) -> Crossing:
+def _crossing(c: Penetration, n: int, change: Change, abrupt: float) -> Crossing:
     """The crossing of interval n: by position where apart, by force where there is contact."""
+    making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
     pressed, gap = c.pressed[touching], c.place[apart]
     sd_pressed = float(np.hypot(c.sd_pressed, c.form * abs(pressed)))
     if c.hidden:  # a rigid pad hides its compression
         pressed = max(c.place[touching], 0.0)
         sd_pressed = c.sd_place + 0.5 * abs(gap)
+    before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
-        return Crossing(gap, pressed, c.rate[n], c.rate[n + 1], c.sd_place, sd_pressed, c.sd_rate, kind)
-    return Crossing(-pressed, -gap, -c.rate[n], -c.rate[n + 1], sd_pressed, c.sd_place, c.sd_rate, kind)
+        return Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
+    share = _abrupt(abrupt, _inside(c, n)) if kind == "smooth" else 0.0
+    return Crossing(-pressed, -gap, -before, -after, sd_pressed, c.sd_place, c.sd_rate, kind, float(share))

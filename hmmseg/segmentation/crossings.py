@@ -8,6 +8,7 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_y, hanging
+from hmmseg.hand.rates import one_sided
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.changes import Change, Prior, cut
 from hmmseg.segmentation.emissions import Parameters
@@ -16,6 +17,7 @@ from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.switching import SURE, Penetration
 
 HELD = 0.15  # chosen: s of a hold that locate the block next to a contact change; a hand drifts over more
+PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
 STIFFEST = 1e-7  # chosen: m/N
 
 
@@ -24,8 +26,9 @@ class Contacts:
     """Fingertip signals of one trial with what the fit knows: biases, weights, pads and noise.
 
     `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
-    position along its own closing direction [m], `inward_rate` likewise; `deflection` (T,): the pads'
-    mean shear deflection by the net vertical force [m].
+    position along its own closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just
+    after each sample, by finger, `sinking` (2, T) that of the mean height downwards [m/s]; `deflection` (T,):
+    the pads' mean shear deflection by the net vertical force [m].
     """
 
     signals: Signals
@@ -33,6 +36,7 @@ class Contacts:
     compression: np.ndarray
     inward: np.ndarray
     inward_rate: np.ndarray
+    sinking: np.ndarray
     deflection: np.ndarray
     weight: dict[str, float]
     sd: dict[str, float]
@@ -56,21 +60,42 @@ class Contacts:
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
             making = after.state == ON_GROUND
             load = self._load(before, stretch, making)
+            if self.signals.timing is not None:
+                timing = float(
+                    np.hypot(timing, np.median(self.signals.timing[stretch][:: 1 if making else -1][:2]))
+                )
             return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
         """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
-        inward, rate = self.inward[i], self.inward_rate[i]
-        if not rests:
-            inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=0)
+        inward, rate, sd_inward = self.inward[i], self.inward_rate[:, i], self.sd["inward"]
+        if rests:
+            moved, moving = self._pushed(1 - i, held)
+            inward, rate, sd_inward = inward + moved, rate + moving, np.sqrt(2.0) * sd_inward
+        else:
+            inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
         face = _median(inward[held] - self.compression[i, held])
         sd = self.sd["compression"]
         return self._timely(Penetration(
             self.signals.t, self.compression[i], inward - face, rate, sd, sd,
-            self.sd["inward"], self.sd["inward_rate"], self.sensing.normal.form,
+            sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
             self.sensing.normal.value < RIGID,
         ), making)  # fmt: skip
+
+    def _pushed(self, i: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far finger i has pushed the block from where it rested (T,) [m], and its speed (2, T) [m/s].
+
+        A finger that comes first, or stays longer, pushes the block: as long as it touches, its own
+        position less its pad's compression is where the block is.
+        """
+        pressed = self.compression[i]
+        face = _median(self.inward[i, held] - pressed[held])
+        moved = self.inward[i] - pressed - face
+        doubt = np.hypot(self.sd["inward"], self.sensing.normal.form * pressed)
+        pushes = (pressed > SURE * self.sd["compression"]) & (np.abs(moved) > PUSHED * doubt)
+        moving = self.inward_rate[:, i] - np.gradient(pressed, self.signals.t)
+        return np.where(pushes, moved, 0.0), np.where(pushes & np.isfinite(moving), moving, 0.0)
 
     def _load(self, before: Subtask, held: np.ndarray, making: bool) -> Penetration:
         """The fingers below the height at which the pads' shear just carries the weight."""
@@ -78,7 +103,7 @@ class Contacts:
         level = _median(y[held] - self.deflection[held])
         carrying = hanging(self.weight[str(before.object)], shown(self.sensing.pads))
         return self._timely(Penetration(
-            self.signals.t, carrying - self.deflection, level + carrying - y, -self.signals.vy,
+            self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
             self.sd["deflection"], self.sd["carried"], self.sd["y"], self.sd["vy"],
             self.sensing.shear.form, self.sensing.shear.value < RIGID,
         ), making)  # fmt: skip
@@ -89,7 +114,7 @@ class Contacts:
         A touch begins where the compression does, and so do both changes for a sensor that is late.
         Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly.
         """
-        moved = self.sensing.delay * np.nan_to_num(c.rate)
+        moved = self.sensing.delay * np.nan_to_num(c.rate).mean(axis=0)
         if not making and self.sensing.delay < 0:
             return replace(c, place=c.place - moved)
         sure = c.pressed > SURE * c.sd_apart
@@ -112,26 +137,48 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
     inward = np.stack([s.x1, -s.x2])
-    rate = np.stack([s.vx1, -s.vx2])
+    sd_x, sd_y = _sd(s.sd_x, s.x1), _sd(s.sd_y, s.y1)
+    rates, sinking, sd_vx, sd_vy = _rates(s, inward, sd_x, sd_y)
     force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
-
-    def sd(stated: np.ndarray, values: np.ndarray) -> float:
-        return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
 
     pads = shown(sensing.pads)
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
     return Contacts(
         signals=s, sensing=sensing, compression=normal * np.array([[pads.normal1], [pads.normal2]]),
-        inward=inward, inward_rate=rate, deflection=-block_y(0.0, fy1, fy2, pads),
+        inward=inward, inward_rate=rates, sinking=sinking, deflection=-block_y(0.0, fy1, fy2, pads),
         weight=parameters.weight,
         sd={
             "compression": force * float(pads.normal1),
-            "inward": sd(s.sd_x, s.x1),
-            "inward_rate": sd(s.sd_vx, s.vx1),
-            "y": float(np.hypot(sd(s.sd_y, s.y1) / root2, level)),
-            "vy": sd(s.sd_vy, s.vy1) / root2,
+            "inward": sd_x,
+            "inward_rate": sd_vx,
+            "y": float(np.hypot(sd_y / root2, level)),
+            "vy": sd_vy / root2,
             "deflection": root2 * hanging(force, pads),
             "carried": hanging(max(parameters.scale["carry"], root2 * force), pads),
         },
     )  # fmt: skip
+
+
+def _sd(stated: np.ndarray, values: np.ndarray) -> float:
+    """Noise of a channel: as stated, or as the recording shows it."""
+    return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
+
+
+def _rates(
+    s: Signals, inward: np.ndarray, sd_x: float, sd_y: float
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Rates (2, 2, T) of closing and (2, T) of sinking, before and after each sample, and their noise [m/s].
+
+    Where velocities are differences of positions, each side has its own.
+    """
+    if not s.derived:
+        rates, sinking = np.stack([s.vx1, -s.vx2]), -s.vy
+        return (
+            np.stack([rates, rates]),
+            np.stack([sinking, sinking]),
+            _sd(s.sd_vx, s.vx1),
+            _sd(s.sd_vy, s.vy1),
+        )
+    (left, noise), (right, _), (rising, _) = (one_sided(s.t, x) for x in (*inward, s.y))
+    return np.stack([left, right], axis=1), -rising, noise * sd_x, noise * sd_y

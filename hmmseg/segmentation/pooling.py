@@ -11,7 +11,7 @@ from hmmseg.contact.decompose import Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.boundaries import Kind
-from hmmseg.segmentation.changes import Change, discrepancies
+from hmmseg.segmentation.changes import Change, Disagreement, disagreements
 from hmmseg.segmentation.emissions import Features, Parameters
 from hmmseg.segmentation.features import WINDOW, features, thin
 from hmmseg.segmentation.fit import Fit, fit
@@ -38,7 +38,7 @@ class Reading:
 class Pool:
     """All recordings as they were read last, the fit of those that fit, and what they show of the hand.
 
-    `changes` are those of each fitted recording; `discrepancy` [m] as in `discrepancies`. `remarks` tell
+    `changes` are those of each fitted recording; `disagreement` as in `disagreements`. `remarks` tell
     people what contradicts the rig.
     """
 
@@ -46,7 +46,7 @@ class Pool:
     fit: Fit
     sensing: Sensing
     changes: list[list[Change | None]] = field(default_factory=list)
-    discrepancy: dict[tuple[Kind, int], float] = field(default_factory=dict)
+    disagreement: dict[tuple[Kind, int], Disagreement] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
 
@@ -73,8 +73,8 @@ def pooled(
         contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)
     ]
-    discrepancy = discrepancies([c for own in changes for c in own if c is not None])
-    return Pool(readings, fitted, sensing, changes, discrepancy, remarks)
+    disagreement = disagreements([c for own in changes for c in own if c is not None])
+    return Pool(readings, fitted, sensing, changes, disagreement, remarks)
 
 
 def unfitted(recordings: Sequence[Signals], parameters: Parameters, rig: Rig) -> Pool:

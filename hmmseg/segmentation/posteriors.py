@@ -10,7 +10,7 @@ from hmmseg.contact.decompose import FREE, Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.alignment import Alignment
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal
-from hmmseg.segmentation.changes import DISCREPANCY, Change, Prior, moment
+from hmmseg.segmentation.changes import Change, Disagreement, Prior, moment
 from hmmseg.segmentation.crossings import HELD, contacts
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import Sensing
@@ -44,7 +44,7 @@ def contact_changes(
 
 
 def boundary_posteriors(
-    changes: Sequence[Change | None], discrepancy: Mapping[tuple[Kind, int], float], t: np.ndarray,
+    changes: Sequence[Change | None], known: Mapping[tuple[Kind, int], Disagreement], t: np.ndarray,
     posterior: Alignment, touches: Touches = (),
 ) -> tuple[BoundaryPosterior, ...]:  # fmt: skip
     """Posterior of each boundary of one trial, aligned at t (num_timesteps,) [s].
@@ -56,7 +56,7 @@ def boundary_posteriors(
         if change is None:
             found.append(combine(t, np.exp(posterior.log_advance[:, k]), {}))
         else:
-            posted = moment(change, discrepancy.get(change.sort, DISCREPANCY))
+            posted = moment(change, known.get(change.sort, Disagreement()))
             found.append(_known(touches, posted) if len(change.contacts) > 1 else posted)
     return tuple(found)
 

@@ -12,7 +12,7 @@ from hmmseg.hand.signals import Signals
 
 FRICTION = 1.5  # cited: rubber on dry solids reaches about 1 to 1.4 (Persson, J. Chem. Phys. 115, 2001)
 CLEAR = 6.0  # numerics: standard deviations, so that no noise of an hour at 1 kHz is taken for a touch
-BRIEF = 0.05  # s; physics: an impact of hard parts rings no longer
+BRIEF = 0.05  # physics: s; an impact of hard parts rings no longer
 
 
 def standing(signals: Signals, free: np.ndarray) -> np.ndarray:

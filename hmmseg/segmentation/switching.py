@@ -31,7 +31,8 @@ TAIL = 4.0  # chosen: Student-t residuals, as in the emissions
 class Penetration:
     """One contact as sensed, arrays (num_samples,), NaN where missing.
 
-    `pressed` [m]: by the force; `place` [m]: by the position; `rate` [m/s] of `place`. `sd_pressed` is
+    `pressed` [m]: by the force; `place` [m]: by the position; `rate` (2, num_samples) [m/s] of `place`, just
+    before and just after each sample. `sd_pressed` is
     the noise of the force, `form` the share by which a pad's force may be off its compression;
     `sd_apart` [m]: what the force may be of itself where there is no contact. `hidden`: a rigid pad, whose
     force tells that there is contact, but not how deep.

@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import chisquare
 
 from hmmseg.hmm.alignment import align, align_many
-from hmmseg.hmm.banded import InfeasibleAlignment, forward, forward_backward, sample_alignments, viterbi
+from hmmseg.hmm.banded import forward, forward_backward, sample_alignments, viterbi
+from hmmseg.hmm.chain import InfeasibleAlignment
 
 SIZES = [(1, 1), (4, 1), (2, 2), (5, 2), (4, 4), (6, 3), (8, 4)]
 
@@ -234,3 +235,28 @@ def test_nan_and_wrong_shapes_are_refused(function):
 def test_traced_use_returns_minus_infinity_instead_of_raising():
     ll, bands, *_ = infeasible()[0]
     assert np.isneginf(jax.jit(lambda ll: viterbi(ll, *bands).log_prob)(ll))
+
+
+def test_single_precision_stays_so_and_moves_no_label():
+    """A long recording of states half a standard deviation apart: sums not rebased would drift by nats."""
+    rng = np.random.default_rng(5)
+    num = 60_000
+    signal = 0.5 * (np.arange(num) * 4 // num) + rng.normal(size=num)
+    ll = (-0.5 * (signal[:, None] - 0.5 * np.arange(4)) ** 2 - 20.0).astype(np.float32)
+    stay, advance = np.log(np.full(4, 0.999)), np.log(np.full(3, 0.001))
+    single = viterbi(ll, stay.astype(np.float32), advance.astype(np.float32))
+    double = viterbi(ll.astype(float), stay.astype(np.float32), advance.astype(np.float32))
+    assert single.path.tolist() == double.path.tolist()
+    np.testing.assert_allclose(single.log_prob, double.log_prob, rtol=1e-7)
+
+
+def test_best_path_differentiates_to_its_own_samples():
+    """The gradient of the best weight counts the samples of the path, padding left out."""
+    ll, bands = random_problem(7, 3, seed=2)
+    best = viterbi(ll[:5], bands[0][:4], bands[1][:4])
+    padded = ll.copy()
+    padded[5:] = np.nan
+    for dtype in (float, np.float32):
+        arguments = [jnp.asarray(a, dtype) for a in (padded, *bands)]
+        found = jax.grad(lambda x, a=arguments: viterbi(x, *a[1:], num_valid=5).log_prob)(arguments[0])
+        np.testing.assert_array_equal(np.asarray(found)[:5], np.eye(3)[np.asarray(best.path)])

@@ -8,7 +8,7 @@ from contact_scene import LEVELS, PLANTED, STEPS, planted
 from scipy import optimize, stats
 
 from hmmseg.hmm import em
-from hmmseg.hmm.banded import InfeasibleAlignment
+from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import TAIL
 from hmmseg.segmentation.fit import (

@@ -18,7 +18,7 @@ GRIPPED = T > 2.0
 
 def make(fy1: np.ndarray, grip: float = 3.0) -> np.ndarray:
     """Stretches found where finger 1 pushes with `fy1` and both grip from 2 s on."""
-    channels = sorted(set(Signals.__dataclass_fields__) - {"t", "sd_force", "touches"})
+    channels = sorted(set(Signals.__dataclass_fields__) - {"t", "sd_force", "derived", "touches"})
     values = {name: np.zeros_like(T) for name in channels}
     values |= {"fx1": grip * GRIPPED, "fx2": -grip * GRIPPED, "fy1": fy1}
     return standing(Signals(t=T, **values, sd_force=0.02), ~GRIPPED & (T < 1.0))

@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 
 from estimation.identification import identify_aligned
+from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.contact.decompose import decompose
 from hmmseg.contact.hands import revealed_by
 from hmmseg.errors import InputError

@@ -45,11 +45,11 @@ class Setup:
     said: dict = field(default_factory=dict)
 
 
-def performances(count: int = 2, rate: float = 50.0) -> list[SimulatedTrial]:
+def performances(count: int = 2, rate: float = 50.0, seed: int = 0) -> list[SimulatedTrial]:
     """Trials at an arm's pace."""
     rig = parse_rig({"rate": rate, "gravity": G, "fingertip": PADS})
     slow = OperatorSettings(pace=(0.6, 0.7))
-    return simulate_trials(TASK, rig, [BLOCKS] * count, list(range(count)), slow)
+    return simulate_trials(TASK, rig, [BLOCKS] * count, list(range(seed, seed + count)), slow)
 
 
 def wrist_rig(setup: Setup, **gripper) -> Rig:

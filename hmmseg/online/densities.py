@@ -1,0 +1,56 @@
+"""Log densities of single readings, compiled: Student-t, a uniform with soft edges, mostly one of them."""
+
+from __future__ import annotations
+
+import math
+
+from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.segmentation.emissions import TAIL
+
+_HALF = (TAIL + 1) / 2
+_CONSTANT = math.lgamma(_HALF) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)
+_ROOT2 = math.sqrt(2.0)  # chosen
+_LEAST = -25.0  # chosen: of an edge, as in the emissions off line
+
+
+@compiled
+def log_sum(a, b):
+    """log(exp(a) + exp(b))."""
+    high, low = (a, b) if a > b else (b, a)
+    return high + math.log1p(math.exp(low - high)) if low > -math.inf else high
+
+
+@compiled
+def log_student(residual, variance):
+    """Log density of a Student-t residual whose squared scale is `variance`; 0 where missing."""
+    if math.isnan(residual):
+        return 0.0
+    return _CONSTANT - 0.5 * math.log(variance) - _HALF * math.log1p(residual * residual / variance / TAIL)
+
+
+@compiled
+def _log_normal_cdf(z):
+    return math.log(0.5 * math.erfc(-z / _ROOT2)) if z > -30.0 else -450.0
+
+
+@compiled
+def log_between(value, low, high, scale, span):
+    """Log density of a uniform on [low, high] of width `span` with noise-softened edges."""
+    if math.isnan(value):
+        return 0.0
+    soft = _log_normal_cdf((value - low) / scale) + _log_normal_cdf((high - value) / scale)
+    return max(soft, _LEAST) - math.log(span)
+
+
+@compiled
+def log_mostly(residual, variance, log_close, log_stray, span):
+    """Log density of a residual that is as a rule a Student-t one, and anywhere in `span` now and then."""
+    if math.isnan(residual):
+        return 0.0
+    return log_sum(log_close + log_student(residual, variance), log_stray - math.log(span))
+
+
+@compiled
+def log_broad(value, span):
+    """Log density of a value that may be anywhere in `span`; 0 where missing."""
+    return 0.0 if math.isnan(value) else -math.log(span)

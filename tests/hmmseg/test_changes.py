@@ -1,0 +1,71 @@
+"""What contact changes show of where force and position disagree, and a block that a finger pushes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmmseg import Rig, Trial, align, example_folder
+from hmmseg.hand.signals import task_space
+from hmmseg.segmentation.changes import Change, Prior, disagreements, moment
+from hmmseg.segmentation.crossings import contacts
+from hmmseg.segmentation.pads import Compliance, Sensing
+from hmmseg.segmentation.switching import Penetration
+
+T = np.arange(12) * 0.02
+SD_PRESSED, SD_PLACE = 3e-6, 2e-5
+
+
+def release(abrupt: bool, seed: int) -> Change:
+    """A contact that ends between samples 5 and 6, relaxed or with up to 0.2 mm to go."""
+    rng = np.random.default_rng(seed)
+    place = (5 - np.arange(12)) * 2e-4 + rng.uniform(0, 4e-4 if abrupt else 2e-4)
+    pressed = np.where(np.arange(12) <= 5, np.maximum(place, 0), 0.0)
+    c = Penetration(
+        T, pressed + SD_PRESSED * rng.standard_normal(12), place + SD_PLACE * rng.standard_normal(12),
+        np.full((2, 12), -1e-2), SD_PRESSED, SD_PRESSED, SD_PLACE, 1e-3, 0.0,
+    )  # fmt: skip
+    probability = np.zeros(11)
+    probability[5] = 1.0
+    return Change((c,), Prior(T, probability, (0.0, 1.0)), False, "smooth", 0.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_the_share_of_contacts_that_end_abruptly_is_learned(share):
+    changes = [release(k < share * 40, k) for k in range(40)]
+    (found,) = disagreements(changes).values()
+    assert found.abrupt == pytest.approx(max(share, 0.02), abs=0.15)
+
+
+def test_an_abrupt_end_may_be_anywhere_in_its_interval():
+    many = [release(k < 20, k) for k in range(40)]
+    (known,) = disagreements(many).values()
+    inside = next(c for c in (release(True, k) for k in range(100, 200))
+                  if 2 < c.contacts[0].place[6] / SD_PLACE < 3)  # fmt: skip
+    relaxed, abrupt = moment(release(False, 99), known), moment(inside, known)
+    assert abrupt.sd > 1.4 * relaxed.sd
+    assert abrupt.sd > 0.8 * 0.02 / np.sqrt(12)  # of a uniform density
+
+
+def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets():
+    folder = example_folder()
+    rig = Rig.read(folder / "rig.toml")
+    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
+    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
+    parameters = aligned.fit.parameters
+    stiff = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(4e-4, 1e-6, 0.0), 0.0, 1e-3)
+    n, step = signals.t.size, 1.5e-3
+    still = np.full(n, 0.01)
+    pushed = np.where(np.arange(n) < n // 2, 0.0, step)  # finger 2 has pushed the block to the left
+    made = replace(
+        signals, x1=-still - pushed, x2=still - pushed, vx1=0 * still, vx2=0 * still,
+        fx1=0 * still, fx2=np.full(n, -1.0),
+    )  # fmt: skip
+    table = contacts(made, stiff, replace(parameters, bias=np.zeros(4)))
+    held = np.zeros(n, bool)
+    held[n // 4 : n // 2] = True
+    moved, _ = table._pushed(1, held)
+    np.testing.assert_allclose(moved[: n // 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(moved[n // 2 :], step, atol=1e-9)
