@@ -20,49 +20,32 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimation.combinations import Terms, simplest_combinations
-from estimation.compliance import shear_give, squeeze_give, unexpected_share, unit_pads
+from estimation.moments import (
+    free_means,
+    level_rises,
+    observe,
+    observe_slopes,
+    pad_doubt,
+    sampling_variance,
+    slope_variances,
+    unexpected_bias,
+    units,
+)
 from estimation.nuisance import Nuisance, PadDoubt, nuisances
 from estimation.observations import (
     CHANNELS,
     Aligned,
     Noise,
-    channel_values,
     free_forces,
     gravity_factor,
 )
+from estimation.unknowns import FORCE, PROPERTIES, RISE, Unknown, coefficients_of, determined
 from hmmseg.contact.decompose import height_equations
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.features import thin
-
-PROPERTIES = ("weight", "width", "height")
-FORCE, DISTANCE, RISE = range(len(CHANNELS))
-READINGS = {DISTANCE: "distance", RISE: "place"}  # the samples whose slopes show the pads
-
-
-@dataclass(frozen=True)
-class Unknown:
-    """What the recording determines: a property, or a combination of one property of several objects."""
-
-    prop: str
-    terms: Terms
-
-    @property
-    def single(self) -> bool:
-        """Whether it is a property of one object."""
-        return len(self.terms) == 1
-
-    @property
-    def name(self) -> tuple[str, str]:
-        """(object, property); objects of a combination joined as in `b + c`."""
-        text = ""
-        for obj, c in self.terms.items():
-            sign = " - " if c < 0 else " + "
-            text += (sign if text else "") + (obj if abs(c) == 1 else f"{abs(c)} {obj}")
-        return text, self.prop
 
 
 @dataclass(frozen=True)
@@ -109,59 +92,6 @@ class Design:
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
 
-def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
-    """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
-    values = channel_values(signals, rig)
-    out = []
-    for move in moves:
-        weights, counts = aligned.weights.grips[move], aligned.weights.counts[move]
-        means = {k: _mean(w, values[k], counts[k]) for k, w in weights.items()}
-        out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
-    return np.moveaxis(np.array(out), 2, 0)
-
-
-def observe_slopes(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
-    """Slopes of readings over the pads' give (num_moves, 3) of one trial, NaN where there is none."""
-    values, out = channel_values(signals, rig), np.full((len(moves), len(CHANNELS)), np.nan)
-    for i, move in enumerate(moves):
-        for c, reading in READINGS.items():
-            found = aligned.weights.slopes.get(move, {}).get(CHANNELS[c])
-            if found is not None:
-                out[i, c] = found.weights @ np.nan_to_num(values[reading])
-    return out
-
-
-def _slope_variance(aligned: Aligned, moves: Sequence[int]) -> np.ndarray:
-    """Variances (num_moves, 3) of the slopes, infinite of none."""
-    found = [[aligned.weights.slopes.get(m, {}).get(name) for name in CHANNELS] for m in moves]
-    return np.array([[np.inf if s is None else s.variance for s in row] for row in found])
-
-
-def _pad_doubt(slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[Aligned], rig: Rig) -> PadDoubt:
-    """What slopes (num_trials, num_moves, 3) say against the rig's pads, and a usual grip force."""
-    admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
-    found = {}
-    for c, stiffness in ((DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness)):
-        seen = np.isfinite(slopes[..., c])
-        stated = bool(np.isfinite(stiffness))
-        found[c] = unexpected_share(
-            slopes[..., c][seen], variance[..., c][seen], stated, admitted if stated else 0.0
-        )
-    squeeze = np.concatenate([_squeeze(a) for a in aligned])
-    # A width reads too small by the share of the give that the rig leaves out, a height too large.
-    return PadDoubt(-found[DISTANCE], found[RISE], max(float(np.median(squeeze)), 1e-3))
-
-
-def _squeeze(aligned: Aligned) -> np.ndarray:
-    """Mean grip force of one finger (num_moves,) [N]."""
-    force = np.nan_to_num(aligned.signals.fx1 - aligned.signals.fx2) / 2
-    return np.array([np.mean(w["distance"] @ force) for w in aligned.weights.grips.values()])
-
-
-def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    return np.where(counts > 0, weights @ np.nan_to_num(values), np.nan)
-
-
 def build(
     trials: Sequence[Trial], aligned: Sequence[Aligned], noise: Noise, task: BlockTask, rig: Rig
 ) -> Design:
@@ -170,7 +100,7 @@ def build(
     objects = [task.performed[m].object for m in moves]
     rises = dict(height_equations(task))
     raw = np.stack([observe(a.signals, a, rig, moves) for a in aligned])  # T, S, M, 3
-    variance = np.stack([_variance(a, noise, moves) for a in aligned])
+    variance = np.stack([sampling_variance(a, noise, moves) for a in aligned])
     factor = np.stack(
         [[a.weights.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in aligned]
     )
@@ -178,16 +108,16 @@ def build(
     there = valid.mean(axis=1) > 0.5  # of the alignments
     # A move between equal heights has a rise that no property enters: it says nothing of them.
     there[:, :, RISE] &= np.array([bool(rises[m]) for m in moves])
-    unknowns = _unknowns(task, objects, rises, there.any(axis=0))
-    columns = _columns(unknowns, objects, rises)  # M, 3, Q
+    unknowns = determined(task, objects, rises, there.any(axis=0))
+    columns = coefficients_of(unknowns, objects, rises)  # M, 3, Q
     coefficients = np.repeat(np.repeat(columns[None, None], raw.shape[1], axis=1), len(trials), axis=0)
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
-    free_mean, free_variance = _free(aligned, noise)
+    free_mean, free_variance = free_means(aligned, noise)
     surprise = unexpected_bias(free_mean, free_variance, rig)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in aligned])  # T, M, 3
     slopes[..., ~there.any(axis=(0, 1))] = np.nan  # of channels that tell no unknown
-    slope_variance = np.stack([_slope_variance(a, moves) for a in aligned])
-    doubt = _pad_doubt(slopes, slope_variance, aligned, rig)
+    slope_variance = np.stack([slope_variances(a, moves) for a in aligned])
+    doubt = pad_doubt(slopes, slope_variance, aligned, rig)
     deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}
     shifts = np.zeros((*there.shape, len(deviations)))
@@ -210,59 +140,13 @@ def build(
         unknowns=unknowns, nuisances=deviations, mean=np.concatenate([mean, slopes[steep]]),
         variance=np.concatenate([spread, slope_variance[steep]]), coefficients=rows, shifts=shifts,
         channel=np.concatenate([where[2], steep[2]]),
-        unit=np.concatenate([_units(aligned, raw, rig)[where], np.ones(steep[0].size)]),
+        unit=np.concatenate([units(aligned, raw, rig)[where], np.ones(steep[0].size)]),
         trial=np.concatenate([where[0], steep[0]]), move=np.concatenate([where[1], steep[1]]),
         slope=np.repeat([False, True], [where[0].size, steep[0].size]),
         free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
         scale_count=np.array(counts), unexpected=tuple(d for d in deviations if d.name in surprising),
-        doubt=doubt, level_rises=_level_rises(raw, rises),
+        doubt=doubt, level_rises=level_rises(raw, rises),
     )  # fmt: skip
-
-
-def _variance(aligned: Aligned, noise: Noise, moves: Sequence[int]) -> np.ndarray:
-    """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
-    out = []
-    with np.errstate(divide="ignore"):
-        for move in moves:
-            part = {k: noise.variance[k] / n for k, n in aligned.weights.counts[move].items()}
-            out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
-    return np.moveaxis(np.array(out), 2, 0)
-
-
-def _unknowns(
-    task: BlockTask, objects: Sequence[str], rises: dict[int, Terms], there: np.ndarray
-) -> tuple[Unknown, ...]:
-    """What the moves recorded in `there` (num_moves, 3) determine, objects in the task's order."""
-    names = list(task.objects)
-    held = {
-        c: {obj for obj, seen in zip(objects, there[:, c], strict=True) if seen} for c in (FORCE, DISTANCE)
-    }
-    out = []
-    recorded = [rises[m] for m, seen in enumerate(there[:, RISE]) if seen]
-    heights = simplest_combinations(recorded, names)
-    for name in names:
-        out += [Unknown("weight", {name: 1})] * (name in held[FORCE])
-        out += [Unknown("width", {name: 1})] * (name in held[DISTANCE])
-        out += [Unknown("height", {name: 1})] * ({name: 1} in heights)
-    return (*out, *(Unknown("height", terms) for terms in heights if len(terms) > 1))
-
-
-def _columns(unknowns: Sequence[Unknown], objects: Sequence[str], rises: dict[int, Terms]) -> np.ndarray:
-    """Coefficients (num_moves, 3, Q) of the unknowns in each observation of a move."""
-    out = np.zeros((len(objects), len(CHANNELS), len(unknowns)))
-    heights = [i for i, u in enumerate(unknowns) if u.prop == "height"]
-    names = list(dict.fromkeys(name for i in heights for name in unknowns[i].terms))
-    basis = np.array([[unknowns[i].terms.get(name, 0) for name in names] for i in heights], float)
-    for m, obj in enumerate(objects):
-        for i, u in enumerate(unknowns):
-            if u.single and obj in u.terms and u.prop != "height":
-                out[m, PROPERTIES.index(u.prop), i] = 1.0
-        if heights and rises[m] and set(rises[m]) <= set(names):
-            rise = np.array([rises[m].get(name, 0) for name in names], float)
-            solved, *_ = np.linalg.lstsq(basis.T, rise, rcond=None)
-            if np.abs(solved @ basis - rise).max() < 1e-9:
-                out[m, RISE, heights] = np.where(np.abs(solved) > 1e-9, solved, 0.0)
-    return out
 
 
 def _combined(
@@ -291,56 +175,6 @@ def _combined(
     return mean, within + (1 + 1 / num) * between, row
 
 
-def _units(aligned: Sequence[Aligned], raw: np.ndarray, rig: Rig) -> np.ndarray:
-    """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
-
-    Of a rise at least the give under the weight: contact forces that balance leave other errors.
-    """
-    force = np.abs(raw[..., FORCE]).mean(axis=1)
-    force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
-    grip, lever = [], []
-    for a in aligned:
-        squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
-        grips = a.weights.grips.values()
-        grip.append([np.mean(w["distance"] @ squeeze) for w in grips])
-        lever.append([np.mean(w["place"] @ shear) - np.mean(w["pickup"] @ shear) for w in grips])
-    hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
-    rise = np.array(lever)
-    rise = np.where(rise < 0, -1.0, 1.0) * np.maximum(np.abs(rise), hanging)
-    return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
-
-
-def _free(aligned: Sequence[Aligned], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
-    """Mean forces in free motion (num_trials, 4) and their variances."""
-    mean = np.stack([free_forces(a.signals, a) for a in aligned])
-    count = np.array([max(a.weights.free_count, 1.0) for a in aligned])
-    variance = np.array([noise.variance[name] for name in FORCE_CHANNELS])
-    return mean, variance[None, :] / count[:, None]
-
-
-def _level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
-    """Mean recorded rise [m] of the moves that should have none, where they were recorded."""
-    out = {}
-    for move, rise in rises.items():
-        recorded = raw[:, :, move, RISE]
-        recorded = recorded[np.isfinite(recorded)]
-        if not rise and recorded.size:
-            out[move] = float(recorded.mean())
-    return out
-
-
 def _rate(signals: Signals) -> float:
     """A rate at which thinning groups samples as it did for these signals."""
     return 1.0 / float(np.median(np.diff(signals.t))) * 1.001
-
-
-def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """Extra prior sd (4,) of force biases that free motion shows and the rig does not admit [N].
-
-    Forces in free motion should vanish; where their pooled mean is beyond 4 standard errors of
-    what noise and the rig's own [systematic] allow, the bias gets a prior as wide as itself.
-    """
-    precision = 1.0 / variance
-    pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
-    allowed = np.hypot(1.0 / np.sqrt(precision.sum(axis=0)), np.asarray(rig.systematic.force_bias))
-    return np.where(np.abs(pooled) > 4 * allowed, np.abs(pooled), 0.0)

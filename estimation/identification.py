@@ -10,13 +10,14 @@ import numpy as np
 
 from estimation.actual import Actual
 from estimation.compliance import unit_pads
-from estimation.design import Design, Unknown, build
+from estimation.design import Design, build
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.observations import CHANNELS, Aligned, Noise, aligned_weights
 from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.sampler import Draws, sample
 from estimation.tables import properties_table
+from estimation.unknowns import Unknown
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
 from hmmseg.errors import nearest
 from hmmseg.io.rig import Rig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +35,9 @@ from hmmseg_cli.diagnose_robot import (
 )
 from simgap.report.finding import sentence
 from simgap.report.tables import tables
+
+if TYPE_CHECKING:
+    from hmmseg.io.trial import Trial
 
 EffectOption = Annotated[
     list[str] | None,
@@ -138,30 +141,35 @@ def diagnose(
         from hmmseg.io.rig import read_rig
 
         hand = read_rig(rig)
-        if hand.gripper is not None:
-            problem = "a wrist sensor does not feel each finger, which the effects act on"
-            raise InputError(f"{rig}: [gripper]", problem, "a hand with forces at both fingertips")
         if patch is not None:
             check_folder("--patch", patch)
         body = run(out, paths, description, hand, actual, effect or [], healthy or [])
         if patch is not None:
-            _patch(out, body, rig, patch)
+            _patch(out, body, rig, patch, read_trials(out, paths, hand), description)
         out.finish(body)
 
 
-def _patch(out: Output, body: dict[str, Any], rig: Path, folder: Path) -> None:
-    """Write the corrected model; a warning where there is no cause to correct."""
-    from simgap.patch import files
+def _patch(
+    out: Output, body: dict[str, Any], rig: Path, folder: Path, trials: Sequence[Trial], task: BlockTask
+) -> None:
+    """Write the corrected model; a warning where there is no cause to correct, or where it predicts worse."""
+    from hmmseg.io.rig import read_rig
+    from simgap.patch import files, reproduced
 
     if (folder / "rig.toml").resolve() == rig.resolve():
         raise InputError(f"--patch {folder}", f"would replace the input {rig}", "another folder")
     written = files(rig.read_text(encoding="utf-8"), body)
     if not written:
         out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
+        return
+    nominal, corrected = reproduced(written, body, trials, task, read_rig(rig))
+    told = f"forces differ from the recorded ones by {corrected:.3g} N with it, {nominal:.3g} N without"
+    if not corrected < nominal:
+        out.warn(f"--patch {folder}: the corrected model is no better ({told}); nothing is written")
+        return
     for name, text in written.items():
         out.stage(folder / name).write_text(text, encoding="utf-8")
-    if written:
-        out.print(f"the corrected model is in {folder}: {', '.join(written)}")
+    out.print(f"the corrected model is in {folder}: {', '.join(written)}; {told}")
 
 
 def run(

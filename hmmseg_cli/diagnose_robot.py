@@ -102,6 +102,7 @@ def diagnose_robot(
             f"--task {task}", "does not go with a simulator of your own yet: phases are told by motion"
         )
     more: list = []
+    length = None
     if own.simulator is not None:
         from simgap.simulators.user import load_simulator
 
@@ -115,7 +116,7 @@ def diagnose_robot(
         assert own.mjcf is not None and own.map_file is not None
         loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
         recordings = [loaded.read(path) for path in paths]
-        at_risk = loaded.simulator
+        at_risk, length = loaded.simulator, loaded.map.length
         more = loaded.effects(recordings)
         for warning in loaded.warnings:
             out.warn(warning)
@@ -126,6 +127,7 @@ def diagnose_robot(
             forced=tuple(dict.fromkeys(effect)),
             seed=out.seed,
             more=more,
+            length=length,
             tell=lambda text: advance(1),
             warn=out.warn,
         )

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from hmmseg.errors import InputError
+from hmmseg.jaxconfig import configure
 from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, check_folder
 
 PropertiesArgument = Annotated[Path | None, typer.Argument(
@@ -34,6 +35,7 @@ def play(
     quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """The virtual blocks in a browser: the mouse holds the fingertips; a session is saved as a trial."""
+    configure(steady=True)  # steps have a deadline, and are not handed to another thread
     check_folder("--output", output)
     with Output("play", json=json, seed=seed, quiet=quiet) as out:
         try:

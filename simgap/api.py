@@ -8,8 +8,9 @@ from typing import Any
 
 from estimation.actual import parse_actual, read_actual
 from estimation.identification import Identification
-from hmmseg.api import Source, block_task, read_trials
+from hmmseg.api import Source, align, block_task
 from hmmseg.io.rig import Rig
+from hmmseg.segmentation.align import AlignedTrials
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.diagnose import diagnose as diagnose_blocks
 from simgap.world.operator import OperatorSettings
@@ -43,9 +44,9 @@ def simulate(
 
 
 def diagnose(
-    trials: Source | Sequence[Source],
-    task: Source,
-    rig: Source,
+    trials: Source | Sequence[Source] | AlignedTrials | Identification,
+    task: Source = None,
+    rig: Source = None,
     actual: str | Path | dict | None = None,
     effects: Sequence[str] = (),
     seed: int = 0,
@@ -53,16 +54,24 @@ def diagnose(
 ) -> Diagnosis:
     """Where recordings part from the virtual model, which effect causes it, how far it shrinks the gap.
 
-    `actual`: properties measured apart (a path or a table); `effects` are taken instead of choosing.
+    `trials`, `task`, `rig`: paths, tables or what the readers give; or what `hmmseg.align` or `identify`
+    gave, alone: the alignment is then theirs. `actual`: properties measured apart (a path or a table);
+    `effects` are taken instead of choosing.
     InputError for input at fault or where no trial fits its task.
     """
-    order, hand = block_task(task), Rig.read(rig)
+    if isinstance(trials, Identification):
+        aligned = trials.aligned
+    else:
+        aligned = trials if isinstance(trials, AlignedTrials) else align(trials, task, rig)
+    order = aligned.task
     if isinstance(actual, dict):
         measured = parse_actual(actual, order.objects)
     else:
         measured = None if actual is None else read_actual(actual, order.objects)
-    recorded = read_trials(trials, hand)
-    return diagnose_blocks(recorded, order, hand, measured, tuple(effects), seed, progress)
+    recorded = [one.trial for one in aligned.trials]
+    return diagnose_blocks(
+        recorded, order, aligned.rig, measured, tuple(effects), seed, progress, aligned=aligned
+    )
 
 
 def _blocks(properties: Any, task: Any) -> Blocks:

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import priors
-from estimation.design import Design, Unknown
+from estimation.design import Design
 from estimation.nuisance import Nuisance
+from estimation.unknowns import Unknown
 
 OBJECTS = ("left", "right")
 PROPS = ("weight", "width", "height")

@@ -9,7 +9,7 @@ import numpy as np
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.effects.base import FORCES
 from simgap.gap.diagnose import Diagnosis
-from simgap.gap.frame import CHANNELS
+from simgap.gap.trial_arrays import CHANNELS
 
 LABELS = {
     "x": "x [cm]",

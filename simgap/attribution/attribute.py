@@ -9,84 +9,20 @@ from itertools import product
 import numpy as np
 from scipy.special import expit
 
-from simgap.attribution.cells import Cell, significant
-from simgap.attribution.detection import Detection, detected, statistic
-from simgap.attribution.heldout import HowFar, how_far
+from simgap.attribution.cells import significant
+from simgap.attribution.detection import detected, statistic
+from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder
+from simgap.attribution.heldout import how_far
 from simgap.attribution.invariance import Invariance, invariance, residual_left
-from simgap.attribution.posterior import Forms, Model, fitted, forms, sought, weights
+from simgap.attribution.noise import channel_of, noise_of, small_gap, stated
+from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.attribution.problem import Gap
+from simgap.attribution.search import sought, weights
 from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import LEAST, POSITIVE, alike, known, named_part
 
 ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
 LISTED = 1e-4  # chosen: probability below which a set is one of the others
-STATED = (0.6, 1.7)  # chosen: bounds of a channel's noise over the stated one, in standard deviations
-
-
-@dataclass(frozen=True)
-class ParameterPosterior:
-    """Mean, standard deviation and 90 % interval, given that the effect acts."""
-
-    mean: float
-    sd: float
-    interval_90: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class EffectPosterior:
-    """One effect: `probability` to act, `share` of the gap it explains with its 90 % interval (0 where it
-    does not act), parameters, whether they are the same in all trials, and which of the gap's candidates (an
-    effect may have several forms) they are of."""
-
-    probability: float
-    share: float
-    share_90: tuple[float, float]
-    parameters: dict[str, ParameterPosterior]
-    invariance: Invariance | None
-    candidate: int
-
-
-@dataclass(frozen=True)
-class Remainder:
-    """What no named cause explains: its `share` of the gap, the chance of noise to look so, and where."""
-
-    share: float
-    p_value: float
-    where: tuple[Cell, ...]
-
-
-@dataclass(frozen=True)
-class SmallGap:
-    """A gap below the smallest that matters: `size` over that, of the `channel` and `part` with the most;
-    `amount` and what is `tolerated` there in sds of the noise, for the caller to turn into units."""
-
-    size: float
-    channel: str
-    part: str
-    amount: float = float("nan")
-    tolerated: float = float("nan")
-
-
-@dataclass(frozen=True)
-class Attribution:
-    """Everything found; see the fields' own classes. `left` (n,): residual that the causes leave, `before`
-    (n,): with nuisances alone, both as cosines of each cell; `nuisances` (K,) and their covariance."""
-
-    verdict: str
-    causes: tuple[str, ...]
-    indistinguishable: tuple[str, ...]
-    probabilities: dict[str, float]
-    effects: dict[str, EffectPosterior]
-    detection: Detection
-    remainder: Remainder
-    where: tuple[Cell, ...]
-    how_far: HowFar | None
-    small_gap: SmallGap | None
-    noise: dict[str, float]
-    models: tuple[Model, ...]
-    shares: Shares
-    before: np.ndarray
-    left: np.ndarray
 
 
 def attribute(
@@ -116,7 +52,7 @@ def attribute(
     found = detected(value, twins(value) if callable(twins) else twins)
     w = weights(models)
     noise = noise_of(f, models[0])
-    by_group = (noise**2)[_channel_of(f)]
+    by_group = (noise**2)[channel_of(f)]
     # A set's probability to be the cause, decoys being what no name explains.
     parts = {m.effects: named_part(f, m) for m in models}
     likely: dict[tuple[int, ...], float] = {}
@@ -127,7 +63,9 @@ def attribute(
     probability = _probabilities(f, likely, judged, found.p_value)
     causes_of = _leading(f, ranked, judged, likely) or _judged(f, (), by_group, rng)
     gone = bool(found.p_value >= ALARM) and not forced
-    small = None if tolerance is None or gone else _small(f, models[0], np.minimum(by_group, 1.0), tolerance)
+    small = (
+        None if tolerance is None or gone else small_gap(f, models[0], np.minimum(by_group, 1.0), tolerance)
+    )
     if small is not None and absorbed is not None:
         moved = np.abs(models[0].x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
         small = None if (moved > absorbed).any() else small
@@ -155,7 +93,8 @@ def attribute(
         _effects(f, models, w, judged, rng, by_group), found,
         Remainder(explained.remainder, p_rest, rest),
         significant(gap.rows, f.spectrum.band, before, sd) if verdict != "none" or small is not None else (),
-        far, small, dict(zip(gap.rows.channels, noise.tolist(), strict=True)), tuple(models), explained,
+        far, small, dict(zip(gap.rows.channels, (noise * stated(gap.rows)).tolist(), strict=True)),
+        tuple(models), explained,
         before, left,
     )  # fmt: skip
 
@@ -271,46 +210,3 @@ def _effects(
 def _wander(same: Invariance | None) -> float:
     """By which share an effect's parameters wander from part to part, 0 where nothing tells."""
     return 0.0 if same is None or np.isnan(same.wander) else same.wander
-
-
-def _channel_of(f: Forms) -> np.ndarray:
-    """The channel (G,) of each group."""
-    out = np.zeros(f.count.size, int)
-    out[f.spectrum.group] = f.gap.rows.channel
-    return out
-
-
-def noise_of(f: Forms, model: Model) -> np.ndarray:
-    """Noise (channels,) over the stated one, sd: the median of the groups that a set leaves, by their counts.
-
-    Groups where the model is off by itself are few: a median does not see them.
-    """
-    channel, ratio = _channel_of(f), model.energy / np.maximum(f.count, 1)
-    out = np.ones(len(f.gap.rows.channels))
-    for c in np.unique(channel):
-        mine = np.flatnonzero((channel == c) & (f.count >= 8))
-        if mine.size >= 3:
-            order = mine[np.argsort(ratio[mine])]
-            share = np.cumsum(f.count[order]) / f.count[order].sum()
-            out[c] = np.sqrt(ratio[order[np.searchsorted(share, 0.5)]])
-    return np.clip(out, *STATED)
-
-
-def _small(f: Forms, model: Model, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap | None:
-    """The gap's size where it exceeds what matters least of all, None where it matters."""
-    before = residual_left(f, fitted(f, ()))
-    rows = f.gap.rows
-    key, inverse = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
-    count = np.bincount(inverse).astype(float)
-    noise = by_group[f.spectrum.group]
-    excess = np.maximum(np.bincount(inverse, before**2) - np.bincount(inverse, noise), 0.0) / count
-    spread = np.sqrt(2 / count) * np.bincount(inverse, noise) / count
-    amount = np.sqrt(np.maximum(excess - 2 * spread, 0.0))
-    least = np.bincount(inverse, tolerance) / count
-    size = amount / least
-    most = int(size.argmax())
-    if size[most] >= 1.0:
-        return None
-    channel, part = divmod(int(key[most]), len(rows.parts))
-    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]),
-                    float(least[most]))  # fmt: skip

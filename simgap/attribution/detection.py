@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from simgap.attribution.background import Background
-from simgap.attribution.posterior import Forms, Model, fitted, sought
+from simgap.attribution.posterior import Forms, Model, fitted
+from simgap.attribution.search import sought
 
 # chosen: shares of groups off beside the usual one: a gap may be in one place alone
 RARE = (0.002, 0.01, 0.03)

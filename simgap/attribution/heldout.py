@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from simgap.attribution.posterior import Forms, fitted, forms, sought, squares_left
+from simgap.attribution.posterior import Forms, fitted, forms, squares_left
 from simgap.attribution.problem import Gap
+from simgap.attribution.search import sought
 
 
 @dataclass(frozen=True)

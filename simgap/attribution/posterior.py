@@ -2,8 +2,7 @@
 
 Every set's evidence is Laplace's approximation about its mode, found by iteratively reweighted least
 squares: groups of rows count by their expected precision under the background (`background`), parameters by
-that of their Cauchy prior. Sets are found by adding, removing and exchanging effects as long as that leads
-to sets within a window of the best (Occam's window: Madigan & Raftery, JASA 89, 1994).
+that of their Cauchy prior. `search` finds the sets.
 """
 
 from __future__ import annotations
@@ -16,14 +15,10 @@ from scipy.special import gammaln
 
 from simgap.attribution.background import Background
 from simgap.attribution.problem import Candidate, Gap, Spectrum, spectrum
+from simgap.bounded import least
 
 STEPS = 30  # numerics: of an iteration, at most
 CLOSE = 0.02  # numerics: nats
-# numerics: steps by which neighbours of a set are screened, how many of them are fitted
-SCREEN, REFINED = 3, 5
-WINDOW = 12.0  # chosen: nats behind the best set within which a set is kept
-BEAM = 5  # numerics: sets of each size that are extended
-MOST = 6  # chosen: effects of a set at most
 FREED = 0.9  # chosen: chance of a group to be off where an effect that acts gives it a variance of its own
 
 
@@ -111,19 +106,19 @@ def forms(gap: Gap, background: Background | None = None) -> Forms:
 def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
     """The set's mode and evidence, the better one of two starts: all groups count alike, and as they would
     with every effect as it was linearised."""
-    taken = _taken(f, effects)
-    found = [_mode(f, taken, np.ones(f.count.size))]
+    taken = quadratic_forms(f, effects)
+    found = [mode(f, taken, np.ones(f.count.size))]
     if effects:
         x = np.zeros(taken.low.size)
         for j, mine in taken.blocks:
             c = f.gap.candidates[j]
             x[mine] = (c.at - c.neutral) / c.scale
-        found.append(_mode(f, taken, f.marginal(effects, taken.energy(x))[1], x))
+        found.append(mode(f, taken, f.marginal(effects, taken.energy(x))[1], x))
     return max(found, key=lambda m: m.score)
 
 
 @dataclass(frozen=True)
-class _Taken:
+class QuadraticForms:
     """The quadratic forms of one set: square (G,), pull (G, n), bend (G, n, n) of its coordinates x (n,)."""
 
     effects: tuple[int, ...]
@@ -140,7 +135,8 @@ class _Taken:
         return np.maximum(self.square - 2 * self.pull @ x + (self.bend @ x) @ x, 0.0)
 
 
-def _taken(f: Forms, effects: tuple[int, ...]) -> _Taken:
+def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
+    """The quadratic forms of one set of effects."""
     z, own = f.spectrum.num_nuisances, f.spectrum.own
     free = np.concatenate([np.arange(1, 1 + z), *(own[j][1:] for j in effects)]).astype(int)
     constant = np.array([0, *(own[j][0] for j in effects)])
@@ -148,13 +144,13 @@ def _taken(f: Forms, effects: tuple[int, ...]) -> _Taken:
     square = np.einsum("i,gij,j->g", sign, f.product[:, constant[:, None], constant], sign)
     pull = np.einsum("i,gij->gj", sign, f.product[:, constant[:, None], free])
     bend = f.product[:, free[:, None], free]
-    return _Taken(
+    return QuadraticForms(
         effects, square, pull, bend, *_limits(f, effects, z), _blocks(f, effects, z), f.shift(effects)
     )
 
 
-def _mode(
-    f: Forms, taken: _Taken, precision: np.ndarray, x: np.ndarray | None = None, steps: int = STEPS
+def mode(
+    f: Forms, taken: QuadraticForms, precision: np.ndarray, x: np.ndarray | None = None, steps: int = STEPS
 ) -> Model:
     """Iteratively reweighted least squares from given precisions of the groups."""
     z, size = f.spectrum.num_nuisances, taken.low.size
@@ -165,7 +161,7 @@ def _mode(
         for _, mine in taken.blocks:
             prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
         matrix = np.tensordot(precision, taken.bend, 1) + np.diag(prior)
-        x, held = _bounded(matrix, precision @ taken.pull, x, taken.low, taken.high)
+        x, held = least(matrix, precision @ taken.pull, taken.low, taken.high)
         energy = taken.energy(x)
         density, precision = f.marginal(taken.effects, energy)
         last, value = value, float(density.sum()) + _log_prior(x, z, taken.blocks)
@@ -181,23 +177,6 @@ def _mode(
     volume -= 0.5 * float(np.linalg.slogdet(matrix[np.ix_(loose, loose)])[1])
     known = sum(f.gap.candidates[j].evidence for j in taken.effects) + len(taken.effects) * f.log_odds
     return Model(taken.effects, value + volume + known, x, covariance, energy, precision, held)
-
-
-def _bounded(
-    matrix: np.ndarray, pull: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The least of x' matrix x / 2 - pull x inside bounds, by an active set, and which are held."""
-    out, held = np.linalg.solve(matrix, pull), np.zeros(x.size, bool)
-    for _ in range(x.size):
-        past = ~held & ((out < low) | (out > high))
-        if not past.any():
-            break
-        held |= past
-        out[held] = np.clip(out[held], low[held], high[held])
-        free = ~held
-        rest = pull[free] - matrix[np.ix_(free, held)] @ out[held]
-        out[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
-    return out, held
 
 
 def _blocks(f: Forms, effects: tuple[int, ...], z: int) -> list[tuple[int, np.ndarray]]:
@@ -229,57 +208,6 @@ def _log_prior(x: np.ndarray, z: int, blocks: list[tuple[int, np.ndarray]]) -> f
     return float(out)
 
 
-def sought(f: Forms, beam: int = BEAM) -> list[Model]:
-    """All sets found within the window of the best, best first; the empty set is always one.
-
-    Neighbours of a set are screened from its mode in a few steps; those that lead are fitted to the end.
-    `beam`: how many sets of the window are extended.
-    """
-    empty = fitted(f, ())
-    seen: dict[tuple[int, ...], Model] = {
-        (): empty,
-        **{(j,): fitted(f, (j,)) for j in range(len(f.gap.candidates))},
-    }
-    rough: set[tuple[int, ...]] = set()
-    opened: set[tuple[int, ...]] = {()}
-    while True:
-        best = max(m.score for m in seen.values())
-        ranked = sorted(seen.values(), key=lambda m: -m.score)
-        leading = [m for m in ranked if m.score > best - WINDOW][:beam]
-        leading += [m for m in ranked if len(m.effects) == 1][: 2 if beam > 1 else 0]
-        todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
-        if not todo:
-            break
-        for m in todo:
-            opened.add(m.effects)
-            new = [e for e in _neighbours(f, m.effects) if e not in seen and e not in rough]
-            first = sorted(new, key=lambda e: -_mode(f, _taken(f, e), m.precision, steps=SCREEN).score)
-            seen |= {e: fitted(f, e) for e in first[:REFINED]}
-            rough |= set(first[REFINED:])
-    best = max(m.score for m in seen.values())
-    kept = [m for m in seen.values() if m.score > best - WINDOW or not m.effects]
-    return sorted(kept, key=lambda m: -m.score)
-
-
-def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """Sets with one effect more, one left out, or one exchanged; of one name's forms only one acts."""
-    names = [c.name for c in f.gap.candidates]
-    fewer = [tuple(j for j in effects if j != out) for out in effects]
-    more = [
-        tuple(sorted({*e, j}))
-        for e in (effects, *fewer)
-        for j, name in enumerate(names)
-        if j not in effects and name not in {names[i] for i in e}
-    ]
-    return list(dict.fromkeys([*more, *fewer]))
-
-
-def weights(models: list[Model]) -> np.ndarray:
-    """Posterior probabilities of the sets, which sum to 1."""
-    score = np.array([m.score for m in models])
-    return np.exp(score - np.logaddexp.reduce(score))
-
-
 def deviations(c: Candidate, x: np.ndarray) -> np.ndarray:
     """Parameters from deviations over scale."""
     return c.neutral + c.scale * x
@@ -290,14 +218,14 @@ def squares_left(
 ) -> np.ndarray:
     """Squares (G,) that a set leaves at x, or at best, groups weighted, its variances taken off; and as one
     more entry those of the nuisances themselves, for what was measured of them is data as well."""
-    taken, z = _taken(f, effects), f.spectrum.num_nuisances
+    taken, z = quadratic_forms(f, effects), f.spectrum.num_nuisances
     weight = weight * np.exp(-taken.shift)
     if x is None:
         prior = np.ones(taken.low.size)
         for _, mine in taken.blocks:
             prior[mine] = 1e-3
         matrix = np.tensordot(weight, taken.bend, 1) + np.diag(prior)
-        x, _ = _bounded(matrix, weight @ taken.pull, np.zeros(prior.size), taken.low, taken.high)
+        x, _ = least(matrix, weight @ taken.pull, taken.low, taken.high)
     squares = weight * taken.energy(x)
     freed = f.freed[list(effects)].any(0)
     return np.append(np.where(freed, np.minimum(squares, f.count), squares), x[:z] @ x[:z])

@@ -20,7 +20,8 @@ class Rows:
     """What each of n residuals is: indices of its trial, channel and part, and its time [s].
 
     A part is a subtask, or any stretch of a trial. Rows of one cell (a channel in a part of a trial) are in
-    the order of time. `bands` [Hz]: lower edges of the frequency bands that are told apart.
+    the order of time. `bands` [Hz]: lower edges of the frequency bands that are told apart. `sd` (n,): the
+    noise's in the cosine coefficients of the cells, one where it is not given.
     """
 
     trial: Int[np.ndarray, " n"]
@@ -31,11 +32,13 @@ class Rows:
     channels: tuple[str, ...]
     parts: tuple[str, ...]
     bands: tuple[float, ...] = (0.0, 1.0, 5.0)
+    sd: np.ndarray | None = None
 
     def taken(self, chosen: np.ndarray) -> Rows:
         """The rows of a mask (n,) or of indices; names stay."""
         return Rows(self.trial[chosen], self.channel[chosen], self.part[chosen], self.time[chosen],
-                    self.trials, self.channels, self.parts, self.bands)  # fmt: skip
+                    self.trials, self.channels, self.parts, self.bands,
+                    None if self.sd is None else self.sd[chosen])  # fmt: skip
 
     @property
     def cell(self) -> Int[np.ndarray, " n"]:
@@ -89,7 +92,8 @@ class Candidate:
 class Gap:
     """Residuals (n,) at the nominal, derivatives by nuisances whose prior is N(0, 1), and candidates.
 
-    `expected`: how many of all candidates act, beforehand.
+    `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
+    trials tell nothing.
     """
 
     rows: Rows
@@ -97,16 +101,17 @@ class Gap:
     nuisance: Float[np.ndarray, "n z"]
     candidates: tuple[Candidate, ...]
     expected: float = 1.0
+    own: tuple[int, ...] = ()
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
         return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
-                   tuple(c.taken(rows) for c in self.candidates), self.expected)  # fmt: skip
+                   tuple(c.taken(rows) for c in self.candidates), self.expected, self.own)  # fmt: skip
 
     def without(self, names: tuple[str, ...]) -> Gap:
         """The gap with some candidates not thought of."""
         kept = tuple(c for c in self.candidates if c.name not in names)
-        return Gap(self.rows, self.residual, self.nuisance, kept, self.expected)
+        return Gap(self.rows, self.residual, self.nuisance, kept, self.expected, self.own)
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,8 @@ def spectrum(gap: Gap) -> Spectrum:
 
 
 def cosines(rows: Rows, columns: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray]]:
-    """Columns (n, M) under an orthonormal cosine transform of every cell, and the coefficients' bands."""
+    """Columns (n, M) under an orthonormal cosine transform of every cell, over the noise's sd there, and the
+    coefficients' bands."""
     out, band = np.empty_like(columns, float), np.zeros(len(columns), int)
     order = np.argsort(rows.cell, kind="stable")
     starts = np.flatnonzero(np.diff(rows.cell[order], prepend=-1))
@@ -149,4 +155,4 @@ def cosines(rows: Rows, columns: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarr
         if mine.size > 1:
             step = float(np.median(np.diff(rows.time[mine])))
             band[mine] = np.searchsorted(edges, np.arange(mine.size) / (2 * mine.size * step), side="right")
-    return out, (band,)
+    return out if rows.sd is None else out / rows.sd[:, None], (band,)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import READOUT, Effect, Parameter, gradient, tips
-from simgap.gap.frame import CHANNELS
+from simgap.gap.trial_arrays import CHANNELS
 
 JITTERS = np.geomspace(5e-4, 0.03, 40)  # chosen: s
 

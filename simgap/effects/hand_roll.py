@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance
-from simgap.gap.frame import CHANNELS
+from simgap.gap.trial_arrays import CHANNELS
 
 SLOW = 2.0  # chosen: Hz; a hand with a block in it turns no faster (an arm's own modes lie above)
 ROLLS = np.geomspace(2e-4, 0.1, 40)  # chosen: rad
@@ -16,7 +16,8 @@ ROLLS = np.geomspace(2e-4, 0.1, 40)  # chosen: rad
 def _scatter(given, residual: np.ndarray):
     """Roll shows in the fingers' height difference alone: its width times the angle, slowly.
 
-    Its power lies in the first cosines of every carry, evenly up to SLOW.
+    Its power lies in the first cosines of every carry, evenly up to SLOW. A hand rolls in every carry alike:
+    what turns in some of them only is no roll of the hand.
     """
     from scipy.fft import dct
 
@@ -40,7 +41,7 @@ def _scatter(given, residual: np.ndarray):
         square[at] = np.asarray(dct(residual[at], norm="ortho")) ** 2
     if not (unit > 0).any():
         return None
-    found = on_grid("hand_roll", square, unit, ROLLS)
+    found = on_grid("hand_roll", square, unit, ROLLS, rows.cell)
     # How much of it there is in which carry and how fast nobody knows: what lies there has its own variance.
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=lever > 0)
 

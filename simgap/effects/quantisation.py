@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from simgap.effects.base import READOUT, Effect, Parameter
-from simgap.gap.frame import CHANNELS
+from simgap.gap.trial_arrays import CHANNELS
 
 REPEATED = 0.5  # chosen: share of repeated values that only a lattice has
 WRITTEN = 1e-5  # chosen: N; how finely forces are written that were not rounded before

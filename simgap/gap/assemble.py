@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from simgap.attribution.problem import Candidate, Gap, Rows
-from simgap.effects import catalogue, decoys, fitted, free_parameters, name_of
-from simgap.effects.base import Parameter, gradient, tips
-from simgap.gap.fit import Fitted, Problem, columns_of, derivatives, limits, neutral, residual_at, slots
-from simgap.gap.frame import CHANNELS, subtask_name
+from simgap.effects import catalogue, decoys, fitted, name_of
+from simgap.gap.evaluation import residual_at
+from simgap.gap.fit import Fitted
+from simgap.gap.frame import subtask_name
+from simgap.gap.noise_model import coefficient_sd
+from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.spread import Spread
+from simgap.gap.trial_arrays import CHANNELS
 
 BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of those that are told apart
 
@@ -34,11 +35,13 @@ def gap_of(given: Problem, healthy: Fitted, fits: Sequence[Fitted], spreads: Seq
     measured apart."""
     k = given.num_properties
     start = healthy.residual - healthy.push @ healthy.u[:k]
-    nuisance = np.concatenate([-healthy.push, *_admitted(given, healthy), *_late_rates(given)], 1)
+    nuisance = np.concatenate([-healthy.push, given.nuisances.columns], 1)
+    rows = rows_of(given)
+    rows = replace(rows, sd=coefficient_sd(given, rows, given.nuisances.left(healthy.residual)))
     candidates = [_shifting(given, f, start, healthy.push) for f in fits]
-    candidates += [_spreading(s) for s in spreads]
+    candidates += [_spreading(s, rows) for s in spreads]
     candidates += _measured(given, healthy.push)
-    return Gap(rows_of(given), start, nuisance, tuple(candidates))
+    return Gap(rows, start, nuisance, tuple(candidates))
 
 
 def together(given: Problem, gap: Gap, healthy: Fitted, joint: Fitted, left: Sequence[Spread] = ()) -> Gap:
@@ -48,7 +51,7 @@ def together(given: Problem, gap: Gap, healthy: Fitted, joint: Fitted, left: Seq
     What scatters is as large as it is in what they leave (`left`).
     """
     k = given.num_properties
-    again = {s.effect: _spreading(s) for s in left}
+    again = {s.effect: _spreading(s, gap.rows) for s in left}
     gap = replace(gap, candidates=tuple(again.get(c.name, c) for c in gap.candidates))
     if len(joint.effects) < 2:
         return gap
@@ -64,16 +67,11 @@ def together(given: Problem, gap: Gap, healthy: Fitted, joint: Fitted, left: Seq
     both = (start - sum(alone)) / len(alone)
     more, at = [], k
     for key, shift in zip(joint.effects, alone, strict=True):
-        free = _free(key)
+        free = free_of(key)
         more.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
                                joint.push[:, at : at + len(free)], joint.doubts / len(alone)))  # fmt: skip
         at += len(free)
     return Gap(gap.rows, gap.residual, gap.nuisance, (*gap.candidates, *more), gap.expected)
-
-
-def _free(key: str) -> list[Parameter]:
-    """The free parameters of a form, in the order of its columns."""
-    return [p for p in fitted()[name_of(key)].parameters if p.name in free_parameters(key)]
 
 
 def _shifting(given: Problem, f: Fitted, start: np.ndarray, push: np.ndarray) -> Candidate:
@@ -93,7 +91,7 @@ def _candidate(
     doubts: float,
 ) -> Candidate:
     """One form of an effect at coordinates u, of which it has the columns `own`."""
-    free, effect = _free(key), fitted()[name_of(key)]
+    free, effect = free_of(key), fitted()[name_of(key)]
     low, high = (edge[own] for edge in limits(given))
     return Candidate(
         effect.name, tuple(p.name for p in free), u[own], neutral(given)[own], np.ones(own.size), shift,
@@ -104,10 +102,12 @@ def _candidate(
     )  # fmt: skip
 
 
-def _spreading(s: Spread) -> Candidate:
+def _spreading(s: Spread, rows: Rows) -> Candidate:
+    """What scatters as a candidate; its variance over that of the noise as it is in these rows."""
     nothing, count = np.zeros(0), s.variance.size
+    variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))
     return Candidate(s.effect, (), nothing, nothing, nothing, np.zeros(count), np.zeros((count, 0)), nothing,
-                     nothing, s.variance, s.known, s.same, frees=s.frees)  # fmt: skip
+                     nothing, variance, s.known, s.same, frees=s.frees)  # fmt: skip
 
 
 def _measured(given: Problem, push: np.ndarray) -> list[Candidate]:
@@ -122,49 +122,4 @@ def _measured(given: Problem, push: np.ndarray) -> list[Candidate]:
                 out.append(Candidate("actual", (f"{name}.{kind}",), nothing, nothing, usual,
                                      np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
                                      np.full(1, np.inf)))  # fmt: skip
-    return out
-
-
-def _late_rates(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of speeds that are differences of positions, late by half a sample, or smoothed.
-
-    How a drive comes by its speeds rig.toml does not say: differences are as usual as a tachometer.
-    """
-    world, weight = given.frame.world, given.whitening.weight
-    tree = jax.tree.map(jnp.asarray, world)
-    step = float(np.median(np.diff(world.t[0])))
-    velocity = np.asarray(tips(tree)[1])
-    mean = (velocity[..., :2] + velocity[..., 2:]) / 2
-    rate = np.asarray(gradient(tree.t, jnp.asarray(mean)))
-    bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
-    position = np.asarray(tips(tree)[0])
-    place = (position[..., :2] + position[..., 2:]) / 2
-    # What a drive that takes differences of its own readings from sample to sample would say.
-    before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
-    own = np.asarray(tips(tree._replace(rates=jnp.asarray((world.joints - before) / step)))[1])
-    own = (own[..., :2] + own[..., 2:]) / 2
-    own[:, 1:-1] = (own[:, :-2] + 4 * own[:, 1:-1] + own[:, 2:]) / 6
-    own = own - np.asarray(gradient(tree.t, jnp.asarray(place)))
-    out = []
-    for change, usual in ((own, 1.0), (rate, step / 2), (bend, step**2 / 2)):
-        column = np.zeros_like(weight)
-        for k, channel in enumerate(("vx", "vy")):
-            c = CHANNELS.index(channel)
-            column[..., c] = usual * change[..., k] * weight[..., c]
-        out.append(column[weight > 0][:, None])
-    return out
-
-
-def _admitted(given: Problem, healthy: Fitted) -> list[np.ndarray]:
-    """Columns (n, .) of what rig.toml admits under [systematic], each per its standard deviation."""
-    out, k = [], given.num_properties
-    for slot in slots(k)[0]:
-        if slot.effect.admitted is None:
-            continue
-        key, sds = slot.effect.admitted(given.frame.rig)
-        if any(sds.values()):
-            push = derivatives(given, (key,), healthy.u)[:, k:]
-            for j, p in enumerate(_free(key)):
-                if sds.get(p.name, 0.0) > 0:
-                    out.append(-push[:, [j]] * sds[p.name] / p.sd)
     return out

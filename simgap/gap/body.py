@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from simgap.attribution.attribute import Attribution, EffectPosterior
+from simgap.attribution.findings import Attribution, EffectPosterior
 from simgap.effects import catalogue
 from simgap.effects.base import Effect
 from simgap.gap.fit import Fitted
-from simgap.gap.frame import CHANNELS
 from simgap.gap.located import where
 from simgap.gap.search import Search
+from simgap.gap.trial_arrays import CHANNELS
 
 PROPERTIES = ("weight", "width", "height")
 UNITS = {"weight": "N", "width": "m", "height": "m"}

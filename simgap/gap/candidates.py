@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.io.rig import Rig
+from simgap.bounded import least
 from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
-from simgap.gap.fit import STEPS, Fitted, Problem, Start, fit, limits, slots
+from simgap.gap.fit import STEPS, Fitted, Start, fit
+from simgap.gap.problem import Problem, limits, slots
 
 SCREEN = 2  # chosen: steps before the best start of a form is chosen
 LEADERS = 3  # chosen: starts screened
@@ -73,9 +75,15 @@ def _ranked(given: Problem, start: Start) -> tuple[float, Start, Fitted]:
     one = fit(given, start, 0)
     free = ~np.isin(one.columns, fixed)
     columns, push = one.columns[free], one.push[:, free]
-    step = -np.linalg.solve(push.T @ push + np.eye(columns.size), push.T @ one.residual + one.u[columns])
     u = one.u.copy()
+    bend = given.product(push, push) + np.eye(columns.size)
+    pull = -given.product(push, one.residual) - u[columns]
+    step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
     u[columns] = np.clip(u[columns] + step, low[columns], high[columns])
     left = one.residual + push @ (u[columns] - one.u[columns])
     own = u[: given.num_properties]
-    return 0.5 * float(left @ left) + one.doubts + 0.5 * float(own @ own), Start(one.effects, u), one
+    return (
+        0.5 * float(given.product(left, left)) + one.doubts + 0.5 * float(own @ own),
+        Start(one.effects, u),
+        one,
+    )

@@ -15,20 +15,26 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
+from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import as_html, as_text
-from simgap.attribution.attribute import ALARM, Attribution, attribute
-from simgap.attribution.posterior import Model, forms, sought
+from simgap.attribution.attribute import ALARM, attribute
+from simgap.attribution.findings import Attribution
+from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
+from simgap.attribution.search import sought
 from simgap.effects import free_parameters, name_of
 from simgap.gap.assemble import together
 from simgap.gap.body import body, parameters
+from simgap.gap.evaluation import residual_at
 from simgap.gap.experiments import next_experiment
-from simgap.gap.fit import Fitted, Problem, Start, fit, residual_at
+from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.located import Tally, tallies
+from simgap.gap.problem import Problem
 from simgap.gap.search import Search, search
 from simgap.gap.spread import spreads
 from simgap.gap.tolerance import properties_tolerated, tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
+from simgap.gap.wrist_gap import check_forced, of_wrist
 from simgap.report.finding import sentence
 from simgap.report.tables import tables
 
@@ -97,16 +103,19 @@ def diagnose(
     twins: bool = True,
     healthy: Sequence[Trial] = (),
     excluded: Sequence[str] = (),
+    aligned: AlignedTrials | None = None,
 ) -> Diagnosis:
     """Diagnose recordings of one block task against the nominal model.
 
     `actual` as `estimation.actual.read_actual` gives it; `forced` names effects to be taken instead of
     choosing; `excluded` effects are not thought of. The null are `healthy` recordings of the same task and
-    rig if there are any, else simulated `twins`, else the model itself. InputError where no trial fits its
-    task.
+    rig if there are any, else simulated `twins`, else the model itself. `aligned`: what `align` made of the
+    same trials, where that is known already. InputError where no trial fits its task.
     """
     tell = progress or (lambda text: None)
-    found = search(trials, task, rig, actual, excluded, tell)
+    if of_wrist(trials):
+        check_forced(forced)
+    found = search(trials, task, rig, actual, excluded, tell, aligned)
     tell("attributing the gap")
 
     def null(value: float) -> Iterable[float]:
@@ -153,7 +162,9 @@ def attributed(
     leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
-        left = spreads(found.problem, joint.residual, [s.effect for s in found.spreads])
+        left = spreads(
+            found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.spreads]
+        )
         gap, models = together(found.problem, gap, found.healthy, joint, left), None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, twins, tolerance, forced, seed, models=models, absorbed=absorbed)

@@ -17,8 +17,9 @@ from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.effects import catalogue, forms_of, name_of
 from simgap.gap.candidates import best_fit
-from simgap.gap.fit import Start, fit, neutral, problem
+from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
+from simgap.gap.problem import neutral, problem
 from simgap.gap.search import Search
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.twins import blocks_of

@@ -13,8 +13,11 @@ import numpy as np
 from simgap.attribution.cells import Cell
 from simgap.effects import fitted, name_of
 from simgap.effects.base import World, tips
-from simgap.gap.fit import Fitted, Problem, raw_residual_at, world_without
-from simgap.gap.frame import CHANNELS, subtask_name
+from simgap.gap.evaluation import raw_residual_at, world_without
+from simgap.gap.fit import Fitted
+from simgap.gap.frame import subtask_name
+from simgap.gap.problem import Problem
+from simgap.gap.trial_arrays import CHANNELS
 
 # cited: sds of a sample: mean shift of a cell that counts as shifted (the interface's definition)
 SHIFTED = 3.0

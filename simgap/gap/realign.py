@@ -12,8 +12,10 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects.base import tips
-from simgap.gap.fit import Fitted, Problem, world_without
-from simgap.gap.frame import thinned
+from simgap.gap.evaluation import world_without
+from simgap.gap.fit import Fitted
+from simgap.gap.problem import Problem
+from simgap.gap.trial_arrays import thinned
 
 
 def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, insist: bool = False) -> AlignedTrials:

@@ -16,10 +16,13 @@ from simgap.attribution.problem import Gap
 from simgap.effects import decoys, name_of
 from simgap.gap.assemble import gap_of
 from simgap.gap.candidates import best_fit, candidate_names, shifting
-from simgap.gap.fit import Fitted, Problem, Start, fit, neutral, problem
+from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.frame import build
+from simgap.gap.nuisances import with_nuisances
+from simgap.gap.problem import Problem, neutral, problem
 from simgap.gap.realign import moved, realigned
 from simgap.gap.spread import Spread, spreads
+from simgap.gap.wrist_gap import SHOWN, not_compared, of_wrist, shown_forms
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
 ROUNDS = 2  # numerics: times at most
@@ -51,18 +54,27 @@ def search(
     actual: dict | None = None,
     excluded: Sequence[str] = (),
     tell: Progress = lambda text: None,
+    aligned: AlignedTrials | None = None,
 ) -> Search:
-    """Fit the catalogue to recordings of one block task; InputError where no trial fits its task."""
-    tell("aligning trials")
-    aligned, misled = align(trials, task, rig), []
+    """Fit the catalogue to recordings of one block task; InputError where no trial fits its task.
+
+    `aligned`: what `align` made of the same trials, where that is known already.
+    """
+    misled: list[str] = []
+    if aligned is None:
+        tell("aligning trials")
+        aligned = align(trials, task, rig)
     names = candidate_names(rig, excluded)
     keys = shifting(names)
+    if of_wrist(trials):
+        keys = [key for key in shown_forms(names) if key in keys]
+        names = [name for name in names if name in SHOWN]
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
         aligned, misled = _insisted(trials, aligned, rig, actual, keys)
     trials, aligned, warnings = _complete(trials, aligned)
     tell("fitting single effects")
-    given = problem(build(trials, aligned, rig), actual)
+    given = with_nuisances(problem(build(trials, aligned, rig), actual))
     healthy = fit(given, Start((), neutral(given)))
     fits = [best_fit(given, key, healthy) for key in keys]
     for _ in range(ROUNDS):
@@ -71,8 +83,10 @@ def search(
             break
         tell("aligning again without the best explanation")
         aligned, given, healthy, fits = again
-    spread = spreads(given, healthy.residual, names)
+    spread = spreads(given, given.nuisances.left(healthy.residual), names)
     gap = gap_of(given, healthy, fits, spread)
+    if of_wrist(trials):
+        warnings = [not_compared(trials), *warnings]
     return Search(tuple(trials), aligned, given, healthy, tuple(fits), tuple(spread), gap,
                   (*misled, *warnings))  # fmt: skip
 
@@ -88,7 +102,7 @@ def _anew(trials, aligned, given: Problem, healthy: Fitted, fits: Sequence[Fitte
     again = realigned(trials, given, best)
     if not SHIFT < moved(aligned, again) < np.inf:
         return None
-    other = problem(build(trials, again, given.frame.rig), actual)
+    other = with_nuisances(problem(build(trials, again, given.frame.rig), actual))
     if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
         return None
     plain = fit(other, Start((), healthy.u))

@@ -9,7 +9,7 @@ import numpy as np
 
 from simgap.attribution.verdict import POSITIVE
 from simgap.effects import fitted
-from simgap.gap.fit import Problem
+from simgap.gap.problem import Problem
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from simgap.gap.fit import Problem
-from simgap.gap.frame import CHANNELS
+from simgap.gap.problem import Problem
+from simgap.gap.trial_arrays import CHANNELS
 
 SAMPLES = 0.5  # chosen: sds of one sample: a shift below that is not seen in any single one
 PROPERTY = 0.01  # chosen: the same, of a property

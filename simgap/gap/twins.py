@@ -24,9 +24,11 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import cache_folder
 from simgap.attribution.detection import statistic
-from simgap.attribution.posterior import forms, sought
+from simgap.attribution.posterior import forms
+from simgap.attribution.search import sought
 from simgap.gap.search import Search, search
 from simgap.gap.synthetic import performed, recorded
+from simgap.gap.wrist_gap import as_from_wrist, of_wrist
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 
@@ -93,6 +95,8 @@ def _recorded(found: Search, task: BlockTask, rig: Rig, which: range, seed: int)
     task = found.problem.frame.task if task.repeat == "unknown" else task
     simulated = performed(task, hand, [blocks] * len(seeds), seeds, {}, settings(found))
     every = [recorded(s, task, hand, {}) for s in simulated]
+    if of_wrist(found.trials):
+        every = [as_from_wrist(twin, found.trials[0]) for twin in every]
     return [every[k : k + trials] for k in range(0, len(every), trials)]
 
 

@@ -27,7 +27,8 @@ class RobotEffect:
     `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
     `alter` gives several channels or such as depend on others, `restore` undoes it on a whole log. `command`
     maps a whole recording to one whose commands are as the drives took them. `model` maps short names to the
-    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself.
+    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself; `by_log`:
+    each log has its own parameters, which no other log tells.
     """
 
     name: str
@@ -41,6 +42,7 @@ class RobotEffect:
     command: Command | None = None
     model: Mapping[str, str] = field(default_factory=dict)
     fitted: bool = False
+    by_log: bool = False
 
     @property
     def undoes(self) -> bool:
@@ -72,6 +74,20 @@ class Setting:
     def commands(self) -> list[str]:
         """Channels that are commanded."""
         return self.compared("command")
+
+    def poses(self) -> Mapping[str, Mapping[str, str]]:
+        """Bodies whose whole pose is read: x, y, z, qw, qx, qy, qz to its column."""
+        return getattr(self.simulator, "poses", {})
+
+    def alone(self) -> list[str]:
+        """Compared channels that are read by themselves; a quaternion's components are not."""
+        turns = {c for columns in self.poses().values() for axis, c in columns.items() if axis[0] == "q"}
+        return [n for n in self.compared() if n not in turns]
+
+    def late_alone(self) -> list[str]:
+        """Those that can be late by themselves: no component of a pose can."""
+        posed = {c for columns in self.poses().values() for c in columns.values()}
+        return [n for n in self.compared() if n not in posed]
 
     def spread(self, channel: str) -> float:
         """Standard deviation of a channel over all recordings [its unit]; 1 where it is constant."""

@@ -9,7 +9,7 @@ from simgap.simulators.protocol import Parameter
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each channel; its usual size is 3 % of the channel's spread."""
     out = []
-    for name in setting.compared():
+    for name in setting.alone():
         bias = Parameter(0.0, 0.03 * setting.spread(name), setting.simulator.channels[name].unit)
         out.append(
             RobotEffect(

@@ -10,7 +10,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each channel; over the longest log it usually drifts by 3 % of the channel's spread."""
     longest = max(float(r.t[-1] - r.t[0]) for r in setting.recordings)
     out = []
-    for name in setting.compared():
+    for name in setting.alone():
         unit = setting.simulator.channels[name].unit
         rate = Parameter(0.0, 0.03 * setting.spread(name) / longest, f"{unit}/s")
         out.append(

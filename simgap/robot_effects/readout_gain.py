@@ -15,5 +15,5 @@ def candidates(setting: Setting) -> list[RobotEffect]:
             read=lambda since, values, theta: (1 + theta["gain"]) * values,
             undo=lambda since, values, theta: values / (1 + theta["gain"]),
         )
-        for name in setting.compared()
+        for name in setting.alone()
     ]  # fmt: skip

@@ -17,5 +17,5 @@ def candidates(setting: Setting) -> list[RobotEffect]:
             read=lambda since, values, theta: delayed(since, values, theta["delay"]),
             undo=lambda since, values, theta: np.interp(since + theta["delay"], since, values),
         )
-        for name in setting.compared()
+        for name in setting.late_alone()
     ]  # fmt: skip

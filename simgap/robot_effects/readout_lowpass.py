@@ -39,5 +39,5 @@ def candidates(setting: Setting) -> list[RobotEffect]:
             read=lambda since, values, theta: lowpass(since, values, theta["time_constant"]),
             undo=lambda since, values, theta: values + theta["time_constant"] * np.gradient(values, since),
         )
-        for name in setting.compared()
+        for name in setting.late_alone()
     ]  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t as student
 
-from simgap.attribution.posterior import Forms, _taken, fitted, forms
+from simgap.attribution.posterior import Forms, fitted, forms, quadratic_forms
 from simgap.attribution.problem import Gap
 from simgap.robots.linear import Linear
 
@@ -42,8 +42,15 @@ def held_out_scores(gap: Gap, sets: Sequence[tuple[int, ...]], fold: np.ndarray)
 
 
 def _log_likelihood(f: Forms, effects: tuple[int, ...], x: np.ndarray) -> float:
-    """Of rows at parameters x, the background averaged over."""
-    taken = _taken(f, effects)
+    """Of rows at parameters x, the background averaged over; what each log has of its own is fitted to them,
+    as no other log tells it."""
+    taken = quadratic_forms(f, effects)
+    own = list(f.gap.own)
+    if own:
+        x, count = x.copy(), 1.0 + np.maximum(taken.energy(x) / f.count - 1.0, 0.0)
+        bend, pull = np.tensordot(1 / count, taken.bend, 1), (1 / count) @ taken.pull
+        x[own] = 0.0
+        x[own] = np.linalg.solve(bend[np.ix_(own, own)] + np.eye(len(own)), (pull - bend @ x)[own])
     return float(f.background.marginal(taken.energy(x), f.count, taken.shift)[0].sum())
 
 

@@ -17,6 +17,7 @@ from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.robots.borne_out import borne_out, folds_of
+from simgap.robots.discrepancy import learned
 from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
@@ -25,10 +26,10 @@ from simgap.robots.judge import Verdict, judge
 from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
-from simgap.robots.phases import Phases, phases_by_motion
+from simgap.robots.phases import Phases, phases_of
 from simgap.robots.search import Found, moved_to, point_of, search
 from simgap.robots.twins import healthy_twins
-from simgap.robots.whiten import NONE, covariances, learned
+from simgap.robots.whiten import NONE, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -81,7 +82,7 @@ def diagnose(
     composed = Composed.of(
         simulator, recordings, effects, noise, **({} if length is None else {"length": length})
     )
-    parts = phases_by_motion(simulator, recordings) if phases is None else phases
+    parts = phases_of(simulator, recordings) if phases is None else phases
     warnings: list[str] = []
 
     def said(text: str) -> None:

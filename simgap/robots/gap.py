@@ -27,12 +27,13 @@ def gap_of(
     """The gap about the linear model's point, at which it is exact; `candidates` in this order."""
     finite = np.isfinite(linear.residual)
     residual = whiten(np.where(finite, linear.residual, 0.0))
-    along = []
+    along, own = [], []
     for name in fitted_along(composed):
         moved, effect = linear.moved[name], composed.effects[name]
         sd = np.array([p.sd for p in effect.parameters.values()])
         neutral = np.array([p.nominal for p in effect.parameters.values()])
         columns = whiten(_finite(moved.jacobian)) * sd
+        own += [effect.by_log] * sd.size
         along.append(columns)
         residual = residual + columns @ ((moved.at - neutral) / sd)
     made = []
@@ -67,7 +68,7 @@ def gap_of(
         BANDS,
     )
     nuisance = np.concatenate([*along, np.zeros((rows.log.size, 0))], 1)
-    whole = Gap(told, residual, nuisance, tuple(made))
+    whole = Gap(told, residual, nuisance, tuple(made), own=tuple(int(k) for k in np.flatnonzero(own)))
     return whole if finite.all() else whole.taken(np.flatnonzero(finite))
 
 

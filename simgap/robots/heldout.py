@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from simgap.attribution.posterior import forms, sought
+from simgap.attribution.posterior import forms
+from simgap.attribution.search import sought
 from simgap.robots.borne_out import borne_out
 from simgap.robots.linear import Linear, base_at
 from simgap.robots.model import Composed, Point
@@ -61,6 +62,8 @@ def shrinkage(
         if whole_logs:
             point = _refitted(composed, found, point, np.unique(rows.log[~inside]).tolist())
         logs = np.unique(rows.log[inside])
+        if whole_logs:
+            point = _own(composed, found, point, logs.tolist())
         mine = np.isin(rows.log, logs)
         predicted = base_at(composed.along(logs.tolist()), point).rows
         after[mine] = np.where(inside[mine], rows.observed[mine] - predicted, after[mine])
@@ -110,18 +113,26 @@ def _measured(
     )
 
 
-def _refitted(composed: Composed, found: Found, point: Point, logs: Sequence[int]) -> Point:
+def _own(composed: Composed, found: Found, point: Point, logs: Sequence[int]) -> Point:
+    """The point with what these logs have of their own fitted to them, for nothing else tells it."""
+    by_log = [n for n in point if composed.effects[n].by_log]
+    return _refitted(composed, found, point, logs, by_log) if by_log else point
+
+
+def _refitted(
+    composed: Composed, found: Found, point: Point, logs: Sequence[int], only: Sequence[str] | None = None
+) -> Point:
     """The point fitted to some of the logs alone, exactly."""
     from simgap.robots.linear import linearise
     from simgap.robots.whiten import covariances
 
     part = composed.along(logs)
     kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
-    linear = linearise(part, point, [])
+    linear = linearise(part, point, list(point))
     cov = covariances(linear, part.windows, kinds)
     numbers = {
         i: found.discrepancy.multiplier.get(composed.windows.index(w), 1.0)
         for i, w in enumerate(part.windows)
     }
     off = type(found.discrepancy)(found.discrepancy.scale, numbers)
-    return moved_to(part, linear, cov.whitener(off), point)
+    return moved_to(part, linear, cov.whitener(off), point, only)

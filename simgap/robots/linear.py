@@ -22,9 +22,11 @@ START_STEP = 0.3  # numerics: of a start's
 
 @dataclass(frozen=True)
 class Moved:
-    """How an effect moves rows: `shift` (N,) from neutral to `at` (k,), and its derivatives there (N, k)."""
+    """How an effect moves rows: `shift` (N,) from neutral to `at` (k,), and its derivatives there (N, k);
+    `usual` (k,): usual sizes of its parameters."""
 
     at: np.ndarray
+    usual: np.ndarray
     shift: np.ndarray
     jacobian: np.ndarray
 
@@ -126,8 +128,8 @@ def vary(
         here = {**neutral, **at}
         rows = _rows_at(composed, base, starts, name, here)
         shift = rows - base.rows
-    columns = []
-    for short in effect.parameters:
+    columns = _each_log_at_once(composed, base, starts, name, here, rows) if effect.by_log else []
+    for short in () if effect.by_log else effect.parameters:
         step = step_of(composed, name, short, here[short])
         there = _rows_at(composed, base, starts, name, {**here, short: here[short] + step})
         columns.append((there - rows) / step)
@@ -138,7 +140,29 @@ def vary(
     point = np.array([here[n] for n in effect.parameters])
     if name in base.point:  # a straight line back to neutral
         shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
-    return Moved(point, shift, jacobian)
+    return Moved(point, np.array([p.sd for p in effect.parameters.values()]), shift, jacobian)
+
+
+def _each_log_at_once(
+    composed: Composed,
+    base: Base,
+    starts: Mapping[str, np.ndarray],
+    name: str,
+    here: Mapping[str, float],
+    rows: np.ndarray,
+) -> list[np.ndarray]:
+    """Derivatives (N,) by every parameter of an effect that each log has of its own: logs do not act on each
+    other, so one is varied in all of them together. Parameters go by log, then by kind."""
+    names = list(composed.effects[name].parameters)
+    kinds = len(names) // len(composed.recordings)
+    found = []
+    for kind in range(kinds):
+        mine = names[kind::kinds]
+        step = step_of(composed, name, mine[0], here[mine[0]])
+        there = _rows_at(composed, base, starts, name, {**here, **{n: here[n] + step for n in mine}})
+        found.append((there - rows) / step)
+    log = composed.rows.log
+    return [np.where(log == i // kinds, found[i % kinds], 0.0) for i in range(len(names))]
 
 
 def _rows_at(

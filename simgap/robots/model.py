@@ -83,15 +83,14 @@ class Composed:
             if channels is None or not acting:
                 out.append(channels)
                 continue
-            log, here = self.recordings[window.log], dict(channels)
-            since = log.t[window.begin : window.end] - log.t[0]
-            for effect, theta in acting:
-                if effect.read is not None:
-                    here[effect.channel] = effect.read(since, here[effect.channel], theta)
-                if effect.alter is not None:
-                    here |= effect.alter(log.window(window.begin, window.end), here, theta)
-            out.append(here)
+            log = self.recordings[window.log]
+            out.append(_read(acting, log.window(window.begin, window.end), float(log.t[0]), channels))
         return out
+
+    def read_whole(self, log: Recording, true: Channels, point: Point) -> Channels:
+        """Channels along a whole log as they are read."""
+        acting = [(e, v) for e, v in self._acting(point) if e.reads]
+        return _read(acting, log, float(log.t[0]), true)
 
     def starts(self, point: Point) -> list[Mapping[str, float] | None]:
         """Every window's start, smoothed from the recordings with read-outs' effects undone."""
@@ -131,3 +130,14 @@ class Composed:
     def run(self, point: Point) -> list[Channels | None]:
         """True channels of every window."""
         return run_all(self.simulator, self.jobs(point, self.starts(point)))
+
+
+def _read(acting: Sequence, stretch: Recording, begin: float, true: Channels) -> Channels:
+    """A stretch of a log that begins at `begin` [s], through read-outs' effects one after another."""
+    here, since = dict(true), stretch.t - begin
+    for effect, theta in acting:
+        if effect.read is not None:
+            here[effect.channel] = effect.read(since, here[effect.channel], theta)
+        if effect.alter is not None:
+            here |= effect.alter(stretch, here, theta)
+    return here

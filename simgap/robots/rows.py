@@ -29,6 +29,7 @@ class Rows:
     window: np.ndarray
     time: np.ndarray
     since: np.ndarray  # s from the window's first sample
+    touching: np.ndarray  # whether the row's window has contacts
     observed: np.ndarray
     variance: np.ndarray
     of: tuple[slice, ...]
@@ -93,4 +94,7 @@ def rows_of(recordings: Sequence[Recording], windows: Sequence[Window], noise: M
         raise InputError("recordings", "have no samples of the channels to compare", "numbers")
     joined = [np.concatenate([p[i] for p in parts]) for i in range(7)]
     log, channel, window, time, since, observed, variance = joined
-    return Rows(names, log, channel, window, time, since, observed, variance, tuple(of), tuple(picks))
+    touching = np.array([w.touching for w in windows])[window]
+    return Rows(
+        names, log, channel, window, time, since, touching, observed, variance, tuple(of), tuple(picks)
+    )

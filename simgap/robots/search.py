@@ -6,19 +6,21 @@ rolled out at their own best fit, so that what kinks at its neutral value is see
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from simgap.attribution.posterior import Forms, Model, fitted, forms, sought
+from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.search import sought
+from simgap.robots.discrepancy import learned
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances, learned
+from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # chosen: candidates that a search goes on with
@@ -178,12 +180,25 @@ def _leaders(
     return linear.with_moved(more), sorted([*held, *first])
 
 
-def moved_to(composed: Composed, linear: Linear, whiten: Whitener, point: Point) -> Point:
-    """The point of least squares of whitened residuals, from a start; priors as in attribution."""
+def moved_to(
+    composed: Composed, linear: Linear, whiten: Whitener, point: Point, only: Sequence[str] | None = None
+) -> Point:
+    """The point of least squares of whitened residuals, from a start; priors as in attribution. `only`: the
+    effects that are moved, all by default."""
+    if only is not None and set(only) != set(point):
+        held = {e: theta for e, theta in point.items() if e not in only}
+        free = {e: theta for e, theta in point.items() if e in only}
+        return {**point, **_moved(composed, linear, whiten, free, held)}
+    return _moved(composed, linear, whiten, point, {})
+
+
+def _moved(
+    composed: Composed, linear: Linear, whiten: Whitener, point: Point, held: Point
+) -> dict[str, Mapping[str, float]]:
     names = [(e, p) for e, theta in point.items() for p in theta]
     known = [composed.effects[e].parameters[p] for e, p in names]
     if not names:
-        return point
+        return dict(point)
     sd = np.array([p.sd for p in known])
     low, high = np.array([p.low for p in known]), np.array([p.high for p in known])
     nominal = np.array([p.nominal for p in known])
@@ -199,14 +214,14 @@ def moved_to(composed: Composed, linear: Linear, whiten: Whitener, point: Point)
         return np.where(loose, x, np.sqrt(2 * np.log1p(x**2)))
 
     def residual(x: np.ndarray) -> np.ndarray:
-        found = linear.rows.observed - base_at(composed, at(x)).rows
+        found = linear.rows.observed - base_at(composed, {**held, **at(x)}).rows
         # A rollout that diverged is as far off as the recording is from its mean.
         found = np.where(np.isfinite(found), found, linear.rows.observed)
         return np.concatenate([whiten(np.where(np.isfinite(linear.residual), found, 0.0)), prior(x)])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         here = at(x)
-        base = base_at(composed, here)
+        base = base_at(composed, {**held, **here})
         columns = []
         for effect in here:
             moved = vary(composed, base, linear.starts, effect)
@@ -223,7 +238,7 @@ def moved_to(composed: Composed, linear: Linear, whiten: Whitener, point: Point)
     inside = np.clip(begin, bounds[0] + 1e-6, bounds[1] - 1e-6)
     derivative: Any = jacobian
     done = least_squares(residual, inside, derivative, bounds=bounds, max_nfev=STEPS, method="trf", ftol=1e-5)
-    return at(np.clip(done.x, *bounds))
+    return dict(at(np.clip(done.x, *bounds)))
 
 
 def _slope(x: np.ndarray) -> np.ndarray:

@@ -70,6 +70,7 @@ def twin_recordings(composed: Composed, point: Point, rng: np.random.Generator) 
         (channels,) = run_all(composed.simulator, [Job(parameters, driven, start)])
         if channels is None:
             return None
+        channels = composed.read_whole(log, channels, point)
         columns = {}
         for name, noise in composed.noise.items():
             step = resolution(log[name])

@@ -23,11 +23,13 @@ REACH = 0.03
 NEIGHBOURS = 5  # chosen: samples
 # chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
 DOUBT = 3.0
+FREE = "free"  # what a simulator's `contact_states` call the state in which nothing touches
 
 
 @dataclass(frozen=True)
 class Window:
-    """Rows [begin, end) of log number `log`; `start` and its standard deviations by state, or None."""
+    """Rows [begin, end) of log number `log`; `start` and its standard deviations by state, or None;
+    `touching`: bodies touch somewhere in it, where the simulator tells."""
 
     log: int
     begin: int
@@ -35,6 +37,7 @@ class Window:
     forward: bool  # the start is smoothed from later samples alone
     start: dict[str, float] | None
     doubt: dict[str, float]
+    touching: bool = False
 
 
 def cut(
@@ -49,10 +52,11 @@ def cut(
         if not restarts(simulator):
             out.append(Window(number, 0, len(log), True, None, {}))
             continue
-        marks = _marks(simulator, log)
+        marks, touching = _marks(simulator, log), _touching(simulator, log)
         for begin, end in itertools.pairwise(_edges(log, marks, length)):
             near = any(abs(float(log.t[begin]) - m) < REACH for m in marks)
-            out.append(_begun(simulator, log, Window(number, begin, end, near, None, {}), noise))
+            window = Window(number, begin, end, near, None, {}, bool(touching[begin:end].any()))
+            out.append(_begun(simulator, log, window, noise))
     return out
 
 
@@ -76,6 +80,16 @@ def _marks(simulator: Simulator, log: Recording) -> list[float]:
     """Times [s] of the log at which contacts change."""
     contacts = getattr(simulator, "contacts", None)
     return [] if contacts is None else [float(t) for t in contacts(log)]
+
+
+def _touching(simulator: Simulator, log: Recording) -> np.ndarray:
+    """Whether bodies touch, at every sample of the log."""
+    states = getattr(simulator, "contact_states", None)
+    if states is None:
+        return np.zeros(len(log), bool)
+    times, what = states(log)
+    latest = np.searchsorted(times, log.t, side="right") - 1
+    return np.array([label != FREE for label in what])[np.maximum(latest, 0)]
 
 
 def _edges(log: Recording, contacts: Sequence[float], length: float) -> list[int]:

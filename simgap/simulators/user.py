@@ -13,6 +13,8 @@ from typing import Any
 from hmmseg.errors import InputError, nearest
 from simgap.simulators.protocol import Channel, Parameter, Simulator
 
+BY_LOG = ("shift", "offset")  # what each log may have of its own (`simgap.robot_effects.by_log`)
+
 
 @dataclass(frozen=True)
 class UserSimulator:
@@ -26,6 +28,8 @@ class UserSimulator:
     contacts: Callable[..., Any] | None = None
     simulate_many: Callable[..., Any] | None = None
     says: Mapping[str, str] = field(default_factory=dict)
+    poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    by_log: Mapping[str, Parameter] = field(default_factory=dict)
 
 
 def load_simulator(spec: str) -> UserSimulator:
@@ -75,7 +79,15 @@ def checked(found: Any, where: str) -> UserSimulator:
     optional = {n: getattr(found, n, None) for n in ("state_at", "contacts", "simulate_many")}
     says = dict(getattr(found, "says", None) or {})
     restarted = "start" in inspect.signature(run).parameters
-    return UserSimulator(parameters, channels, run, restarted, says=says, **optional)
+    given = getattr(found, "by_log", None) or {}
+    by_log = {n: _made(Parameter, v, f"{where}: by_log {n}") for n, v in given.items()}
+    for name in by_log:
+        if name not in BY_LOG:
+            raise InputError(f"{where}: by_log {name}", "unknown key", nearest(name, BY_LOG))
+    poses = dict(getattr(found, "poses", None) or {})
+    return UserSimulator(
+        parameters, channels, run, restarted, says=says, poses=poses, by_log=by_log, **optional
+    )
 
 
 def _made(kind: type, value: Any, where: str) -> Any:

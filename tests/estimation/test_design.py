@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.design import build, unexpected_bias
+from estimation.design import build
 from estimation.mode import find_mode
+from estimation.moments import unexpected_bias
 from estimation.observations import aligned_weights
 from estimation.posterior import posterior
 from experiments.bank import simulated_cases

@@ -15,8 +15,9 @@ from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, statistic
 from simgap.attribution.heldout import how_far
 from simgap.attribution.invariance import WANDER, invariance
-from simgap.attribution.posterior import Forms, forms, sought, weights
+from simgap.attribution.posterior import Forms, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
+from simgap.attribution.search import sought, weights
 
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:

@@ -8,7 +8,9 @@ import pytest
 from scipy.signal import lfilter, lsim
 
 from simgap.effects.base import LATE, SMOOTH, YIELDING
-from simgap.gap.residuals import _between, _sunk, contact, shifted
+from simgap.gap.between import doubt_between, shifted
+from simgap.gap.memory import sunk
+from simgap.gap.residuals import contact
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
 STEP = 0.05  # s
@@ -68,7 +70,7 @@ def test_no_force_before_the_contact_behind_a_low_pass():
 
 def test_a_corner_is_in_doubt_and_a_straight_force_is_not():
     ramp = 3.0 * np.maximum(np.arange(60) - 20, 0.0) * STEP
-    variance = np.asarray(_between(_slow(ramp, 0.1)))[0, :, 0]
+    variance = np.asarray(doubt_between(_slow(ramp, 0.1)))[0, :, 0]
     assert variance[18:23].max() > 1e-3 and variance[25:-5].max() < 1e-6
 
 
@@ -101,7 +103,7 @@ def test_a_late_force_is_in_doubt_where_it_is_read(steps):
         delay=jnp.asarray(steps) * jnp.median(world.t[:, 1:] - world.t[:, :-1]),
         modes=jnp.asarray(world.modes).at[LATE].set(1.0),
     )
-    variance = np.asarray(_between(world))[0, :, 0]
+    variance = np.asarray(doubt_between(world))[0, :, 0]
     assert variance.argmax() == 29 - int(steps)
     # It came at any moment between the two samples: at least the variance of one that came midway.
     assert variance.max() > 0.3**2 and variance[:20].max() == 0.0
@@ -127,7 +129,7 @@ def test_a_support_settles_like_a_spring_beside_a_damper():
         modes=jnp.asarray(world.modes).at[YIELDING].set(1.0),
     )  # fmt: skip
     load = np.where(t >= 2.0, np.minimum(3.0 * (t - 2.0 + STEP), 0.8), 0.5)
-    depth = np.asarray(_sunk(world, jnp.asarray(load)[None]))[0]
+    depth = np.asarray(sunk(world, jnp.asarray(load)[None]))[0]
     borne = load * (1 - carry)
     after = t > 1.5  # what is in the air weighs on nothing: the oracle starts from rest
     oracle = lsim(([give], [time, 1.0]), borne[after], t[after] - t[after][0])[1]

@@ -9,7 +9,9 @@ from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
 from simgap.effects.backlash import play, side
-from simgap.gap.residuals import ANYWHERE, SLIDE, _driven, _filtered, _followed
+from simgap.gap.between import sensed
+from simgap.gap.grips import ANYWHERE, SLIDE, _followed
+from simgap.gap.memory import driven
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
 
@@ -78,8 +80,8 @@ def test_the_ring_of_a_straight_load_is_exact_and_is_taken_out_again():
     rng = np.random.default_rng(0)
     world = _ringing()
     load = jnp.asarray(rng.standard_normal(world.force.shape)).cumsum(1)
-    read = _driven(world, load, back=False)
-    np.testing.assert_allclose(_driven(world, read, back=True), load, atol=1e-9)
+    read = driven(world, load, back=False)
+    np.testing.assert_allclose(driven(world, read, back=True), load, atol=1e-9)
     # The oracle: the mode's response to the load's rate, piecewise constant, on a far finer grid.
     t = np.asarray(world.t[0])
     fine = np.linspace(t[0], t[-1], 40 * (t.size - 1) + 1)
@@ -97,6 +99,6 @@ def test_late_forces_are_in_doubt_between_samples_only():
     force = jnp.repeat(jnp.where(world.t > 1.0, 2.0, 0.0)[..., None], 4, axis=2)
     for delay, doubtful in ((2.0, False), (2.5, True)):
         late = world._replace(delay=jnp.asarray(delay * step), modes=world.modes.at[0].set(1.0))
-        out, variance = _filtered(late, force)
+        out, variance = sensed(late, force)
         assert (float(variance.max()) > 0.1) == doubtful
         assert float(jnp.abs(out[:, 3:] - force[:, :-3]).max()) <= 2.0

@@ -9,12 +9,15 @@ from demo_recordings import RIG, TASK
 
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
-from simgap.gap.fit import Start, fit, neutral, problem, residual_at
-from simgap.gap.frame import CHANNELS, build
-from simgap.gap.residuals import _fivepoint
+from simgap.gap.between import fivepoint
+from simgap.gap.evaluation import residual_at
+from simgap.gap.fit import Start, fit
+from simgap.gap.frame import build
+from simgap.gap.problem import neutral, problem
 from simgap.gap.sensor_noise import _unresolved
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import performed, recorded
+from simgap.gap.trial_arrays import CHANNELS
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
@@ -61,7 +64,7 @@ def test_fast_work_leaves_little_but_noise_away_from_contact_changes(fast, chann
 def test_five_samples_give_slopes_to_fourth_order():
     world = as_jax(world_of(performance(400)))
     t = np.asarray(world.t)
-    found, three = _fivepoint(world, jnp.asarray(t**4)[..., None])
+    found, three = fivepoint(world, jnp.asarray(t**4)[..., None])
     exact = 4 * t**3
     assert np.abs(found[..., 0] - exact)[:, 2:-2].max() < 1e-9 * np.abs(exact).max()
     assert np.abs(three[..., 0] - exact)[:, 2:-2].max() > 1e-6 * np.abs(exact).max()

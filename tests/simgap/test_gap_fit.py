@@ -15,8 +15,11 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.effects import effect_named
 from simgap.gap.assemble import gap_of, together
-from simgap.gap.fit import Start, derivatives, fit, neutral, problem, slots
+from simgap.gap.evaluation import derivatives
+from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
+from simgap.gap.nuisances import with_nuisances
+from simgap.gap.problem import neutral, problem, slots
 from simgap.gap.spread import spreads
 
 
@@ -96,13 +99,10 @@ def test_what_the_rig_admits_is_a_nuisance(shared):
     rig = frame.rig.model_copy(
         update={"systematic": frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})}
     )
-    given = problem(replace(frame, rig=rig))
-    plain = fit(given, Start((), neutral(given)))
-    gap = gap_of(given, plain, [])
+    given = with_nuisances(problem(replace(frame, rig=rig)))
     k = given.num_properties
-    assert gap.nuisance.shape[1] == k + 2 + 3  # speeds may be read late
-    push = derivatives(given, ("force_bias",), plain.u)[:, k:]
-    np.testing.assert_allclose(gap.nuisance[:, k : k + 2], -push[:, [0, 3]] * [0.2, 0.1], rtol=1e-6)
+    push = derivatives(given, ("force_bias",), neutral(given))[:, k:]
+    np.testing.assert_allclose(given.nuisances.columns[:, :2], -push[:, [0, 3]] * [0.2, 0.1], rtol=1e-6)
 
 
 @double_precision

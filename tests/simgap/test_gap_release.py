@@ -16,9 +16,10 @@ from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from simgap.effects import catalogue
-from simgap.gap.frame import CHANNELS, build
-from simgap.gap.residuals import HELD, LOOSE, _firm
+from simgap.gap.frame import build
+from simgap.gap.grips import HELD, LOOSE, firmness
 from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
+from simgap.gap.trial_arrays import CHANNELS
 
 DEMO = example_folder()
 MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)
@@ -27,7 +28,7 @@ MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)
 def grips(first: list[float]) -> np.ndarray:
     """Firmness (20,): one grip begins with the given ones and is 2 N, the other is 0.5 N."""
     grip = jnp.asarray([[*first, *[2.0] * (10 - len(first)), *[0.5] * 10]])
-    return np.asarray(_firm(grip, jnp.ones_like(grip), jnp.asarray(MOVES)))[0]
+    return np.asarray(firmness(grip, jnp.ones_like(grip), jnp.asarray(MOVES)))[0]
 
 
 @pytest.mark.parametrize(("grip", "holds"), [(0.3, False), (0.05, False), (1.6, True)])
@@ -43,7 +44,7 @@ def test_a_light_grip_is_firm_where_it_is_usual():
 
 def test_nothing_is_held_by_less_than_noise():
     grip = jnp.full((1, 20), 0.5 * HELD)
-    assert (np.asarray(_firm(grip, jnp.ones_like(grip), jnp.asarray(MOVES))) < 0.1).all() and 0 < LOOSE < 1
+    assert (np.asarray(firmness(grip, jnp.ones_like(grip), jnp.asarray(MOVES))) < 0.1).all() and 0 < LOOSE < 1
 
 
 def test_how_fast_a_block_comes_off_its_support_is_in_doubt():

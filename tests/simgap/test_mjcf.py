@@ -82,7 +82,7 @@ def test_what_is_set_is_taken_back(files):
 
 
 def test_a_step_of_torque_is_held_as_the_steps_have_it():
-    from simgap.simulators.mjcf.model import Held
+    from simgap.simulators.mjcf.signals import Held
 
     held = Held(np.array([0.0, 0.005, 0.01]), np.arange(0, 0.012, 0.002))
     np.testing.assert_allclose(held(np.array([1.0, 3.0, 0.0])), [1, 1, 2, 3, 3, 0])

@@ -15,7 +15,8 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import APPLIED, MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
-from simgap.simulators.mjcf.settable import Setting, names_of, setting_of
+from simgap.simulators.mjcf.settable import setting_of
+from simgap.simulators.mjcf.setting import Setting, names_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 

@@ -60,7 +60,8 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         plain = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
-    from simgap.simulators.mjcf.settable import names_of, setting_of
+    from simgap.simulators.mjcf.settable import setting_of
+    from simgap.simulators.mjcf.setting import names_of
 
     for column in described.columns.values():
         known = names_of(plain, column.thing)
@@ -181,7 +182,8 @@ def _simulator(mujoco: Any, model: Any, described: Map, address: Mapping[str, tu
     touching = bool(np.any((model.geom_contype != 0) | (model.geom_conaffinity != 0))) and not (
         model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
-    made = MjcfSimulator(model, described, channels, {}, {}, sensors, joints, driven, free, touching)
+    whole = {name: pose for name, pose in poses.items() if len(pose) == 7}
+    made = MjcfSimulator(model, described, channels, {}, {}, sensors, joints, driven, free, touching, whole)
     return made, warnings
 
 

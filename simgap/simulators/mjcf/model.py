@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
-from simgap.simulators.mjcf.map import Map, Mapped
-from simgap.simulators.mjcf.settable import Setting
+from simgap.simulators.mjcf.map import Map
+from simgap.simulators.mjcf.setting import Setting
+from simgap.simulators.mjcf.signals import Held, aligned, body_rate, cubic, filled
+from simgap.simulators.mjcf.touching import contact_labels
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values, finite
 from simgap.simulators.recording import Recording
 
@@ -25,7 +28,8 @@ class MjcfSimulator:
     """The compiled model with a sensor for each compared column (`sensor` name -> address).
 
     `joints`: by position column its joint; `driven`: by command column its actuator; `free`: by body, the
-    seven columns of its pose. What no column tells starts as the model's own run of the whole log has it.
+    seven columns of its pose; `poses`: of every body whose whole pose is read. What no column tells starts as
+    the model's own run of the whole log has it.
     """
 
     model: Any
@@ -38,6 +42,7 @@ class MjcfSimulator:
     driven: Mapping[str, int]
     free: Mapping[int, Mapping[str, str]]
     touching: bool
+    poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     says: Mapping[str, str] = field(default_factory=dict)
     restarts: bool = True
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
@@ -77,7 +82,7 @@ class MjcfSimulator:
     def _all(self, jobs: Sequence[Job], changed: tuple[tuple[str, float], ...]) -> list[Channels | None]:
         """Every job's channels with some settings changed."""
         out: list[Channels | None] = []
-        with _Set(self.model, self.settings, changed):
+        with Changed(self.model, self.settings, changed):
             for part in self._batches(jobs, list(range(len(jobs)))):
                 out += self._roll([jobs[i] for i in part])
         return out
@@ -204,11 +209,17 @@ class MjcfSimulator:
             self._runs[log.name] = np.where(np.isfinite(found), found, first)
 
     def contacts(self, recording: Recording) -> list[float]:
-        """Times at which the set of touching geoms changes along the recorded motion, for good."""
+        """Times at which the set of touching bodies changes along the recorded motion."""
         if not self.touching:
             return []
+        times, what = self.contact_states(recording)
+        return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
+
+    def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[str]]:
+        """What touches along the recorded motion: times, and at each `free` or the touching bodies."""
         rows = self._shown(recording)
-        return lasting_changes(recording.t[rows], self.touched(recording))
+        sets = self.touched(recording) if self.touching else [frozenset()] * rows.size
+        return recording.t[rows], contact_labels(self.model, recording.t[rows], sets)
 
     def _shown(self, recording: Recording) -> np.ndarray:
         """Samples at which contacts are looked at: 200 a second at most."""
@@ -219,7 +230,7 @@ class MjcfSimulator:
         """Pairs of geoms that touch along the recorded motion, at the samples looked at."""
         data = self._data[0]
         told = (*self.joints, *(n for m in self.free.values() for n in m.values()))
-        columns = {c: _filled(recording[c]) for c in told}
+        columns = {c: filled(recording[c]) for c in told}
         mujoco.mj_setState(self.model, data, self._own_state(recording, True), int(self._spec))
         out = []
         for i in self._shown(recording):
@@ -237,104 +248,8 @@ class MjcfSimulator:
         return out
 
 
-class Held:
-    """Commands held from sample to sample, as each step of the simulator has them on average."""
-
-    def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
-        self.since = since
-        self.edges = np.append(times, 2 * times[-1] - times[-2])
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Means (steps,) of a column (num_timesteps,); missing samples hold the one before."""
-        seen = np.isfinite(values)
-        t, u = self.since[seen], values[seen]
-        area = np.concatenate([[0.0], np.cumsum(u[:-1] * np.diff(t))])
-        k = np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
-        whole = area[k] + u[k] * (self.edges - t[k])
-        return np.diff(whole) / np.diff(self.edges)
-
-
-# chosen: s that a change of contact must last: sensors' noise makes and breaks contacts
-LASTING = 0.04
-
-
-def lasting_changes(t: np.ndarray, sets: Sequence[Any]) -> list[float]:
-    """Times at which a sequence of sets changes to one that stays."""
-    out: list[float] = []
-    now = sets[0] if sets else None
-    i = 0
-    while i < len(sets):
-        if sets[i] != now:
-            end = i
-            while end < len(sets) and sets[end] == sets[i]:
-                end += 1
-            if end == len(sets) or t[end] - t[i] >= LASTING:
-                out.append(float(t[i]))
-                now = sets[i]
-                i = end
-                continue
-        i += 1
-    return out
-
-
-def _filled(values: np.ndarray) -> np.ndarray:
-    seen = np.isfinite(values)
-    return values if seen.all() else np.interp(np.arange(values.size), np.flatnonzero(seen), values[seen])
-
-
 def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | None:
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
-
-
-class _Set:
-    """The model with some settings changed, for as long as it is entered."""
-
-    def __init__(
-        self, model: Any, settings: Mapping[str, Setting], changed: Sequence[tuple[str, float]]
-    ) -> None:
-        self.model, self.settings, self.changed = model, settings, changed
-
-    def __enter__(self) -> None:
-        if not self.changed:
-            return
-        self.kept = {n: np.array(getattr(self.model, n)) for n in FIELDS}
-        opt = self.model.opt
-        self.options = (np.array(opt.gravity), opt.timestep, opt.integrator, opt.iterations)
-        for name, value in self.changed:
-            self.settings[name].put(self.model, value)
-        if any(self.settings[n].derived for n, _ in self.changed):
-            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
-
-    def __exit__(self, *exception: object) -> None:
-        if not self.changed:
-            return
-        for name, values in self.kept.items():
-            getattr(self.model, name)[:] = values
-        opt = self.model.opt
-        opt.gravity[:], opt.timestep, opt.integrator, opt.iterations = self.options
-        if any(self.settings[n].derived for n, _ in self.changed):
-            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
-
-
-FIELDS = (
-    "dof_damping",
-    "dof_frictionloss",
-    "dof_armature",
-    "jnt_stiffness",
-    "qpos_spring",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_pos",
-    "geom_friction",
-    "geom_solref",
-    "geom_solimp",
-    "geom_size",
-    "geom_rbound",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
-)
 
 
 def _joint(model: Any, name: str) -> int:
@@ -343,39 +258,3 @@ def _joint(model: Any, name: str) -> int:
 
 def _key(model: Any, name: str) -> int:
     return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
-
-
-def cubic(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values between points of an even grid by cubics through neighbours (Catmull & Rom 1974)."""
-    h = times[1] - times[0]
-    place = np.clip(at / h, 0, times.size - 1)
-    i = np.minimum(place.astype(int), times.size - 2)
-    s = place - i
-    p0, p1, p2, p3 = (values[np.clip(i + k, 0, times.size - 1)] for k in (-1, 0, 1, 2))
-    inner = (i > 0) & (i < times.size - 2)
-    bend = 0.5 * (s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0))
-    return np.where(inner, p1 + bend, p1 + s * (p2 - p1))
-
-
-def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Angular velocity (3,) in the body's frame, 2 conj(q) dq/dt, of a unit quaternion, scalar first."""
-    w, x, y, z = quat
-    a, b, c, d = rate
-    return 2 * np.array(
-        [w * b - x * a - y * d + z * c, w * c - y * a - z * b + x * d, w * d - z * a - x * c + y * b]
-    )
-
-
-def aligned(log: Recording, out: dict[str, np.ndarray], columns: Mapping[str, str]) -> None:
-    """Turn the sign of simulated quaternions to the recorded ones': both are the same turn."""
-    turn = [columns[a] for a in ("qw", "qx", "qy", "qz") if columns[a] in out]
-    if len(turn) == 4:
-        dot = sum(np.nan_to_num(log[n]) * out[n] for n in turn)
-        sign = np.where(dot < 0, -1.0, 1.0)
-        for n in turn:
-            out[n] = out[n] * sign
-
-
-def sensed_columns(mapped: Mapping[str, Mapped]) -> list[Mapped]:
-    """Columns that are compared."""
-    return [m for m in mapped.values() if m.kind != "command"]

@@ -1,0 +1,129 @@
+"""What recordings contain that is nobody's fault, as columns beside which every effect is judged.
+
+What rig.toml admits under [systematic]; speeds that a drive takes as differences; and blocks that turn in the
+grip. Each column is per its standard deviation beforehand, so that its prior is N(0, 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from simgap.effects.base import gradient, tips
+from simgap.gap.evaluation import derivatives
+from simgap.gap.marginal import Nuisances
+from simgap.gap.problem import Problem, free_of, neutral, slots
+from simgap.gap.trial_arrays import CHANNELS
+
+PAD = 5e-3  # chosen: m; half a pad's length: how hard it turns follows from that and its stiffness
+STANCES = (0.6, 1.0)  # chosen: shares of a block's width between its feet; what lies between is a mixture
+SWING = 2e-3  # chosen: rad; sd of the angle at which a lifted block hangs against how it stood
+LANDING = 4e-5  # chosen: m; sd of how far a pad slides in the shock of landing
+
+
+def with_nuisances(given: Problem) -> Problem:
+    """The problem with its nuisances, linear about no effect at all."""
+    columns = [*_admitted(given), *_late_rates(given), *_turning(given), *_settling(given)]
+    return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
+
+
+def _admitted(given: Problem) -> list[np.ndarray]:
+    """Columns (n, .) of what rig.toml admits under [systematic], each per its standard deviation."""
+    out, k = [], given.num_properties
+    for slot in slots(k)[0]:
+        if slot.effect.admitted is None:
+            continue
+        key, sds = slot.effect.admitted(given.frame.rig)
+        if any(sds.values()):
+            push = derivatives(given, (key,), neutral(given))[:, k:]
+            for j, p in enumerate(free_of(key)):
+                if sds.get(p.name, 0.0) > 0:
+                    out.append(-push[:, [j]] * sds[p.name] / p.sd)
+    return out
+
+
+def _late_rates(given: Problem) -> list[np.ndarray]:
+    """Columns (n, 1) of speeds that are differences of positions, late by half a sample, or smoothed.
+
+    How a drive comes by its speeds rig.toml does not say: differences are as usual as a tachometer.
+    """
+    world, weight = given.frame.world, given.whitening.weight
+    tree = jax.tree.map(jnp.asarray, world)
+    step = float(np.median(np.diff(world.t[0])))
+    velocity = np.asarray(tips(tree)[1])
+    mean = (velocity[..., :2] + velocity[..., 2:]) / 2
+    rate = np.asarray(gradient(tree.t, jnp.asarray(mean)))
+    bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
+    position = np.asarray(tips(tree)[0])
+    place = (position[..., :2] + position[..., 2:]) / 2
+    # What a drive that takes differences of its own readings from sample to sample would say.
+    before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
+    own = np.asarray(tips(tree._replace(rates=jnp.asarray((world.joints - before) / step)))[1])
+    own = (own[..., :2] + own[..., 2:]) / 2
+    own[:, 1:-1] = (own[:, :-2] + 4 * own[:, 1:-1] + own[:, 2:]) / 6
+    own = own - np.asarray(gradient(tree.t, jnp.asarray(place)))
+    out = []
+    for change, usual in ((own, 1.0), (rate, step / 2), (bend, step**2 / 2)):
+        column = np.zeros_like(weight)
+        for k, channel in enumerate(("vx", "vy")):
+            c = CHANNELS.index(channel)
+            column[..., c] = usual * change[..., k] * weight[..., c]
+        out.append(column[weight > 0][:, None])
+    return out
+
+
+def _turning(given: Problem) -> list[np.ndarray]:
+    """Columns (n, 1) of blocks that turn in the grip: the fingers' offset moves by its width times the angle.
+
+    Balance of moments about its middle: what both fingers' shears and the couple of grips at unequal heights
+    exert turns a block against the pads, as far as its support does not hold it upright. The support's load
+    acts within its feet, so it holds a moment up to the load times half its stance; beyond that the block
+    turns about a foot, and its middle rises. How easily pads turn is nobody's fault.
+    """
+    world, arrays = given.frame.world, given.frame.arrays
+    stiffness = 1 / np.maximum(world.give_normal.mean(), 1e-9)
+    compliance = 3 / (2 * stiffness * PAD**2)  # rad/(N m) of both pads: rows of springs along their length
+    weight, width = (
+        np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, k]) for k in (0, 1)
+    )
+    position = np.asarray(tips(jax.tree.map(jnp.asarray, world))[0])
+    fx1, fy1, fx2, fy2 = np.moveaxis(world.force, -1, 0)
+    apart = position[..., 3] - position[..., 1] - (fy2 * world.give_shear[1] - fy1 * world.give_shear[0])
+    moment = width / 2 * (fy2 - fy1) + (fx1 - fx2) / 2 * apart
+    load = np.maximum(weight - fy1 - fy2, 0.0) * (1 - world.carry)
+    out = []
+    for share in STANCES:
+        stance = share * width / 2
+        turn = compliance * np.sign(moment) * np.maximum(np.abs(moment) - load * stance, 0.0)
+        out.append(_column(given, {"offset": width * turn, "y": stance * np.abs(turn) * (1 - world.carry)}))
+    return [z for z in out if z.any()]
+
+
+def _settling(given: Problem) -> list[np.ndarray]:
+    """Columns (n, 1) of what a grip has of its own: the angle at which a lifted block hangs against how it
+    stood, and by how much pads have slid when it is set down, for landing is a shock."""
+    arrays, out = given.frame.arrays, []
+    width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
+    for t in range(given.frame.num_trials):
+        for m in range(arrays.onehot.shape[2]):
+            mine = np.zeros_like(width)
+            mine[t] = arrays.onehot[t, :, m]
+            out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., 2]}))
+            for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)):
+                out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., 3]}))
+    return [z for z in out if z.any()]
+
+
+def _column(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
+    """The whitened column (n, 1) of shifts (T, N) of channels, told up to a constant in every grip."""
+    weight, onehot = given.whitening.weight, given.frame.arrays.onehot
+    out = np.zeros_like(weight)
+    for name, shift in shifts.items():
+        c = CHANNELS.index(name)
+        mine = onehot * (weight[..., c] > 0)[..., None]
+        mean = np.einsum("tnm,tn->tm", mine, shift) / np.maximum(mine.sum(1), 1.0)
+        out[..., c] = (shift - np.einsum("tnm,tm->tn", onehot, mean)) * weight[..., c]
+    return out[weight > 0][:, None]

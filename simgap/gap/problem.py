@@ -1,0 +1,136 @@
+"""The problem of fitting: a frame, its whitening, the properties' prior, and a column for every unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from simgap.effects import fitted as known_effects
+from simgap.effects import free_parameters, name_of
+from simgap.effects.base import Effect, Parameter, tips
+from simgap.gap.frame import Frame
+from simgap.gap.marginal import Nuisances
+from simgap.gap.whitening import Whitening, whitening
+
+FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # chosen: sd of a property that nothing else tells
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One effect's place among the columns of all parameters."""
+
+    effect: Effect
+    start: int
+
+    @property
+    def stop(self) -> int:
+        """One past its last column."""
+        return self.start + len(self.effect.parameters)
+
+
+@lru_cache
+def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
+    """Slots of all deterministic effects in order of correction, and the number of columns."""
+    out, at = [], num_properties
+    known = [e for e in known_effects().values() if e.correct is not None]
+    for effect in sorted(known, key=lambda e: (e.stage, e.name)):
+        out.append(Slot(effect, at))
+        at += len(effect.parameters)
+    return tuple(out), at
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A frame with its whitening and the properties' prior: `centre`, `spread` (O, 3); which of weight, width
+    and height were `measured` (O, 3) apart; `nuisances` that every fit leaves free."""
+
+    frame: Frame
+    whitening: Whitening
+    centre: np.ndarray
+    spread: np.ndarray
+    measured: np.ndarray
+    nuisances: Nuisances
+
+    def product(self, a: np.ndarray, b: np.ndarray) -> Any:
+        """Products of residuals, or of their derivatives, (n, ...), nuisances integrated out."""
+        return self.nuisances.product(a, b) if self.nuisances.columns.size else a.T @ b
+
+    @property
+    def num_properties(self) -> int:
+        """Number of property columns."""
+        return self.centre.size
+
+    @property
+    def size(self) -> int:
+        """Number of residuals."""
+        return int((self.whitening.weight > 0).sum())
+
+
+def problem(frame: Frame, actual: dict | None = None) -> Problem:
+    """The problem of a frame; `actual` as `estimation.actual` reads it narrows the prior."""
+    a, w, objects = frame.arrays, frame.world, frame.task.objects
+    valid = (a.there[..., 6] > 0) & (a.phase[..., 2] > 0)
+    centre, spread = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
+    measured = np.zeros((len(objects), 3), bool)
+    net = w.force[..., 1] + w.force[..., 3]
+    position, _ = tips(jax.tree.map(jnp.asarray, w))
+    distance = np.asarray(position[..., 2] - position[..., 0])
+    distance = distance + w.force[..., 0] * w.give_normal[0] - w.force[..., 2] * w.give_normal[1]
+    for o, name in enumerate(objects):
+        mine = valid & (np.einsum("tnm,m->tn", a.onehot, a.objects[:, o]) > 0)
+        given = (actual or {}).get(name, {})
+        guess = (float(np.median(net[mine])), float(np.median(distance[mine]))) if mine.any() else (0.4, 0.02)
+        for k, prop in enumerate(("weight", "width", "height")):
+            start = max(guess[k], 1e-3) if k < 2 else 0.015
+            centre[o, k], spread[o, k] = start, FLAT[prop]
+            if prop in given:
+                value, sd = given[prop]
+                centre[o, k], spread[o, k] = value, np.hypot(sd, (2e-3 * value, 3e-5, 4e-5)[k])
+                measured[o, k] = True
+    white = whitening(frame)
+    none = Nuisances(np.zeros((int((white.weight > 0).sum()), 0)))
+    return Problem(frame, white, centre, spread, measured, none)
+
+
+def free_of(key: str) -> list[Parameter]:
+    """The free parameters of an effect's form, in the order of its columns."""
+    return [p for p in known_effects()[name_of(key)].parameters if p.name in free_parameters(key)]
+
+
+def neutral(given: Problem) -> np.ndarray:
+    """Coordinates of no effect at all: properties at the centre of their prior."""
+    places, total = slots(given.num_properties)
+    u = np.zeros(total)
+    for slot in places:
+        for j, p in enumerate(slot.effect.parameters):
+            if not p.log:
+                u[slot.start + j] = p.coordinate(p.neutral)
+    return u
+
+
+def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
+    """Columns of the properties and of the parameters that effects' forms have free."""
+    out = [np.arange(given.num_properties)]
+    places = {s.effect.name: s for s in slots(given.num_properties)[0]}
+    for key in effects:
+        slot, names = places[name_of(key)], free_parameters(key)
+        out.append(
+            np.array([slot.start + j for j, p in enumerate(slot.effect.parameters) if p.name in names])
+        )
+    return np.concatenate(out).astype(int)
+
+
+def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of all coordinates."""
+    places, total = slots(given.num_properties)
+    low, high = np.full(total, -np.inf), np.full(total, np.inf)
+    for slot in places:
+        for j, p in enumerate(slot.effect.parameters):
+            low[slot.start + j], high[slot.start + j] = p.limits
+    return low, high

@@ -1,0 +1,182 @@
+"""One aligned trial as arrays over its samples: signals, states, noise, and which equations hold where."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.align import TrialAlignment
+from simgap.effects.base import FORCES
+from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise
+from simgap.gap.wrist_gap import absent
+
+CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
+BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
+PHASES = ("free", "pickup", "carry", "place", "slide")
+MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
+TOUCHING = 5.0  # chosen: sds of a force by which a touch shows
+# chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
+EITHER_SIDE = 0.02
+FIRST_TOUCH = 0.2  # chosen: s; one finger touches no earlier before the other, nor lets go later
+
+
+def thinned(trial: Trial) -> tuple[Trial, int]:
+    """The trial averaged down to MAX_RATE at most, and how many samples went into one."""
+    group = int(np.ceil(trial.rate / MAX_RATE - 1e-6))
+    if group <= 1:
+        return trial, 1
+    count = trial.t.size // group
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        block = values[: count * group].reshape(count, group)
+        there = np.isfinite(block)
+        total = np.where(there, block, 0.0).sum(1)
+        return np.where(there.any(1), total / np.maximum(there.sum(1), 1), np.nan)
+
+    inertia = None if trial.inertia is None else np.stack([mean(v) for v in trial.inertia.T], 1)
+    channels = {k: mean(v) for k, v in trial.channels.items()}
+    return Trial(trial.file, mean(trial.t), channels, hidden=trial.hidden, inertia=inertia), group
+
+
+def boundary_quantiles(aligned: TrialAlignment) -> np.ndarray:
+    """Quantiles (3, B) [s] of every boundary: nearly the first, the median and nearly the last it may be."""
+    levels = (EITHER_SIDE, 0.5, 1 - EITHER_SIDE)
+    return np.array([[b.quantile(p) for b in aligned.boundaries] for p in levels])
+
+
+def trial_arrays(
+    trial: Trial, quantiles: np.ndarray, steps: tuple[Subtask, ...], rig: Rig
+) -> dict[str, np.ndarray]:
+    """One trial's signals, states and noise, arrays over its samples."""
+    trial, group = thinned(trial)
+    first, boundaries, last = quantiles
+    signals = task_space(trial, rig)
+    t, step = trial.t, np.median(np.diff(trial.t))
+    subtask = np.searchsorted(boundaries, t, side="right")
+    phase = np.array([_phase(s) for s in steps])[subtask]
+    edge = np.abs(t[:, None] - boundaries).min(axis=1) < step
+    force = np.stack([signals.__dict__[c] for c in FORCES], 1)
+    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
+    joints = np.stack([trial.channels[n] for n in names], 1)
+    if rig.jointed:
+        rates = np.stack([trial.channels[f"d{n}"] for n in names], 1)
+    else:
+        rates = np.stack([signals.vx1, signals.vy1, signals.vx2, signals.vy2], 1)
+    there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
+    force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
+    sample = sample_noise(signals, rig, group)
+    sd = residual_noise(signals, sample, rig, step)
+    sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, edge & (phase == 2), boundaries))
+    if trial.inertia is not None:
+        sd[:, 6:8] = np.hypot(sd[:, 6:8], trial.inertia)
+    there[:, np.isin(CHANNELS, absent(trial))] = 0.0
+    lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
+    there[lone, CHANNELS.index("fx") :] = 0.0
+    carried = np.array([_phase(s) == 2 for s in steps])
+    lifts = carried[1:] != carried[:-1]  # a block leaves its support or meets one
+    either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
+    there[np.ix_(either, np.isin(CHANNELS, BORNE))] = 0.0
+    if group > 1:  # a mean over a contact change is of neither contact
+        there[np.abs(t[:, None] - boundaries).min(axis=1) <= step / 2] = 0.0
+    return {
+        "t": t,
+        "joints": joints,
+        "rates": rates,
+        "force": force,
+        "events": boundaries,
+        "there": there,
+        "sd": sd,
+        "sample": channel_noise(sample) * np.sqrt(group),  # of one as it was recorded
+        "kind": (2 * phase + edge).astype(float),
+        "subtask": subtask.astype(float),
+        "move": _moves(t, boundaries, steps, subtask).astype(float),
+        "phase": np.eye(len(PHASES))[phase],
+    }
+
+
+def _one_finger(
+    t: np.ndarray,
+    force: np.ndarray,
+    subtask: np.ndarray,
+    free: np.ndarray,
+    boundaries: np.ndarray,
+    sd: np.ndarray,
+) -> np.ndarray:
+    """Samples (N,) of free motion beside a grip at which one finger touches already or still.
+
+    Such a touch is a contact that the task does not list and no gap. One finger presses inwards, compared
+    with its own median in that free motion, and the other does not; `sd` (N,) is a force's noise [N].
+    """
+    out = np.zeros(t.size, bool)
+    for s in np.unique(subtask[free]):
+        mine = np.flatnonzero(subtask == s)
+        change = force[mine] - np.median(force[mine], axis=0)
+        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > TOUCHING * sd[mine, None]
+        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < TOUCHING * sd[mine, None]
+        near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
+        out[mine] = near & ((inwards[:, 0] & quiet[:, 1]) | (inwards[:, 1] & quiet[:, 0]))
+    return out
+
+
+def _phase(step: Subtask) -> int:
+    if step.state == FREE:
+        return 0
+    if step.state == ABOVE_GROUND:
+        return 2
+    return PHASES.index(step.name)
+
+
+def _moves(
+    t: np.ndarray, boundaries: np.ndarray, steps: tuple[Subtask, ...], subtask: np.ndarray
+) -> np.ndarray:
+    """The move of each sample; free motion belongs to the nearer grip."""
+    own = [-1 if s.state == FREE or s.move is None else s.move for s in steps]
+    starts, ends = {}, {}
+    for k, move in enumerate(own):
+        if move >= 0:
+            starts.setdefault(move, boundaries[k - 1])
+            ends[move] = boundaries[k] if k < len(boundaries) else t[-1]
+    distance = np.stack([np.maximum(starts[m] - t, 0) + np.maximum(t - ends[m], 0) for m in sorted(starts)])
+    found = np.array(own)[subtask]
+    return np.where(found >= 0, found, distance.argmin(axis=0))
+
+
+def _filled(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Columns with missing samples interpolated (they are masked where they count)."""
+    out = values.copy()
+    for column in out.T:
+        good = np.isfinite(column)
+        column[~good] = np.interp(t[~good], t[good], column[good])
+    return out
+
+
+def _there(
+    t: np.ndarray, phase: np.ndarray, force: np.ndarray, place: np.ndarray, speed: np.ndarray
+) -> np.ndarray:
+    """Where each channel's equation is defined and every signal in it was recorded (N, C)."""
+    free, carry, held = phase == 0, phase == 2, phase > 0
+    still = held & ~carry & (phase != 4)
+    step = np.diff(t)
+    even = np.zeros(t.size, bool)
+    even[1:-1] = np.abs(step[1:] / step[:-1] - 1) < 0.2
+    both = even & place & speed
+    both[1:-1] &= (place & speed)[2:] & (place & speed)[:-2]
+    near = speed.copy()
+    near[1:-1] &= speed[2:] & speed[:-2]
+    inertial = force & near
+    columns = {
+        "x": still & force & place,
+        "y": (still | (phase == 4)) & force & place,
+        "distance": held & force & place,
+        "offset": held & force & place,
+        "vx": both,
+        "vy": both,
+        "fx": (free & force) | (carry & inertial),
+        "fy": (free & force) | (carry & inertial),
+        "grip": free & force,
+        "shear": free & force,
+    }
+    return np.stack([columns[c] for c in CHANNELS], 1).astype(float)

@@ -1,0 +1,78 @@
+"""What is nobody's fault: linear unknowns integrated out, the noise's level and colour, blocks that turn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.jaxconfig import double_precision
+from hmmseg.segmentation.align import align
+from simgap.attribution.problem import Rows
+from simgap.gap.frame import build
+from simgap.gap.marginal import Nuisances
+from simgap.gap.noise_model import _density, _likeliest, coefficient_sd
+from simgap.gap.nuisances import _settling, _turning
+from simgap.gap.problem import problem
+from simgap.gap.trial_arrays import CHANNELS
+
+
+def test_products_are_those_of_the_marginal_density():
+    rng = np.random.default_rng(0)
+    columns, a, b = rng.normal(size=(30, 4)), rng.normal(size=(30, 3)), rng.normal(size=30)
+    columns[:, 3] = columns[:, 2]  # the same unknown twice
+    inverse = np.linalg.inv(np.eye(30) + columns @ columns.T)
+    nuisances = Nuisances(columns)
+    np.testing.assert_allclose(nuisances.product(a, b), a.T @ inverse @ b, atol=1e-10)
+    np.testing.assert_allclose(nuisances.product(a, a), a.T @ inverse @ a, atol=1e-10)
+    np.testing.assert_allclose(nuisances.left(b), inverse @ b, atol=1e-10)
+
+
+@pytest.mark.parametrize(("level", "colour"), [(1.0, 0.0), (1.3, 0.0), (0.8, 0.3)])
+def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
+    rng = np.random.default_rng(1)
+    turn = np.tile(np.pi * (np.arange(200) + 0.5) / 200, 10)
+    square = level**2 * _density(turn, colour) * rng.standard_normal(turn.size) ** 2
+    square[turn < 0.3] *= 50.0  # an effect: slow and large
+    found = _likeliest(turn, square)
+    assert found[0] == pytest.approx(level, rel=0.08)
+    assert found[1] == pytest.approx(colour, abs=0.08)
+
+
+@pytest.fixture(scope="module")
+def given(shared):
+    folder = shared / "recordings/none_1"
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    assert isinstance(task, BlockTask)
+    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
+    return double_precision(lambda: problem(build(trials, align(trials, task, rig), rig)))()
+
+
+def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
+    there = given.whitening.weight > 0
+    trial, sample, channel = np.nonzero(there)
+    rows = Rows(trial, channel, given.frame.arrays.subtask[trial, sample], given.frame.world.t[trial, sample],
+                given.frame.files, CHANNELS, tuple(map(str, range(len(given.frame.steps)))))  # fmt: skip
+    sd = coefficient_sd(given, rows, np.random.default_rng(2).standard_normal(trial.size))
+    for c, name in enumerate(CHANNELS):
+        low, high = (0.55, 1.5) if name in ("vx", "vy") else (0.9, 1.1)
+        assert low < np.sqrt(np.mean(sd[channel == c] ** 2)) < high, name
+    slow = (channel == CHANNELS.index("vy")) & (sd > np.median(sd[channel == CHANNELS.index("vy")]))
+    assert slow.any()  # three samples averaged: louder at low frequencies
+
+
+@double_precision
+def test_blocks_turn_and_settle_in_the_offset_and_height_alone(given):
+    there = given.whitening.weight > 0
+    channel = np.nonzero(there)[2]
+    carried = np.broadcast_to(given.frame.arrays.phase[..., 2:3] > 0, there.shape)[there]
+    turning, settling = _turning(given), _settling(given)
+    moves = given.frame.num_trials * given.frame.arrays.onehot.shape[2]
+    assert len(turning) == 2 and len(settling) == 3 * moves
+    for column in (*turning, *settling):
+        assert set(channel[np.abs(column[:, 0]) > 1e-9]) <= {CHANNELS.index("offset"), CHANNELS.index("y")}
+    # Firmly on its support a block does not turn: the offset moves in the air.
+    mine = channel == CHANNELS.index("offset")
+    assert turning[1][mine & carried].std() > 0

@@ -1,0 +1,64 @@
+"""Identification and diagnosis stand on one alignment and one set of contact equations: they must agree."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.identification import identify_aligned
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.segmentation.align import align
+from simgap.api import diagnose
+from simgap.gap.fit import Start, fit
+from simgap.gap.frame import build
+from simgap.gap.problem import neutral, problem
+from simgap.world.properties import Block
+from simgap.world.simulate import simulate_trials
+
+FOLDER = Path(__file__).parents[2] / "recordings/none_1"
+PROPERTIES = ("weight", "width", "height")
+DRAWN = {"block1": Block(0.71, 0.0231, 0.0142), "block2": Block(0.26, 0.0174, 0.0193)}
+
+
+def recorded(folder):
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    trials = [read_trial(path, rig) for path in sorted(folder.glob("trial_*.csv"))]
+    return align(trials, task, rig)
+
+
+def simulated(folder):
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    made = simulate_trials(task, rig, [DRAWN] * 3, [5, 6, 7], None)
+    return align([one.trial for one in made], task, rig)
+
+
+@pytest.mark.parametrize("source", [recorded, simulated])
+def test_properties_without_an_effect_are_those_identified(source):
+    """Each within one standard deviation of what `identify` says: two summaries of the same samples."""
+    aligned = source(FOLDER)
+    found = identify_aligned(aligned)
+    given = problem(build([one.trial for one in aligned.trials], aligned, aligned.rig))
+    healthy = fit(given, Start((), neutral(given)))
+    values = given.centre + given.spread * healthy.u[: given.num_properties].reshape(-1, 3)
+    assert len(found.names) == 6
+    for obj, prop in found.names:
+        draws = found.of(obj, prop)
+        mine = values[aligned.task.objects.index(obj), PROPERTIES.index(prop)]
+        assert abs(mine - draws.mean()) < draws.std(), (obj, prop)
+
+
+def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
+    found = identify_aligned(recorded(FOLDER))
+
+    def never(*args):
+        raise AssertionError("aligned again")
+
+    monkeypatch.setattr("simgap.gap.search.align", never)
+    told = diagnose(found)
+    assert told.body["verdict"] == "none"
+    np.testing.assert_array_equal(
+        [a.quantile(0.5) for a in told.search.aligned.trials[0].boundaries],
+        [a.quantile(0.5) for a in found.aligned.trials[0].boundaries],
+    )

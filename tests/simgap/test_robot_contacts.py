@@ -1,0 +1,156 @@
+"""Robots that touch things: when, in words; poses that one instrument reads; what each log has of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from simgap.robot_effects import by_log, readout_pose
+from simgap.robot_effects.base import Setting
+from simgap.simulators.protocol import Channel, Parameter
+from simgap.simulators.recording import Recording
+
+POSE = {a: a for a in ("x", "y", "z", "qw", "qx", "qy", "qz")}
+
+
+class Posed:
+    """A body whose pose is read."""
+
+    parameters = {}  # noqa: RUF012
+    channels = {a: Channel("1" if a[0] == "q" else "m", "position") for a in POSE}  # noqa: RUF012
+    poses = {"cube": POSE}  # noqa: RUF012
+    by_log = {"shift": Parameter(0.0, 0.3, "s"), "offset": Parameter(0.0, 0.01, "m")}  # noqa: RUF012
+
+    def simulate(self, parameters, recording, start=None):
+        """Never run here."""
+        raise NotImplementedError
+
+
+def tumbling(name: str = "log.csv") -> Recording:
+    """A body that turns about a slanted axis and flies."""
+    t = np.arange(0.0, 0.5, 0.01)
+    half = 1.5 * t
+    axis = np.array([0.6, 0.0, 0.8])
+    turn = {"qw": np.cos(half)} | {f"q{a}": axis[k] * np.sin(half) for k, a in enumerate("xyz")}
+    return Recording(name, t, {"x": 0.3 * t, "y": 0.1 + 0 * t, "z": 1 - 4.9 * t**2} | turn)
+
+
+@pytest.mark.parametrize(
+    ("name", "theta"),
+    [
+        ("pose:cube.lag", {"delay": 0.02}),
+        ("pose:cube.turned", {"about_x": 0.03, "about_y": -0.02, "about_z": 0.05}),
+        ("pose:cube.offset", {"x": 0.01, "y": 0.0, "z": -0.02}),
+    ],
+)
+def test_what_a_pose_is_read_through_is_undone(name, theta):
+    log = tumbling()
+    effects = {e.name: e for e in readout_pose.candidates(Setting(Posed(), [log]))}
+    read = log.with_columns(effects[name].alter(log, log.columns, theta))
+    assert max(np.abs(read[a] - log[a]).max() for a in POSE) > 1e-3
+    back = effects[name].restore(read, theta)
+    inside = slice(0, -3)  # a lag's last samples are not recorded
+    assert all(np.allclose(back[a][inside], log[a][inside], atol=2e-4) for a in POSE)
+    turn = np.array([read[a] for a in ("qw", "qx", "qy", "qz")])
+    assert np.allclose((turn**2).sum(0), 1.0, atol=1e-4)
+
+
+def test_an_offset_turns_with_the_body():
+    """About the vertical by half a turn, an arm along x points back."""
+    turn = np.array([[np.cos(np.pi / 2)], [0.0], [0.0], [np.sin(np.pi / 2)]])
+    assert np.allclose(readout_pose.rotated(turn, np.array([0.1, 0.0, 0.2]))[:, 0], [-0.1, 0.0, 0.2])
+
+
+def test_each_log_has_its_own_shift_and_no_component_of_a_turn_a_gain():
+    logs = [tumbling("a.csv"), tumbling("b.csv")]
+    setting = Setting(Posed(), logs)
+    shift, offset = by_log.candidates(setting)
+    assert list(shift.parameters) == ["a.csv", "b.csv"] and shift.fitted and shift.by_log
+    assert list(offset.parameters)[:3] == ["a.csv.x", "a.csv.y", "a.csv.z"]
+    late = shift.alter(logs[1], logs[1].columns, {"a.csv": 0.3, "b.csv": 0.1})
+    assert np.allclose(late["x"][10:], logs[1]["x"][:-10]) and np.allclose(late["x"][:10], 0.0)
+    assert setting.alone() == ["x", "y", "z"] and setting.late_alone() == []
+
+
+def test_a_brief_touch_counts_and_a_brief_break_does_not():
+    pytest.importorskip("mujoco")
+    from simgap.simulators.mjcf.touching import closed
+
+    t = np.arange(12) * 0.01
+    pair, none = frozenset({"cube on board"}), frozenset()
+    sets = [none, none, pair, none, none, none, none, none, pair, none, pair, none]
+    told = closed(t, sets)
+    assert [bool(s) for s in told] == [bool(i in (2, 8, 9, 10)) for i in range(12)]
+
+
+DROP = """<mujoco><option timestep="0.002"/><worldbody>
+<geom name="board" type="plane" size="2 2 .1"/>
+<body name="cube" pos="0 0 .5"><freejoint/><geom name="box" type="box" size=".05 .05 .05" mass=".4"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def dropped(tmp_path_factory):
+    """A model of a cube and a log of its fall and rest, read on a scale of 0.97."""
+    mujoco = pytest.importorskip("mujoco")
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    folder = tmp_path_factory.mktemp("drop")
+    (folder / "cube.xml").write_text(DROP, encoding="utf-8")
+    text = "".join(f'[columns.{a}]\nbody = "cube"\naxis = "{a}"\n' for a in POSE)
+    (folder / "map.toml").write_text(text, encoding="utf-8")
+    model = mujoco.MjModel.from_xml_string(DROP)
+    data, rows = mujoco.MjData(model), []
+    for _ in range(100):
+        rows.append([data.time, *data.qpos])
+        mujoco.mj_step(model, data, 5)
+    table = np.array(rows)
+    table[:, 1:4] *= 0.97
+    head = "t," + ",".join(POSE)
+    np.savetxt(folder / "log.csv", table, delimiter=",", header=head, comments="")
+    loaded = load_mjcf(folder / "cube.xml", folder / "map.toml")
+    return loaded.simulator, loaded.read(folder / "log.csv")
+
+
+def test_flight_and_contact_are_told_apart(dropped):
+    from simgap.robots.phases import phases_of
+    from simgap.robots.rows import rows_of
+    from simgap.robots.windows import cut
+
+    simulator, log = dropped
+    times, what = simulator.contact_states(log)
+    fall = np.sqrt(2 * 0.45 / 9.81)
+    first = times[what.index("cube on board")]
+    assert fall - 0.03 < first < fall + 0.01 and what[0] == "free"
+    noise = dict.fromkeys(POSE, 1e-3)
+    windows = cut(simulator, [log], noise, 0.2)
+    assert not windows[0].touching and windows[-1].touching
+    assert any(abs(log.t[w.begin] - first) < 0.011 for w in windows)
+    phases = phases_of(simulator, [log])
+    rows = rows_of([log], windows, noise)
+    names = np.array(phases.names)[phases.of(rows)]
+    assert all(n.endswith("free") for n in names[~rows.touching])
+    assert all(n.endswith("cube on board") for n in names[rows.touching])
+
+
+def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
+    """Windows in contact admit that each impact differs: their weight on the scale is small."""
+    from simgap.robot_effects.readout_scale import candidates
+    from simgap.robots.linear import linearise
+    from simgap.robots.model import Composed
+    from simgap.robots.whiten import covariances
+
+    simulator, log = dropped
+    (scale,) = candidates(Setting(simulator, [log]))
+    noise = dict.fromkeys(POSE, 1e-4)
+    composed = Composed.of(simulator, [log], {scale.name: scale}, noise, 0.2)
+    linear = linearise(composed, {}, [scale.name])
+    kinds = {n: c.kind for n, c in simulator.channels.items()}
+    whiten = covariances(linear, composed.windows, kinds).whitener()
+    slope = whiten(linear.moved[scale.name].jacobian)[:, 0]
+    residual = whiten(linear.residual)
+    free = ~composed.rows.touching
+    told = slope[free] @ residual[free] / (slope[free] @ slope[free])
+    assert told == pytest.approx(-0.03, abs=0.004)
+    each = [float(slope[w] @ slope[w]) for w in composed.rows.of if composed.rows.touching[w.start]]
+    assert max(each) <= 1.01 / 0.02**2  # no window in contact tells more than the scale's usual size
