@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: boundaries bench bench-watch before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -56,6 +56,11 @@ bench: $(INSTALLED)  ## kernels beside hmmlearn and dynamax, stages of the comma
 	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
 	$(BIN)/python -m experiments.write_tables
 
+bench-solvers: $(INSTALLED)  ## optimistix and SciPy beside our own solver on the same problems; fills docs/benchmarks.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[bench]'
+	$(BIN)/python -m experiments.benchmarks.solvers recordings/force_bias_1
+	$(BIN)/python -m experiments.write_tables
+
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
 	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
@@ -98,3 +103,9 @@ check-gap: $(INSTALLED)  ## diagnose a small sealed set of another simulator's r
 
 fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, in process (some minutes)
 	PYTHONPATH=tests $(BIN)/python -m experiments.fuzz --cases 100000 --keep build/fuzz
+
+identified: $(INSTALLED)  ## properties and boundaries in labs drawn anew (build/drawn) and in folders of RECORDINGS
+	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 830001 --fastest 200 --out build/drawn
+	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --keep
+	$(BIN)/python -m experiments.identified build/drawn --pooled 1 --keep
+	$(BIN)/python -m experiments.write_tables

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from estimation.design import PROPERTIES, build
+from estimation.design import build
 from estimation.mode import find_mode
 from estimation.observations import aligned_weights
 from estimation.posterior import posterior
 from estimation.sampler import sample
+from estimation.unknowns import PROPERTIES
 from experiments.recordings import Case
 from experiments.scoring import boundaries_covered, boundary_residuals
 from hmmseg.segmentation.align import align

@@ -3,8 +3,8 @@
     python -m experiments.identified FOLDER... [--rig rig_pads.toml] [--pooled 1] [--keep]
 
 A case's trials are estimated in groups of `--pooled` (all of them by default). Prints a row for each
-property, then z and coverage by folder, healthy cases and others apart; --keep writes these summaries to
-experiments/results/identified.json, which docs/calibration.md shows.
+property, then z and coverage, also of boundaries, by folder, healthy cases and others apart; --keep writes
+these summaries to experiments/results/identified.json, which docs/calibration.md shows.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def rows_of(folder: Path, rig: str, pooled: int | None, seed: int = 0) -> Iterat
         group = slice(start, start + size)
         found = identify(list(case.trials[group]), case.task, hand, seed)
         same = {
-            "case": case.name, "effect": label, "start": start,
+            "case": case.name, "effect": label, "start": start, "trials": size,
             "sampler": None if found.sampled is None else found.sampled.method,
             "warnings": list(found.warnings), **_boundaries(found.segmentations, case.truth[group]),
         }  # fmt: skip
@@ -100,6 +100,20 @@ def summary(rows: Sequence[Row]) -> dict[str, Row]:
     return out
 
 
+def boundaries(rows: Sequence[Row]) -> Row | None:
+    """Boundaries of all groups of trials that fit: number, median and 95 % of errors [s], 90 % coverage."""
+    groups = {(r["case"], r["start"]): r for r in rows}.values()
+    error = np.abs(np.concatenate([[], *(r["boundaries"] for r in groups)]))
+    held = np.concatenate([[], *(r.get("held_90", []) for r in groups)])
+    if not error.size:
+        return None
+    return {
+        "count": int(error.size), "misfits": int(sum(r["trials"] - r["complete"] for r in groups)),
+        "median": float(np.median(error)), "percentile_95": float(np.percentile(error, 95)),
+        "coverage_90": float(held.mean()),
+    }  # fmt: skip
+
+
 def summary_lines(name: str, found: dict[str, Row]) -> Iterator[str]:
     """A summary for people."""
     for prop, s in found.items():
@@ -132,12 +146,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 print(line(row), flush=True)
         kept = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
         for kind in ("healthy", "unlabelled", "other"):
-            found = summary([r for r in rows if _kind(r) == kind])
+            mine = [r for r in rows if _kind(r) == kind]
+            found = summary(mine)
             size = "all trials" if options.pooled is None else f"{options.pooled} a time"
             name = f"{folder.name}, {kind}, {options.rig.removesuffix('.toml')}, {size}"
             if found:
-                kept[name] = found
                 print(*summary_lines(name, found), sep="\n", flush=True)
+                seen = boundaries(mine)
+                kept[name] = found | ({} if seen is None else {"boundaries": seen})
+                print(f"{name:32} boundaries {seen}", flush=True)
         if options.keep:
             save(RESULTS, kept)
     if options.json is not None:

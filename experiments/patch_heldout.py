@@ -11,21 +11,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from experiments.saving import save
 from experiments.table_text import RESULTS, load, markdown
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import read_trial
-from hmmseg.segmentation.align import segment
 from simgap.gap.diagnose import diagnose
-from simgap.patch import files, replayed
-from simgap.world.properties import read_properties
+from simgap.patch import files, reproduced
 
 
 def measured(folder: Path) -> dict[str, Any]:
@@ -39,28 +34,8 @@ def measured(folder: Path) -> dict[str, Any]:
     written = files((folder / "rig.toml").read_text(encoding="utf-8"), body)
     if not written:
         return row
-    with tempfile.TemporaryDirectory(prefix="hmmseg-") as place:
-        for name, text in written.items():
-            (Path(place) / name).write_text(text, encoding="utf-8")
-        patched = read_rig(Path(place) / "rig.toml")
-        after = read_properties(Path(place) / "actual.toml", task)
-    shift = body["effects"]["+".join(body["causes"])]["property_shift"]
-    before = {n: _before(b, n, shift) for n, b in after.items()}
-    found = segment(trials[half:], task, rig)
-    sums: dict[str, list[float]] = {"nominal": [], "patched": []}
-    for trial, spans in zip(trials[half:], found, strict=True):
-        ends = [s.start for s in spans.spans[1:]]
-        for name, hand, blocks in (("nominal", rig, before), ("patched", patched, after)):
-            residual = replayed(trial, task, hand, blocks, ends).residual
-            sums[name].append(float(np.nanmean(residual**2)))
-    return row | {k: float(np.sqrt(np.mean(v))) for k, v in sums.items()}
-
-
-def _before(block: Any, name: str, shift: dict[str, Any]) -> Any:
-    from dataclasses import replace
-
-    mine = {k.partition(".")[2]: v["before"] for k, v in shift.items() if k.startswith(f"{name}.")}
-    return replace(block, **mine)
+    nominal, patched = reproduced(written, body, trials[half:], task, rig)
+    return row | {"nominal": nominal, "patched": patched}
 
 
 def table() -> str | None:

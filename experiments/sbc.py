@@ -23,10 +23,11 @@ from scipy import stats
 
 from estimation import priors
 from estimation.compliance import SLOPE_SD
-from estimation.design import PROPERTIES, Design, Unknown
+from estimation.design import Design
 from estimation.nuisance import Nuisance
 from estimation.posterior import posterior
 from estimation.sampler import sample
+from estimation.unknowns import PROPERTIES, Unknown
 from experiments.saving import save
 
 HERE = Path(__file__).parent

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from experiments.scoring import PROPERTIES
 from experiments.table_text import load, markdown, percent
 
 
@@ -22,12 +23,31 @@ def identified() -> str | None:
         if name == "made_by":
             continue
         for prop, s in properties.items():
-            if prop != "all":
+            if prop in PROPERTIES:
                 cells = [f"{s['count']} ({s['null']})", percent(s["median"], 3), percent(s["rms"], 3)]
                 cells += [f"{s['z_rms']:.2f}", percent(s["coverage_68"], 0), percent(s["coverage_95"], 0)]
                 rows.append([name, prop, *cells])
     head = ["recordings, kind, rig file, trials", "property", "estimates (null)", "median error", "rms error",
             "rms of z", "68 % cover", "95 % cover"]  # fmt: skip
+    return markdown(head, rows)
+
+
+def boundaries() -> str | None:
+    """Boundaries of the same recordings."""
+    found = load("identified")
+    if found is None:
+        return None
+    rows = []
+    for name, properties in found.items():
+        seen = properties.get("boundaries") if name != "made_by" else None
+        if seen is not None:
+            cells = [f"{seen['count']}", f"{seen['misfits']}"]
+            cells += [f"{1e3 * seen[k]:.1f} ms" for k in ("median", "percentile_95")]
+            rows.append([name, *cells, percent(seen["coverage_90"], 0)])
+    if not rows:
+        return None
+    head = ["recordings, kind, rig file, trials", "boundaries", "trials that do not fit", "median error",
+            "95 % of errors below", "90 % cover"]  # fmt: skip
     return markdown(head, rows)
 
 

@@ -2,11 +2,14 @@
 
     python -m experiments.blind_check generate --cases 300 --seed S --out DIR [--outside FILE.py]
     python -m experiments.blind_check untidy --trials 4 --seed S --out DIR
+    python -m experiments.blind_check open --cases 40 --seed S --out DIR [--tiers healthy single ...]
     python -m experiments.blind_check diagnose --cases DIR/cases --out RESULTS
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
 
 generate prints the seal's hash; diagnose reads user folders only and may be stopped and started again;
-score opens the seal, checks the hash and writes all figures. docs/blind_check.md has the protocol.
+open writes cases with their answers beside
+them, as other folders of recordings have them; score opens the seal,
+checks the hash and writes all figures. docs/blind_check.md has the protocol.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.blind_check.cases import TIERS
 from experiments.blind_check.sealing import code_digest
 from experiments.blind_check.tables import table
 from experiments.saving import save
@@ -38,6 +42,12 @@ def main(args: Sequence[str] | None = None) -> int:
     hands.add_argument("--trials", type=int, default=4)
     hands.add_argument("--seed", type=int, required=True)
     hands.add_argument("--out", type=Path, required=True)
+    plain = steps.add_parser("open")
+    plain.add_argument("--cases", type=int, default=40)
+    plain.add_argument("--tiers", nargs="+", default=["healthy"], choices=sorted(TIERS))
+    plain.add_argument("--seed", type=int, required=True)
+    plain.add_argument("--out", type=Path, required=True)
+    plain.add_argument("--fastest", type=float, default=float("inf"), help="no world samples faster [Hz]")
     run = steps.add_parser("diagnose")
     run.add_argument("--cases", type=Path, required=True)
     run.add_argument("--out", type=Path, required=True)
@@ -48,9 +58,8 @@ def main(args: Sequence[str] | None = None) -> int:
     judge.add_argument("--json", type=Path, default=RESULTS)
     judge.add_argument("--only", nargs="+", default=[], help="cases FROM:TO only: a run that was cut short")
     given = parser.parse_args(args)
-    return {"generate": _generate, "untidy": _untidy, "diagnose": _diagnose, "score": _score}[given.step](
-        given
-    )
+    step = {"generate": _generate, "untidy": _untidy, "open": _open, "diagnose": _diagnose, "score": _score}
+    return step[given.step](given)
 
 
 def _tell(text: str) -> None:
@@ -71,6 +80,15 @@ def _untidy(given: argparse.Namespace) -> int:
     from experiments.blind_check.untidy_trials import write_untidy
 
     print("\n".join(write_untidy(given.out, given.trials, given.seed)))
+    return 0
+
+
+def _open(given: argparse.Namespace) -> int:
+    from experiments.blind_check.open_folder import write_open
+
+    shares = {tier: TIERS[tier] for tier in given.tiers}
+    tell = lambda k, n: _tell(f"{k}/{n}")  # noqa: E731
+    write_open(given.out, given.cases, given.seed, shares, given.fastest, tell)
     return 0
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments.blind_check.effects import CATALOGUE, Change, Made, Values, fitted
+from experiments.blind_check.effects import CATALOGUE, Change, Made, fitted
 from experiments.blind_check.hand import Rig
 from experiments.blind_check.operator import Style, plan
 from experiments.blind_check.outside import OUTSIDE
@@ -25,6 +25,7 @@ from experiments.blind_check.signals import (
     sense,
     task_space,
 )
+from experiments.blind_check.stages import Values
 from experiments.blind_check.worlds import Circumstances, draw_world
 
 TRIALS = 4

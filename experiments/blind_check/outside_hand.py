@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from experiments.blind_check.effects import Rng, Values, _force
 from experiments.blind_check.hand import angles, jacobians
 from experiments.blind_check.signals import Signals, Stage
+from experiments.blind_check.stages import Rng, Values, added_force
 
 
 def magnet(v: Values) -> Stage:
@@ -18,7 +18,7 @@ def magnet(v: Values) -> Stage:
     def shift(s: Signals, rng: Rng) -> np.ndarray:
         return np.array([0, 1, 0, 1]) * v["pull"] * np.exp(-s.motion.position[:, [1, 1, 3, 3]] / v["reach"])
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def ripple(v: Values) -> Stage:
@@ -36,7 +36,7 @@ def ripple(v: Values) -> Stage:
 
 def dry(v: Values) -> Stage:
     """Dry friction of a sleeve on each finger: constant against the direction of motion."""
-    return _force(lambda s, rng: v["force"] * np.tanh(s.motion.velocity / 0.004))
+    return added_force(lambda s, rng: v["force"] * np.tanh(s.motion.velocity / 0.004))
 
 
 def tacky(v: Values) -> Stage:
@@ -53,7 +53,7 @@ def tacky(v: Values) -> Stage:
                 out[:, channel] -= inwards * v["pull"] * drawn * eased
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def uncounted(v: Values) -> Stage:
@@ -76,7 +76,7 @@ def curtained(v: Values) -> Stage:
         out[:, 3] = v["friction"] * out[:, 2] * np.tanh(s.motion.velocity[:, 3] / 0.004)
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def clinging(v: Values) -> Stage:
@@ -93,7 +93,7 @@ def clinging(v: Values) -> Stage:
             out[:, [1, 3]] += pull[:, None] / 2
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def tendons(v: Values) -> Stage:
@@ -134,7 +134,7 @@ def nozzle(v: Values) -> Stage:
         jet = v["push"] * np.exp(-(((s.motion.position[:, 0::2] - v["place"]) / v["radius"]) ** 2))
         return np.repeat(jet * gusts[:, None], 2, axis=1) * np.array([v["slant"], 1.0] * 2)
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def rolling(v: Values) -> Stage:
@@ -162,7 +162,7 @@ def tied(v: Values) -> Stage:
         pull = v["stiffness"] * np.maximum(apart - v["slack"], 0.0) * way / apart
         return np.concatenate([-pull, pull], 1)
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def loosened(v: Values) -> Stage:
@@ -226,7 +226,7 @@ def knocked(v: Values) -> Stage:
             out += rng.uniform(0.6, 1.4) * swing[:, None] * np.array([np.cos(way), np.sin(way)] * 2)
         return v["amplitude"] * out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def sagging(v: Values) -> Stage:

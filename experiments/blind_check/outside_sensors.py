@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from experiments.blind_check.effects import Rng, Values, _force
 from experiments.blind_check.hand import jacobians
 from experiments.blind_check.signals import Signals, Stage
+from experiments.blind_check.stages import Rng, Values, added_force
 
 
 def lazy(v: Values) -> Stage:
@@ -34,7 +34,7 @@ def hum(v: Values) -> Stage:
         share = np.array([1.0, 0.7, -0.8, 0.6])
         return v["amplitude"] * np.sin(2 * np.pi * v["frequency"] * s.t + phase)[:, None] * share
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def jump(v: Values) -> Stage:
@@ -46,7 +46,7 @@ def jump(v: Values) -> Stage:
         out[:, int(v["channel"])] = v["height"] * (s.t > at)
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def kinked(v: Values) -> Stage:
@@ -96,7 +96,7 @@ def wandering(v: Values) -> Stage:
         start = keep * rng.standard_normal((1, 4))
         return v["rms"] * np.asarray(lfilter([1.0], [1.0, -keep], steps, axis=0, zi=start)[0])
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def behind(v: Values) -> Stage:
@@ -151,7 +151,7 @@ def rectified(v: Values) -> Stage:
         share = np.array([1.0, v["share"], -0.7, 0.8])
         return v["height"] * share * speed**2 / (speed**2 + v["speed"] ** 2)
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def tared(v: Values) -> Stage:
@@ -192,7 +192,7 @@ def capacitive(v: Values) -> Stage:
         share = np.array([1.0, v["lean1"], -v["share"], v["lean2"]])
         return v["height"] * (near - near[0])[:, None] * share
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def stuck(v: Values) -> Stage:
@@ -204,7 +204,7 @@ def stuck(v: Values) -> Stage:
         finger = np.repeat(np.arange(2) == int(v["finger"]), 2)
         return v["bit"] * (v["value"] - is_set) * finger
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def grounded(v: Values) -> Stage:
@@ -216,4 +216,4 @@ def grounded(v: Values) -> Stage:
         share = np.array([v["share1"], 1.0, v["share2"], v["share3"]])
         return v["height"] * current[:, None] * share
 
-    return _force(shift)
+    return added_force(shift)

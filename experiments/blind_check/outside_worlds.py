@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from experiments.blind_check.effects import Change, Made, Rng, Values, _force, _sign
+from experiments.blind_check.effects import Change, Made, _sign
 from experiments.blind_check.signals import ENCODER, HAND, LINKS, MIX, READOUT, SCALE, Signals, Stage
+from experiments.blind_check.stages import Rng, Values, added_force
 
 
 def posed(v: Values) -> Stage:
@@ -36,7 +37,7 @@ def magnetised(v: Values) -> Stage:
                 out[:, [1, 3]] += near[:, None] / 2
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def sloshing(v: Values) -> Stage:
@@ -57,7 +58,7 @@ def sloshing(v: Values) -> Stage:
         push = v["mass"] * np.asarray(swing) * held
         return np.stack([push / 2, 0 * push, push / 2, 0 * push], 1)
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def pumped(v: Values) -> Stage:
@@ -68,7 +69,7 @@ def pumped(v: Values) -> Stage:
         pulse = np.exp(-0.5 * ((phase - 0.5) / v["width"]) ** 2)
         return v["height"] * (pulse - pulse.mean())[:, None] * np.array([v["side"], 1.0, v["side"], 1.0])
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def deadened(v: Values) -> Stage:
@@ -110,7 +111,7 @@ def dripping(v: Values) -> Stage:
             out[:, [1, 3]] -= lost[:, None] / 2
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def mounted(v: Values) -> Stage:
@@ -142,7 +143,7 @@ def hanging(v: Values) -> Stage:
         out[:, 0::2] = np.asarray(swing) * np.array([v["mass1"], v["mass2"]])
         return out
 
-    return _force(shift)
+    return added_force(shift)
 
 
 def _made(name: str, draw, stage: int, build) -> Made:

@@ -47,7 +47,9 @@ def model_text(params: dict) -> str:
 
 def map_text() -> str:
     """Which column is which component of the cube's pose."""
-    return "".join(f'[columns.{c}]\nbody = "cube"\naxis = "{a}"\n' for c, a in POSE.items())
+    return "window = 0.2\n" + "".join(
+        f'[columns.{c}]\nbody = "cube"\naxis = "{a}"\n' for c, a in POSE.items()
+    )
 
 
 def write_inputs(folder: Path, into: Path, count: int = TOSSES) -> list[Path]:
@@ -72,7 +74,8 @@ def run(folder: Path, count: int = TOSSES) -> dict:
         paths = write_inputs(folder, Path(into), count)
         loaded = load_mjcf(Path(into) / "cube.xml", Path(into) / "map.toml")
         logs = [loaded.read(p) for p in paths]
-        return summary(diagnose(loaded.simulator, logs, more=loaded.effects(logs), tell=print))
+        more = loaded.effects(logs)
+        return summary(diagnose(loaded.simulator, logs, more=more, tell=print, length=loaded.map.length))
 
 
 def main() -> None:

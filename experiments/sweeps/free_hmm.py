@@ -14,8 +14,8 @@ from jax import lax
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
 from hmmseg.hand.signals import Signals
-from hmmseg.hmm.banded import log_sum_exp
 from hmmseg.hmm.dense import viterbi
+from hmmseg.hmm.scans import log_sum_exp
 from hmmseg.segmentation.features import noise_sd, thin
 from hmmseg.segmentation.fit import otsu
 from hmmseg.segmentation.thresholds import NUMBERS, StateLabels

@@ -33,7 +33,7 @@ from experiments.sweeps.methods import (
 from experiments.sweeps.trials import Recorded, interpolated, record_cell, scene, stated_rig
 from hmmseg.contact.decompose import Subtask, subtasks
 from hmmseg.hand.signals import Signals, task_space
-from hmmseg.hmm.banded import InfeasibleAlignment
+from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.align import align

@@ -1,0 +1,146 @@
+"""Good files of every kind, and what reads them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+
+import numpy as np
+
+
+class Scene:
+    """Good files of every kind, and what reads them."""
+
+    def __init__(self, folder: Path) -> None:
+        from hmmseg.io.rig import read_rig
+        from hmmseg.io.task import parse_task, read_task
+
+        self.folder = folder
+        t = np.arange(24) / 20
+        names = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
+        rng = np.random.default_rng(0)
+        table = {"t": t} | {name: 0.1 * rng.normal(size=24) + (name == "x2") for name in names}
+        rows = [",".join(table), *(",".join(f"{table[name][i]:.6g}" for name in table) for i in range(24))]
+        later = np.arange(80) / 20
+        still = 0 * later
+        arm = {"t": later, "px": later * 0.1, "pz": 0.1 + 0.02 * np.sin(3 * later), "fx": still, "fy": still,
+               "gap": 0.05 - 0.03 * (np.abs(later - 2) < 1), "fz": 5 + 0.1 * rng.normal(size=80)}  # fmt: skip
+        arm_rows = [",".join(arm), *(",".join(f"{arm[name][i]:.6g}" for name in arm) for i in range(80))]
+        self.good: dict[str, bytes] = {
+            "trial.csv": "\n".join(rows).encode(),
+            "semicolons.csv": "\n".join(rows).replace(",", ";").replace(".", ",").encode(),
+            "arm.csv": "\n".join(arm_rows).encode(),
+            "rig.toml": RIG, "gripper.toml": GRIPPER, "task.toml": TASK, "sequence.toml": SEQUENCE,
+            "actual.toml": ACTUAL,
+        }  # fmt: skip
+        self.good |= _binary(folder, table)
+        for name, data in self.good.items():
+            (folder / name).write_bytes(data)
+        self.rig, self.task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+        self.gripper = read_rig(folder / "gripper.toml")
+        self.order = parse_task({"sequence": ["reach", "lift"]})
+
+    def read(self, name: str, path: Path) -> None:
+        """Read a damaged file as its kind is read."""
+        from estimation.actual import read_actual
+        from hmmseg.contact.decompose import decompose
+        from hmmseg.io.inspect import inspect
+        from hmmseg.io.rig import read_rig
+        from hmmseg.io.task import read_task
+        from hmmseg.io.trial import read_trial
+
+        if name == "arm.csv":
+            read_trial(path, self.gripper)
+        elif name in ("rig.toml", "gripper.toml"):
+            read_rig(path)
+        elif name in ("task.toml", "sequence.toml"):
+            decompose(read_task(path))
+        elif name == "actual.toml":
+            read_actual(path, ("a", "b"))
+        elif name == "info.json":
+            (self.folder / "lerobot/meta/info.json").write_bytes(path.read_bytes())
+            read_trial(self.folder / "lerobot", None, self.order)
+        elif name in ("log.mcap", "log.bag", "demos.hdf5"):
+            read_trial(path, None, self.order)
+        else:
+            inspect(path)
+            read_trial(path, self.rig)
+
+
+RIG = b"""rate = 20
+gravity = 9.81
+[fingertip]
+normal_stiffness = 4000.0
+shear_stiffness = inf
+[noise]
+position = 2e-5
+force = 0.02
+[systematic]
+force_bias = [0.1, 0.1, 0.1, 0.1]
+pad_stiffness = {1 = 0.1}
+[tolerance]
+force = 0.05
+[columns]
+x1 = {from = "x1", unit = "m", sign = 1, offset = 0.0}
+"""
+GRIPPER = b"""gravity = 9.81
+[gripper]
+position = {x = "px", z = "pz"}
+closing = "x"
+opening = "gap"
+wrench = ["fx", "fy", "fz"]
+frame = "sensor"
+sensor_axes = ["y", "x", "-z"]
+tool_mass = 0.5
+grip_force = 10.0
+"""
+TASK = b"""repeat = 2
+[objects.a]
+on = "b"
+[objects.b]
+on = "ground"
+[[moves]]
+object = "a"
+to = "ground"
+[[moves]]
+object = "a"
+to = "b"
+slide = false
+"""
+SEQUENCE = b"""sequence = ["approach", "insert", "mate"]
+channels = ["fx", "fy"]
+optional = ["insert"]
+"""
+ACTUAL = b"""[a]
+weight = {value = 0.4, unit = "N", sd = 0.01}
+width = {value = 0.02, unit = "m"}
+[b]
+height = {value = 0.02, unit = "m"}
+"""
+
+
+def _binary(folder: Path, table: dict[str, np.ndarray]) -> dict[str, bytes]:
+    """The same table as NPZ, and as Parquet and HDF5 where their libraries are there."""
+    made: dict[str, bytes] = {}
+    buffer = io.BytesIO()
+    np.savez(buffer, **table)  # type: ignore[arg-type]
+    made["trial.npz"] = buffer.getvalue()
+    with contextlib.suppress(ImportError):
+        import pyarrow
+        import pyarrow.parquet
+
+        buffer = io.BytesIO()
+        pyarrow.parquet.write_table(pyarrow.table(table), buffer)
+        made["trial.parquet"] = buffer.getvalue()
+    with contextlib.suppress(ImportError):  # of the tests; on the path where these run
+        from file_writers import write_bag, write_lerobot, write_mcap, write_robomimic
+
+        for name, write in (
+            ("log.mcap", write_mcap),
+            ("log.bag", write_bag),
+            ("demos.hdf5", write_robomimic),
+        ):
+            made[name] = write(folder / f"made-{name}").read_bytes()
+        made["info.json"] = (write_lerobot(folder / "lerobot") / "meta/info.json").read_bytes()
+    return made

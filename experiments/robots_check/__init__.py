@@ -1,0 +1,1 @@
+"""The diagnosis checked blind on robots that others modelled, with seeded faults drawn here."""

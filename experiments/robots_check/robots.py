@@ -1,0 +1,94 @@
+"""Robots out of packages' wheels, made light (meshes left out) and changed a little, and their motions.
+
+pip download --no-deps --only-binary :all: -d DIR dm-control robosuite     # then unzip the wheels in DIR
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+LIKE: Any = mujoco
+LONGEST = 0.005  # s: solver's step of the diagnosing model at most
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Where its model stands in a folder of unzipped wheels; `driven`: actuator to joint and command's unit;
+    `read`: joints that are recorded; `reach` [rad] and `rate` [Hz] of its motions; `seconds` of a log."""
+
+    name: str
+    file: str
+    driven: Mapping[str, tuple[str, str]]
+    read: tuple[str, ...]
+    reach: float
+    rate: float
+    seconds: float
+    about: Mapping[str, float] = field(default_factory=dict)
+
+
+UR5E = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+ROBOTS = (
+    Robot(
+        "pendulum",
+        "dm_control/suite/pendulum.xml",
+        {"torque": ("hinge", "Nm")},
+        ("hinge",),
+        0.2,
+        0.7,
+        4.0,
+        {"hinge": np.pi},
+    ),
+    Robot(
+        "ur5e",
+        "robosuite/models/assets/robots/ur5e/robot.xml",
+        {f"torq_j{i + 1}": (f"{n}_joint", "Nm") for i, n in enumerate(UR5E)},
+        tuple(f"{n}_joint" for n in UR5E),
+        0.5,
+        0.6,
+        2.5,
+        {"shoulder_lift_joint": -1.2, "elbow_joint": 1.4, "wrist_1_joint": -1.0, "wrist_2_joint": -1.5},
+    ),
+    Robot(
+        "manipulator",
+        "dm_control/suite/manipulator.xml",
+        {"root": ("arm_root", "1"), "shoulder": ("arm_shoulder", "1"), "elbow": ("arm_elbow", "1"),
+         "wrist": ("arm_wrist", "1"), "grasp": ("thumb", "1")},
+        ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "thumb", "thumbtip", "finger", "fingertip"),
+        0.5,
+        0.7,
+        2.5,
+        {"arm_shoulder": 0.8, "arm_elbow": 0.8},
+    ),
+)  # fmt: skip
+
+
+def nominal_xml(robot: Robot, models: Path, rng: np.random.Generator) -> str:
+    """The diagnosing model: the package's, without meshes, masses and damping other than there."""
+    spec = LIKE.MjSpec.from_file(str(models / robot.file))
+    for geom in list(spec.geoms):
+        if geom.type == LIKE.mjtGeom.mjGEOM_MESH:
+            spec.delete(geom)
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
+    for body in spec.bodies:
+        if body.explicitinertial:
+            share = rng.uniform(0.85, 1.15)
+            body.mass *= share
+            body.inertia = np.array(body.inertia) * share
+    for joint in spec.joints:
+        joint.damping = np.array(joint.damping) * rng.uniform(0.6, 1.6)
+    spec.option.timestep = min(spec.option.timestep, LONGEST)
+    return spec.to_xml()
+
+
+def map_toml(robot: Robot, noise: float) -> str:
+    """Which column is which: commands by actuator, positions by joint."""
+    out = [f'[columns.u_{a}]\nactuator = "{a}"\nunit = "{unit}"\n' for a, (_, unit) in robot.driven.items()]
+    out += [f'[columns.q_{j}]\njoint = "{j}"\nnoise = {noise}\n' for j in robot.read]
+    return "".join(out)

@@ -1,0 +1,98 @@
+"""What the check is scored by, pooled over robots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+NUMERICS = "option."  # steps and integrators do differ: naming them is no false alarm
+
+
+def share(hits: int, of: int) -> dict[str, Any]:
+    """A share with its 90 % interval (Clopper & Pearson 1934)."""
+    low = float(beta.ppf(0.05, hits, of - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(0.95, hits + 1, of - hits)) if hits < of else 1.0
+    return {"hits": hits, "of": of, "share": hits / of if of else None, "interval_90": [low, high]}
+
+
+def _physical(names: Sequence[str]) -> list[str]:
+    return [n for n in names if not n.startswith(NUMERICS)]
+
+
+def right(one: Mapping[str, Any]) -> bool:
+    """Whether every fault is among causes or their rivals, and no other cause is told."""
+    told = one["found"]["causes"]
+    every = {*told, *one["found"]["indistinguishable"]}
+    allowed = {r for f in one["faults"] for r in f["right"]}
+    met = all(every & set(f["right"]) for f in one["faults"])
+    strange = [n for n in _physical(told) if n not in allowed]
+    # In a set, what stands for a fault may be any of its rivals.
+    spare = len([f for f in one["faults"] if not set(told) & set(f["right"])])
+    return met and len(strange) <= spare and one["found"]["verdict"] in ("named", "set")
+
+
+def alarm(one: Mapping[str, Any]) -> bool:
+    """Whether something is told of a healthy robot that is not its numerics."""
+    found = one["found"]
+    return found["verdict"] == "unknown" or bool(_physical(found["causes"]))
+
+
+def held_back(one: Mapping[str, Any]) -> bool:
+    """Whether a fault of no known kind is called unknown, or its remainder told."""
+    return one["found"]["verdict"] == "unknown" or (
+        one["found"]["verdict"] != "none" and one["found"]["remainder"] > 0.1
+    )
+
+
+def covered(one: Mapping[str, Any]) -> list[bool]:
+    """Of rightly named faults whose parameter has the fault's own unit: whether the interval holds it."""
+    out = []
+    same = {"delay": "delay", "read_gain": "gain", "read_bias": "bias", "read_lag": "delay", "gain": "gain"}
+    effects = one["found"]["effects"]
+    for fault in one["faults"]:
+        for name in fault["right"]:
+            if fault["kind"] in same and name in one["found"]["causes"] and name in effects:
+                known = effects[name]["parameters"].get(same[fault["kind"]])
+                if known is None and len(effects[name]["parameters"]) == 1:
+                    known = next(iter(effects[name]["parameters"].values()))
+                if known is not None:
+                    out.append(known["interval_90"][0] <= fault["size"] <= known["interval_90"][1])
+    return out
+
+
+def scored(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The figures, pooled and by kind, and every case in a line."""
+    of = lambda *kinds: [c for c in every if c["kind"] in kinds]  # noqa: E731
+    healthy, outside, known = of("healthy"), of("outside"), of("single", "pair", "dense")
+    inside = [hit for c in every for hit in covered(c)]
+    return {
+        "cases": len(every),
+        "robots": sorted({c["robot"] for c in every}),
+        "false_alarms": share(sum(map(alarm, healthy)), len(healthy)),
+        "named_right": share(sum(map(right, known)), len(known)),
+        "named_right_by_kind": {
+            k: share(sum(map(right, of(k))), len(of(k))) for k in ("single", "pair", "dense")
+        },
+        "outside_held_back": share(sum(map(held_back, outside)), len(outside)),
+        "intervals_cover": share(sum(inside), len(inside)),
+        "processor_seconds": {
+            r: float(np.mean([c["seconds"] for c in every if c["robot"] == r]))
+            for r in sorted({c["robot"] for c in every})
+        },
+        "each": [
+            {
+                "case": c["case"],
+                "robot": c["robot"],
+                "kind": c["kind"],
+                "faults": [f"{f['kind']} {f['thing']} {f['size']:.3g}" for f in c["faults"]],
+                "verdict": c["found"]["verdict"],
+                "causes": c["found"]["causes"],
+                "rivals": c["found"]["indistinguishable"],
+                "remainder": c["found"]["remainder"],
+            }
+            for c in every
+        ],
+    }
