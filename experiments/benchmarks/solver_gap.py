@@ -122,16 +122,18 @@ def gap_optimistix(folder: Path) -> Solve:
         import jax.numpy as jnp
         import optimistix
 
-        from simgap.gap.evaluation import STEP, _constants, whitened
+        from simgap.gap.evaluation import STEP, corrected, whitened
 
-        constants, z = _constants(given), given.num_properties
+        (world, arrays, w), z = given.constants, given.num_properties
 
         def rows(y, args):
             base, mine, there, on, low, high, member, size = args
             x = jnp.clip(y, low, high) * there
-            residual, doubts = whitened(*constants, base.at[mine].add(x), on)
+            u = base.at[mine].add(x)
+            properties = given.centre + given.spread * u[:z].reshape(given.centre.shape)
+            residual, doubts = whitened(corrected(world, u, on, z), arrays, w, properties)
             prior = jnp.sqrt((1 + size) * jnp.log1p(member @ jnp.square(x)) + 1e-12)
-            return jnp.concatenate([residual.ravel(), x[:z], prior, jnp.sqrt(2 * doubts.sum() + 1e-12)[None]])
+            return jnp.concatenate([residual.ravel(), x[:z], prior, jnp.sqrt(2 * doubts + 1e-12)[None]])
 
         solver = optimistix.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
 

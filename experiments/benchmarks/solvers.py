@@ -45,7 +45,8 @@ def quadratics(folder: Path) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, n
     for i in range(count):
         for j in range(i + 1, count):
             taken = quadratic_forms(f, (i, j))
-            out.append((taken.bend.sum(0) + np.eye(taken.low.size), taken.pull.sum(0), taken.low, taken.high))
+            bend, pull = taken.weighed(np.ones(f.count.size))
+            out.append((bend + np.eye(taken.low.size), pull, taken.low, taken.high))
     return out
 
 

@@ -181,7 +181,7 @@ def _effects(
         forms_of.setdefault(c.name, []).append(j)
     for name, mine in forms_of.items():
         inside = [(m, float(p)) for m, p in zip(models, w, strict=True) if {*mine} & {*m.effects}]
-        chance = sum(p for _, p in inside)
+        chance = min(sum(p for _, p in inside), 1.0)  # a sum of many is rounded
         found = next((one for part, one in judged.items() if {*mine} & {*part}), None)
         if found is not None:
             model = found.model

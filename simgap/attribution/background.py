@@ -48,6 +48,9 @@ class Background:
         """Log density (G,) of groups with these squares and counts, but for (2 pi)^(-count/2), and their
         expected precisions (G,). `shift`: log variance that the groups have in any case."""
         log_phi = self.log_phi[:, None] + shift
-        each = self.log_prior[:, None] - 0.5 * count * log_phi - 0.5 * energy * np.exp(-log_phi)
-        total = np.logaddexp.reduce(each, axis=0)
-        return total, np.exp(np.logaddexp.reduce(each - log_phi, axis=0) - total)
+        precision = np.exp(-log_phi)
+        each = self.log_prior[:, None] - 0.5 * (count * log_phi + energy * precision)
+        most = each.max(axis=0)
+        weight = np.exp(each - most)
+        total = weight.sum(axis=0)
+        return most + np.log(total), (weight * precision).sum(axis=0) / total

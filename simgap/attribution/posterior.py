@@ -119,7 +119,7 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
 
 @dataclass(frozen=True)
 class QuadraticForms:
-    """The quadratic forms of one set: square (G,), pull (G, n), bend (G, n, n) of its coordinates x (n,)."""
+    """The quadratic forms of one set: square (G,), pull (G, n), bend (G, n n) of its coordinates x (n,)."""
 
     effects: tuple[int, ...]
     square: np.ndarray
@@ -132,7 +132,12 @@ class QuadraticForms:
 
     def energy(self, x: np.ndarray) -> np.ndarray:
         """Squares (G,) of what is left at x."""
-        return np.maximum(self.square - 2 * self.pull @ x + (self.bend @ x) @ x, 0.0)
+        return np.maximum(self.square - 2 * self.pull @ x + self.bend @ np.outer(x, x).ravel(), 0.0)
+
+    def weighed(self, precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature (n, n) and pull (n,) with groups of these precisions (G,) together."""
+        size = self.low.size
+        return (precision @ self.bend).reshape(size, size), precision @ self.pull
 
 
 def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
@@ -143,7 +148,9 @@ def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
     sign = np.array([1.0, *(-1.0 for _ in effects)])
     square = np.einsum("i,gij,j->g", sign, f.product[:, constant[:, None], constant], sign)
     pull = np.einsum("i,gij->gj", sign, f.product[:, constant[:, None], free])
-    bend = f.product[:, free[:, None], free]
+    # One row a group: sums over groups, and squares, are then products of a matrix and a vector.
+    places = (free[:, None] * f.product.shape[1] + free).ravel()
+    bend = np.take(f.product.reshape(f.count.size, -1), places, axis=1)
     return QuadraticForms(
         effects, square, pull, bend, *_limits(f, effects, z), _blocks(f, effects, z), f.shift(effects)
     )
@@ -160,8 +167,9 @@ def mode(
     for _ in range(steps):
         for _, mine in taken.blocks:
             prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
-        matrix = np.tensordot(precision, taken.bend, 1) + np.diag(prior)
-        x, held = least(matrix, precision @ taken.pull, taken.low, taken.high)
+        matrix, pull = taken.weighed(precision)
+        matrix[np.diag_indices(size)] += prior
+        x, held = least(matrix, pull, taken.low, taken.high)
         energy = taken.energy(x)
         density, precision = f.marginal(taken.effects, energy)
         last, value = value, float(density.sum()) + _log_prior(x, z, taken.blocks)
@@ -169,7 +177,7 @@ def mode(
             break
     for _, mine in taken.blocks:
         prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
-    matrix = np.tensordot(precision, taken.bend, 1) + np.diag(prior)
+    matrix = taken.weighed(precision)[0] + np.diag(prior)
     loose = ~held
     covariance = np.zeros_like(matrix)
     covariance[np.ix_(loose, loose)] = np.linalg.inv(matrix[np.ix_(loose, loose)])
@@ -224,8 +232,8 @@ def squares_left(
         prior = np.ones(taken.low.size)
         for _, mine in taken.blocks:
             prior[mine] = 1e-3
-        matrix = np.tensordot(weight, taken.bend, 1) + np.diag(prior)
-        x, _ = least(matrix, weight @ taken.pull, taken.low, taken.high)
+        matrix, pull = taken.weighed(weight)
+        x, _ = least(matrix + np.diag(prior), pull, taken.low, taken.high)
     squares = weight * taken.energy(x)
     freed = f.freed[list(effects)].any(0)
     return np.append(np.where(freed, np.minimum(squares, f.count), squares), x[:z] @ x[:z])

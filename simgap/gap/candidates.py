@@ -10,8 +10,9 @@ import numpy as np
 from hmmseg.io.rig import Rig
 from simgap.bounded import least
 from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
+from simgap.gap.evaluation import evaluated
 from simgap.gap.fit import STEPS, Fitted, Start, fit
-from simgap.gap.problem import Problem, limits, slots
+from simgap.gap.problem import Problem, columns_of, limits, slots
 
 SCREEN = 2  # chosen: steps before the best start of a form is chosen
 LEADERS = 3  # chosen: starts screened
@@ -52,9 +53,10 @@ def best_fit(given: Problem, key: str, healthy: Fitted, steps: int = STEPS) -> F
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
     what swings with it has no size.
     """
-    ranked = sorted((_ranked(given, start) for start in starts(given, key, healthy.u)), key=lambda r: r[0])
+    every = starts(given, key, healthy.u)
+    ranked = sorted(((*_ranked(given, start), start) for start in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < PROMISING:
-        return ranked[0][2]
+        return fit(given, ranked[0][2], 0)
     leading = [start for _, start, _ in ranked[:LEADERS]]
     if len(leading) > 1:
         screened = sorted((fit(given, s, SCREEN) for s in leading), key=lambda f: f.cost)
@@ -62,8 +64,8 @@ def best_fit(given: Problem, key: str, healthy: Fitted, steps: int = STEPS) -> F
     return fit(given, leading[0], steps)
 
 
-def _ranked(given: Problem, start: Start) -> tuple[float, Start, Fitted]:
-    """A start's cost after a linear step of all but its gridded parameters, the start there, and its fit."""
+def _ranked(given: Problem, start: Start) -> tuple[float, Start]:
+    """A start's cost after a linear step of all but its gridded parameters, and the start there."""
     (key,) = start.effects
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     fixed = [
@@ -72,18 +74,16 @@ def _ranked(given: Problem, start: Start) -> tuple[float, Start, Fitted]:
         if p.gridded and p.name in free_parameters(key)
     ]
     low, high = limits(given)
-    one = fit(given, start, 0)
-    free = ~np.isin(one.columns, fixed)
-    columns, push = one.columns[free], one.push[:, free]
-    u = one.u.copy()
-    bend = given.product(push, push) + np.eye(columns.size)
-    pull = -given.product(push, one.residual) - u[columns]
+    columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
+    u = start.u.copy()
+    u[columns] = np.clip(u[columns], low[columns], high[columns])
+    now = evaluated(given, start.effects, u, columns, [])
+    bend = given.product(now.push, now.push) + np.eye(columns.size)
+    pull = -given.product(now.push, now.residual) - u[columns]
     step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
-    u[columns] = np.clip(u[columns] + step, low[columns], high[columns])
-    left = one.residual + push @ (u[columns] - one.u[columns])
-    own = u[: given.num_properties]
-    return (
-        0.5 * float(given.product(left, left)) + one.doubts + 0.5 * float(own @ own),
-        Start(one.effects, u),
-        one,
-    )
+    there = u.copy()
+    there[columns] = np.clip(u[columns] + step, low[columns], high[columns])
+    left = now.residual + now.push @ (there[columns] - u[columns])
+    own = there[: given.num_properties]
+    cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
+    return cost, Start(start.effects, there)

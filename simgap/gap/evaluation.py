@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,7 +16,6 @@ from simgap.gap.problem import Problem, columns_of, slots
 from simgap.gap.residuals import contact, residuals
 from simgap.gap.whitening import Whitening
 
-ROWS = 8  # numerics: coordinates that are evaluated at once, in one compiled program
 STEP = 1e-5  # numerics: of a usual deviation, for differences
 
 
@@ -36,65 +34,59 @@ def corrected(world: World, u: jax.Array, on: jax.Array, num_properties: int) ->
 
 
 def whitened(
-    world: World,
-    arrays: Arrays,
-    w: Whitening,
-    centre: jax.Array,
-    spread: jax.Array,
-    u: jax.Array,
-    on: jax.Array,
+    world: World, arrays: Arrays, w: Whitening, properties: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Whitened residuals (T, N, C) at coordinates u, and by trial and subtask (T, S) the cost of doubts.
+    """Whitened residuals (T, N, C) of a world that effects were taken out of, and the cost of doubts [nats].
 
-    A residual in doubt counts for less; half the log of its variance's factor is what that costs [nats].
+    A residual in doubt counts for less; half the log of its variance's factor is what that costs.
+    `properties` (O, 3): weight, width, height.
     """
-    properties = centre + spread * u[: centre.size].reshape(centre.shape)
     noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
-    raw, factor = residuals(corrected(world, u, on, centre.size), arrays, properties, noise)
-    cost = jnp.einsum("tns,tnc->ts", w.member, jnp.where(w.weight > 0, 0.5 * jnp.log(factor), 0.0))
+    raw, factor = residuals(world, arrays, properties, noise)
+    cost = jnp.where(w.weight > 0, 0.5 * jnp.log(factor), 0.0).sum()
     return raw / jnp.sqrt(factor) * w.weight, cost
 
 
+_corrected = jax.jit(corrected, static_argnames="num_properties")
+_whitened = jax.jit(whitened)
+
+
 @jax.jit
-def _evaluated_at(world, arrays, w, centre, spread, u, on):
-    """Whitened residuals (B, T, N, C) at B rows of coordinates, and the cost of doubts (B,)."""
-    z, doubts = jax.vmap(lambda row: whitened(world, arrays, w, centre, spread, row, on))(u)
-    return z, doubts.sum((1, 2))
+def _whitened_at_each(world, arrays, w, properties):
+    """Of B rows of properties (B, O, 3): a property alone needs no effect taken out once more."""
+    return jax.vmap(lambda row: whitened(world, arrays, w, row))(properties)
 
 
 def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Whitened residuals (T, N, C) of a candidate at coordinates u."""
-    rows = jnp.tile(jnp.asarray(u), (ROWS, 1))
-    return np.asarray(_evaluated_at(*_constants(given), rows, jnp.asarray(_on(given, effects)))[0][0])
-
-
-@partial(jax.jit, static_argnames="num_properties")
-def _without(world, u, on, num_properties):
-    world = corrected(world, u, on, num_properties)
-    return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
+    _, arrays, w = given.constants
+    world = _without_effects(given, effects, u)
+    return np.asarray(_whitened(world, arrays, w, jnp.asarray(given.properties(u)))[0])
 
 
 @jax.jit
-def _raw(world, arrays, w, centre, spread, u, on):
-    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
-    properties = centre + spread * u[: centre.size].reshape(centre.shape)
-    return residuals(corrected(world, u, on, centre.size), arrays, properties, noise)[0]
+def _in_contact(world):
+    return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
 
 
 def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
     """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
-    world, on = _constants(given)[0], jnp.asarray(_on(given, effects))
-    return _without(world, jnp.asarray(u), on, given.num_properties)
+    return _in_contact(_without_effects(given, effects, u))
 
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Residuals (T, N, C) in units of their channels."""
-    return np.asarray(_raw(*_constants(given), jnp.asarray(u), jnp.asarray(_on(given, effects))))
+    world, (_, arrays, w) = _without_effects(given, effects, u), given.constants
+    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
+    return np.asarray(_raw(world, arrays, jnp.asarray(given.properties(u)), noise)[0])
 
 
-def _constants(given: Problem):
-    tree = (given.frame.world, given.frame.arrays, given.whitening, given.centre, given.spread)
-    return jax.tree.map(jnp.asarray, tree)
+_raw = jax.jit(residuals)
+
+
+def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
+    on = jnp.asarray(_on(given, effects))
+    return _corrected(given.constants[0], jnp.asarray(u), on, given.num_properties)
 
 
 def _on(given: Problem, effects: Sequence[str]) -> np.ndarray:
@@ -121,16 +113,24 @@ def evaluated(
     They are differences over a small step: in double precision good to STEP of a usual deviation, and cheaper
     to compile than derivatives.
     """
-    there, constants, on = given.whitening.weight > 0, _constants(given), jnp.asarray(_on(given, effects))
-    rows = np.concatenate([u[None], u + STEP * np.eye(u.size)[mine]])
-    z, doubts = [], []
-    for at in range(0, len(rows), ROWS):
-        some = rows[at : at + ROWS]
-        some = np.concatenate([some, np.repeat(some[-1:], ROWS - len(some), 0)])
-        residual, doubt = _evaluated_at(*constants, jnp.asarray(some), on)
-        z.append(np.asarray(residual)[:, there])
-        doubts.append(np.asarray(doubt))
-    z, doubts = np.concatenate(z)[: len(rows)], np.concatenate(doubts)[: len(rows)]
+    k, on = given.num_properties, jnp.asarray(_on(given, effects))
+    recorded, arrays, w = given.constants
+
+    def without(u: np.ndarray) -> World:
+        return _corrected(recorded, jnp.asarray(u), on, k)
+
+    steps = given.properties(u + STEP * np.eye(k + 1, u.size, -1))
+    found, cost = _whitened_at_each(without(u), arrays, w, jnp.asarray(steps))
+    z, doubts = [np.asarray(found)], [np.asarray(cost)]
+    usual, step = jnp.asarray(steps[0]), u.copy()
+    for column in mine[k:]:
+        step[column] += STEP
+        residual, doubt = _whitened(without(step), arrays, w, usual)
+        step[column] = u[column]
+        z.append(np.asarray(residual)[None])
+        doubts.append(np.asarray(doubt)[None])
+    z = np.concatenate([each.reshape(len(each), -1)[:, given.existing] for each in z])
+    doubts = np.concatenate(doubts)
     push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
     own = u[mine[: given.num_properties]]
     cost = 0.5 * float(given.product(z[0], z[0])) + float(doubts[0]) + 0.5 * float(own @ own)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import jax
@@ -61,6 +61,22 @@ class Problem:
         """Products of residuals, or of their derivatives, (n, ...), nuisances integrated out."""
         return self.nuisances.product(a, b) if self.nuisances.columns.size else a.T @ b
 
+    def properties(self, u: np.ndarray) -> np.ndarray:
+        """Weight, width and height (..., O, 3) of the blocks at coordinates (..., all columns)."""
+        own = u[..., : self.num_properties]
+        return self.centre + self.spread * own.reshape(*own.shape[:-1], *self.centre.shape)
+
+    @cached_property
+    def constants(self) -> tuple[Any, Any, Any]:
+        """World, arrays and whitening as JAX has them, to be used where this is in double precision."""
+        tree = (self.frame.world, self.frame.arrays, self.whitening)
+        return jax.tree.map(lambda z: jnp.asarray(z, float if z.dtype.kind == "f" else None), tree)
+
+    @cached_property
+    def existing(self) -> np.ndarray:
+        """Places (n,) of the residuals among all (T, N, C), in one row."""
+        return np.flatnonzero(self.whitening.weight > 0)
+
     @property
     def num_properties(self) -> int:
         """Number of property columns."""
@@ -69,7 +85,7 @@ class Problem:
     @property
     def size(self) -> int:
         """Number of residuals."""
-        return int((self.whitening.weight > 0).sum())
+        return self.existing.size
 
 
 def problem(frame: Frame, actual: dict | None = None) -> Problem:

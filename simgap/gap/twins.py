@@ -13,11 +13,14 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+import estimation
 import hmmseg
+import simgap
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -51,7 +54,7 @@ def twin_statistics(
 
     Where this hand or these blocks cannot be simulated there are none.
     """
-    file = _file(found, task, rig, actual, seed)
+    file = _file(found.trials, task, rig, actual, seed)
     known: list[float] = []
     with suppress(OSError, ValueError):
         known = [float(v) for v in json.loads(file.read_text(encoding="utf-8"))]
@@ -150,15 +153,26 @@ def _rate(trials: Sequence[Trial]) -> float:
     return float(np.median([trial.rate for trial in trials]))
 
 
-def _file(found: Search, task: BlockTask, rig: Rig, actual: dict | None, seed: int) -> Path:
-    """Where statistics are kept: by recordings, task, rig, measurements, seed and version."""
+def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None, seed: int) -> Path:
+    """Where statistics are kept: by recordings, task, rig, measurements, seed and the code that made them."""
     digest = hashlib.sha256()
-    for trial in found.trials:
+    for trial in trials:
         for name, values in sorted({"t": trial.t, **trial.channels}.items()):
             digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
-    more = (repr(task), rig.model_dump_json(), repr(actual), str(seed), hmmseg.__version__)
+    more = (repr(task), rig.model_dump_json(), repr(actual), str(seed), source_digest())
     digest.update("\n".join(more).encode())
     return cache_folder() / "twins" / f"{digest.hexdigest()[:24]}.json"
+
+
+@cache
+def source_digest() -> str:
+    """A hash of the product's own source: other code may give a twin another statistic."""
+    digest = hashlib.sha256()
+    for package in (hmmseg, estimation, simgap):
+        root = Path(package.__path__[0])
+        for file in sorted(root.rglob("*.py")):
+            digest.update(f"{package.__name__}/{file.relative_to(root)}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
 
 
 def _keep(file: Path, values: list[float]) -> None:

@@ -10,14 +10,12 @@ from simgap.gap.frame import Frame
 
 
 class Whitening(NamedTuple):
-    """Arrays of T trials, N samples, C channels, S subtasks: `weight` (T, N, C): 1 / standard deviation, 0
-    where there is nothing; `member` (T, N, S) one-hot."""
+    """`weight` (T, N, C) of trials, samples, channels: 1 / standard deviation, 0 where there is nothing."""
 
     weight: np.ndarray
-    member: np.ndarray
 
 
 def whitening(frame: Frame) -> Whitening:
     """The whitening of a frame's residuals."""
     a = frame.arrays
-    return Whitening(np.where(a.there > 0, 1 / a.sd, 0.0), np.eye(len(frame.steps))[a.subtask])
+    return Whitening(np.where(a.there > 0, 1 / a.sd, 0.0))

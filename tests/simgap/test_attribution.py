@@ -15,7 +15,7 @@ from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, statistic
 from simgap.attribution.heldout import how_far
 from simgap.attribution.invariance import WANDER, invariance
-from simgap.attribution.posterior import Forms, forms
+from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import sought, weights
 
@@ -210,6 +210,13 @@ def test_one_effect_is_named_with_its_size_and_share():
     assert found.how_far is not None and found.how_far.fraction > 0.8
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     assert {(c.channel) for c in found.where} <= {"c0", "c1"}
+
+
+def test_rounding_makes_no_probability_larger_than_one():
+    gap = gap_of({1: 3.0})
+    one = fitted(forms(gap), (1,))
+    several = next(n for n in range(2, 99) if sum(weights([one] * n)) > 1.0)
+    assert attribute(gap, nested=False, models=[one] * several).effects["b"].probability == 1.0
 
 
 def test_two_effects_and_a_healthy_recording():
