@@ -1,4 +1,4 @@
-"""Log densities of single readings, compiled: Student-t, a uniform with soft edges, mostly one of them."""
+"""Log densities of single readings, compiled: Student-t, a uniform with soft edges."""
 
 from __future__ import annotations
 
@@ -40,14 +40,6 @@ def log_between(value, low, high, scale, span):
         return 0.0
     soft = _log_normal_cdf((value - low) / scale) + _log_normal_cdf((high - value) / scale)
     return max(soft, _LEAST) - math.log(span)
-
-
-@compiled
-def log_mostly(residual, variance, log_close, log_stray, span):
-    """Log density of a residual that is as a rule a Student-t one, and anywhere in `span` now and then."""
-    if math.isnan(residual):
-        return 0.0
-    return log_sum(log_close + log_student(residual, variance), log_stray - math.log(span))
 
 
 @compiled

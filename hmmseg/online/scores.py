@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
-from hmmseg.online.densities import log_between, log_broad, log_mostly, log_student, log_sum
+from hmmseg.online.densities import log_between, log_broad, log_student, log_sum
 from hmmseg.online.layout import (
     AY,
     BIAS,
@@ -53,7 +53,7 @@ from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TOUCHING
 STILL = 0.2  # chosen: prior share of samples at which a hand that may move stands still,
 JUST_LIFTED = 0.05  # chosen: ... times this while a lift begins: slow, but a motion
 ALIKE = 0.5  # chosen: prior probability that a block not met yet is like one that was
-_LOG_CLOSE, _LOG_STRAY = math.log1p(-STRAY), math.log(STRAY)
+_LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
 _LOG_TOUCHED, _LOG_TOUCHING = math.log1p(-TOUCHING), math.log(TOUCHING)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
@@ -211,13 +211,15 @@ def supported(h, kind, block, x, spans, pads, levels):
         most, soft = span, math.sqrt(scale2(h, CARRY))
     out = log_between(_net_force(h, x), -span, most, soft, span + most)
     moving = scale2(h, VELOCITY)
-    out += log_mostly(x[VY], x[SD_VY] ** 2 + moving, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_VY])
-    if kind == GROUND_KIND:
-        out += log_mostly(x[VX], x[SD_VX] ** 2 + moving, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_VX])
+    upward, broad = log_student(x[VY], x[SD_VY] ** 2 + moving), log_broad(x[VY], spans[SPAN_VY])
+    if levels and h[LEVEL + 1] > 0.0:
+        spread = x[SD_Y] * x[SD_Y] + scale2(h, LEVEL_SCALE) + 1.0 / h[LEVEL + 1]
+        upward += log_student(held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1], spread)
+        broad += log_broad(x[Y], spans[SPAN_Y])
     else:
-        out += log_broad(x[VX], spans[SPAN_VX])
-    if not levels or h[LEVEL + 1] <= 0.0:
-        return out + log_broad(x[Y], spans[SPAN_Y])
-    spread = x[SD_Y] * x[SD_Y] + scale2(h, LEVEL_SCALE) + 1.0 / h[LEVEL + 1]
-    height = held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1]
-    return out + log_mostly(height, spread, _LOG_CLOSE, _LOG_STRAY, spans[SPAN_Y])
+        out += log_broad(x[Y], spans[SPAN_Y])
+    aside = log_broad(x[VX], spans[SPAN_VX])
+    if kind != GROUND_KIND:
+        return out + aside + log_sum(_LOG_CLOSE + upward, _LOG_STRAY + broad)
+    still = log_student(x[VX], x[SD_VX] ** 2 + moving)
+    return out + log_sum(_LOG_REST + still + upward, _LOG_STRAY + aside + log_sum(upward, broad))

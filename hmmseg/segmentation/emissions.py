@@ -30,6 +30,7 @@ from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
 TAIL = 4.0  # cited: degrees of freedom of the Student-t residuals
 STRAY = 0.02  # chosen: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # chosen: share of gripped samples whose distance is not the block's (foam giving late)
+STILL = 0.1  # chosen: prior share of a carry's samples at which the block is held still
 ONE_FINGER = 0.02  # chosen: prior share of free samples at which one finger alone touches
 
 
@@ -121,6 +122,41 @@ def _log_mostly(residual: np.ndarray, scale: np.ndarray, span: float, stray: flo
     return np.where(np.isfinite(residual), either, 0.0)
 
 
+def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.ndarray,
+                 broad_up: np.ndarray, stray: float) -> np.ndarray:  # fmt: skip
+    """Log density of the motion of a block on its support: at rest, pushed aside, or astray altogether.
+
+    `aside`, `upward`: log densities of vx (None: it slides), and of vy and the height together, at rest;
+    `broad_*`: of strays. Height and velocity stray together: if each strayed by itself, a block held still in
+    the air would pay for its height and win the velocity's narrow density at every sample.
+    """
+    astray = np.log(stray) + broad_aside + broad_up
+    if aside is None:
+        return np.logaddexp(np.log1p(-stray) + broad_aside + upward, astray)
+    pushed = np.log(stray) + broad_aside + upward
+    return np.logaddexp.reduce([np.log1p(-2 * stray) + aside + upward, pushed, astray])
+
+
+def _log_halting(f: Features, p: Parameters) -> np.ndarray:
+    """Log density of velocities and height of a block held still in the air, over that of one that moves.
+
+    Without it, a halt would pass for a rest on something, as that predicts the motion so much better. A block
+    that halts is where it was at the sample before; its height counts where that of blocks at rest does.
+    """
+    out = sum(
+        log_student(v, np.hypot(sd, p.scale["velocity"])) + np.log(f.span[name]) * np.isfinite(v)
+        for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy))
+    )
+    if p.levels:
+        there = np.isfinite(f.y)
+        last = np.maximum.accumulate(np.where(there, np.arange(f.y.size), -1))
+        before = np.r_[-1, last[:-1]]
+        risen = np.where(there & (before >= 0), f.y - f.y[before], np.nan)
+        spread = np.sqrt(2 * f.sd_y**2 + p.scale["level"] ** 2)
+        out = out + log_student(risen, spread) + np.log(f.span["y"]) * np.isfinite(risen)
+    return out
+
+
 def _log_ungripped(force: np.ndarray, scale: float, span: float) -> np.ndarray:
     """Log density of forces (num_timesteps, 4) without a grip: no contact, or one finger's."""
     silent = log_student(force, scale)
@@ -152,7 +188,8 @@ def log_likelihoods(
 def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, stray: float) -> np.ndarray:
     scale, span = p.scale, f.span
     force = f.force - p.bias
-    broad_v = -np.log(span["vx"]) * np.isfinite(f.vx) - np.log(span["vy"]) * np.isfinite(f.vy)
+    broad_vx, broad_vy = (-np.log(span[v]) * np.isfinite(getattr(f, v)) for v in ("vx", "vy"))
+    broad_v = broad_vx + broad_vy
     broad_y = -np.log(span["y"]) * np.isfinite(f.y)
     broad_d = -np.log(span["d"]) * np.isfinite(f.d)
     if subtask.state == FREE:
@@ -169,16 +206,17 @@ def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, st
         out += _log_mostly(f.block_width(p.bias) - width, spread, span["d"], TOUCHING)
     weight = p.weight[str(subtask.object)]
     if subtask.state == ABOVE_GROUND:
-        return out + log_student(fy - weight * f.carrying, scale["carry"]) + broad_v + broad_y
+        out += log_student(fy - weight * f.carrying, scale["carry"]) + broad_v + broad_y
+        return out + np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
     if subtask.state not in (ON_GROUND, SLIDING):
         raise ValueError(f"no emission for the contact state {subtask.state!r}")
     out += _log_between(fy, -span["force"], weight, scale["carry"])
-    out += _log_mostly(f.vy, np.hypot(f.sd_vy, scale["velocity"]), span["vy"], stray)
-    if subtask.state == ON_GROUND:
-        out += _log_mostly(f.vx, np.hypot(f.sd_vx, scale["velocity"]), span["vx"], stray)
-    else:
-        out += -np.log(span["vx"]) * np.isfinite(f.vx)
     level = p.levels[trial].get(subtask.index) if p.levels else None
-    if level is None:
-        return out + broad_y
-    return out + _log_mostly(f.block_y(p.bias) - level, np.hypot(f.sd_y, scale["level"]), span["y"], stray)
+    aside = None if subtask.state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
+    upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), broad_vy
+    if level is None:  # where it rests is not known
+        out += broad_y
+    else:
+        upward += log_student(f.block_y(p.bias) - level, np.hypot(f.sd_y, scale["level"]))
+        broad_up = broad_up + broad_y
+    return out + _log_resting(aside, upward, broad_vx, broad_up, stray)

@@ -17,12 +17,11 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
-from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, log_student
+from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
 STRAY = 1e-3  # chosen: share of resting samples that move: contacts settle in states of their own here
-STILL = 0.1  # chosen: prior share of a carry's samples at which the block is held still
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
 SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
 APART = 10  # chosen: noise sds of the grip force between free and gripped
@@ -111,15 +110,8 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
 
 
 def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Parameters) -> np.ndarray:
-    """Log-likelihoods (num_timesteps, num_states) without levels, held still in the air allowed."""
-    table = log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY)
-    still = sum(
-        log_student(v, np.hypot(sd, p.scale["velocity"])) + np.log(f.span[name]) * np.isfinite(v)
-        for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy))
-    )
-    lifted = [k for k, (state, _) in enumerate(states) if state == ABOVE_GROUND]
-    table[:, lifted] += np.logaddexp(np.log1p(-STILL), np.log(STILL) + still)[:, None]
-    return table
+    """Log-likelihoods (num_timesteps, num_states) without levels."""
+    return log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY)
 
 
 def most_probable(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> np.ndarray:

@@ -133,7 +133,9 @@ def sense(
 
     def found(delay: float, filtered: bool) -> list[Compliance]:
         key = {"constant" if filtered else "shift": delay}
-        return [_compliance([(*reading(s, **key), s.sd) for s in own], prior)
+        # A contact's two ends say most, and may differ: by less than a sample neither is left out.
+        reach = abs(delay) if abs(delay) < LATE else 0.0
+        return [_compliance([(*reading(s, **key, reach=reach), s.sd) for s in own], prior)
                 for own, prior in zip((grips, loads), priors, strict=True)]  # fmt: skip
 
     delay, sd, late, filtered = _delay(kinds, priors, again)
@@ -170,7 +172,7 @@ def _delay(
         # A delay is common to all forces; what one kind alone favours is a fault of the linear pad.
         late = late and bool((each[filtered][:, i] >= none).all())
     fine = FINE + (best if late else 0.0)
-    log_posterior = evidence(kinds, priors, fine, filtered and late).sum(axis=0)
+    log_posterior = evidence(kinds, priors, fine, filtered and late, inner=not late).sum(axis=0)
     if not late:
         log_posterior = log_posterior - (fine / LEAD_SD) ** 2 / 2
     if not np.isfinite(log_posterior).any():

@@ -70,12 +70,15 @@ def stretches(
     return out[0], out[1]
 
 
-def reading(s: Stretch, shift: float = 0.0, constant: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def reading(
+    s: Stretch, shift: float = 0.0, constant: float = 0.0, reach: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Loads and values that belong together, for forces `shift` s late or filtered.
 
-    Loads are interpolated to the times of the values, whose noise matters more. A first-order filter of
-    this time `constant` [s] is undone exactly for an input that is steady within each sample interval,
-    whose middle the result belongs to.
+    Loads are interpolated to the times of the values, whose noise matters more; up to `reach` [s] beyond the
+    first and the last of them they are extrapolated (negative: so much at either end is left out). A
+    first-order filter of this time `constant` [s] is undone exactly for an input that is steady within each
+    sample interval, whose middle the result belongs to.
     """
     t, load = s.t - shift, s.load
     if constant > 0:
@@ -88,8 +91,12 @@ def reading(s: Stretch, shift: float = 0.0, constant: float = 0.0) -> tuple[np.n
         return np.zeros(0), np.zeros(0)
     after = np.clip(np.searchsorted(t, s.clock), 1, t.size - 1)
     close = t[after] - t[after - 1] < 1.5 * float(np.median(s.step))
-    within = (s.clock >= t[0] - 1e-9) & (s.clock <= t[-1] + 1e-9) & close
-    return np.interp(s.clock[within], t, load), s.place[within]
+    edge = reach + 1e-9
+    within = (s.clock >= t[0] - edge) & (s.clock <= t[-1] + edge) & close
+    clock = s.clock[within]
+    steep = (load[1] - load[0]) / (t[1] - t[0]), (load[-1] - load[-2]) / (t[-1] - t[-2])
+    beyond = np.minimum(clock - t[0], 0.0) * steep[0] + np.maximum(clock - t[-1], 0.0) * steep[1]
+    return np.interp(clock, t, load) + beyond, s.place[within]
 
 
 def fitted(
@@ -122,11 +129,14 @@ def evidence(
     priors: Sequence[tuple[float, float]],
     delays: np.ndarray,
     filtered: bool,
+    inner: bool = False,
 ) -> np.ndarray:
     """Log-likelihoods (num_kinds, num_delays) of all stretches, each with a rest, each kind a compliance.
 
     Of a sample on the average, times their number, as not every delay leaves all of them in contact;
-    -inf where it leaves too few. `priors`: mean and sd [m/N] of the compliance of each kind.
+    -inf where it leaves too few. `inner`: without the ends of each contact, where a delay of less than a
+    sample takes one sample out that no delay leaves in, which counts more than the delay itself. `priors`:
+    mean and sd [m/N] of the compliance of each kind.
     """
     out = np.zeros((len(kinds), delays.size))
     for row, own, prior in zip(out, kinds, priors, strict=True):
@@ -135,7 +145,8 @@ def evidence(
         usual, num_samples = float(np.median([s.sd for s in own])), sum(s.t.size for s in own)
         tried = []
         for d in delays:
-            read = [reading(s, **{"constant" if filtered else "shift": float(d)}) for s in own]
+            key = {"constant" if filtered else "shift": float(d)}
+            read = [reading(s, **key, reach=-inner * float(np.median(s.step)) / 2) for s in own]
             found = np.array([fitted(*r, s.sd, rounds=3)[:2] for r, s in zip(read, own, strict=True)])
             weight = np.r_[np.minimum(found[:, 1], len(own) * np.median(found[:, 1])), prior[1] ** -2]
             c = max(float(weight @ np.r_[found[:, 0], prior[0]] / weight.sum()), 0.0)

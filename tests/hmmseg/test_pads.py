@@ -1,5 +1,7 @@
 """Pads and delays are learned from what rests: planted ones are found, and none are invented."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,6 +50,33 @@ def test_a_filter_is_told_from_a_delay():
     own = [squeeze(constant=0.03, seed=i) for i in range(8)]
     late, filtered = (evidence([own], [PRIOR], grid, which)[0] for which in (False, True))
     assert filtered.max() > late.max() and grid[filtered.argmax()] == pytest.approx(0.03, abs=0.0101)
+
+
+def with_wild_ends():
+    """A grip whose first and last samples in contact are off by an impact."""
+    s = squeeze()
+    place = s.place.copy()
+    place[np.searchsorted(s.clock, s.t[[0, -1]] - 1e-9)] += 2e-3
+    return replace(s, place=place)
+
+
+def test_a_sample_at_a_contacts_end_does_not_pass_for_a_delay():
+    wild = [with_wild_ends()]
+    grid = np.array([-1e-3, 0.0, 1e-3])
+    inner = evidence([wild], [PRIOR], grid, False, inner=True)[0]
+    assert np.ptp(inner) < 1.0
+    outer = evidence([wild], [PRIOR], grid, False)[0]
+    assert np.ptp(outer) > 2.0  # what any delay gains that takes such a sample out
+
+
+@pytest.mark.parametrize("shift", [-0.003, 0.003])
+def test_a_small_delay_leaves_both_ends_of_a_contact(shift):
+    s = squeeze()
+    assert reading(s, shift=shift)[0].size == s.t.size - 1
+    load, place = reading(s, shift=shift, reach=abs(shift))
+    assert load.size == place.size == s.t.size
+    np.testing.assert_allclose(load, np.interp(s.t + shift, s.t, s.load), atol=0.2)  # 3 ms of a squeeze
+    assert fitted(load, place, s.sd)[0] == pytest.approx(2.5e-4, rel=0.1)
 
 
 def world(**effects):
