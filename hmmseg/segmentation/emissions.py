@@ -143,17 +143,16 @@ def _log_halting(f: Features, p: Parameters) -> np.ndarray:
     Without it, a halt would pass for a rest on something, as that predicts the motion so much better. A block
     that halts is where it was at the sample before; its height counts where that of blocks at rest does.
     """
-    out = sum(
-        log_student(v, np.hypot(sd, p.scale["velocity"])) + np.log(f.span[name]) * np.isfinite(v)
-        for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy))
-    )
+    out = np.zeros(f.t.size)
+    for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy)):
+        out += log_student(v, np.hypot(sd, p.scale["velocity"])) + np.log(f.span[name]) * np.isfinite(v)
     if p.levels:
         there = np.isfinite(f.y)
         last = np.maximum.accumulate(np.where(there, np.arange(f.y.size), -1))
         before = np.r_[-1, last[:-1]]
         risen = np.where(there & (before >= 0), f.y - f.y[before], np.nan)
         spread = np.sqrt(2 * f.sd_y**2 + p.scale["level"] ** 2)
-        out = out + log_student(risen, spread) + np.log(f.span["y"]) * np.isfinite(risen)
+        out += log_student(risen, spread) + np.log(f.span["y"]) * np.isfinite(risen)
     return out
 
 
