@@ -1,6 +1,6 @@
 """Real robots' logs against simulators of them: what the diagnosis says, as the docs tell it.
 
-    python -m experiments.real.robot_gap KIND FOLDER [--output FILE.json]
+    python -m experiments.real.robot_gap KIND FOLDER [--output FILE.json] [--figures DIR]
 
 KIND is xl330 or so101, FOLDER that of the logs (see experiments/real/xl330.py, so101.py).
 """
@@ -8,10 +8,13 @@ KIND is xl330 or so101, FOLDER that of the logs (see experiments/real/xl330.py, 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from experiments.real.hiro_gap import rounded
 from experiments.saving import save
+from hmmseg_cli.figures.gap_robot import Drawn, draw_before_after, draw_signal
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.recording import read_recording
@@ -38,42 +41,57 @@ def summary(found: RobotDiagnosis) -> dict:
     """What the docs tell of a diagnosis."""
     told = body(found)
     likely = sorted(told["probabilities"].items(), key=lambda item: -item[1])[:8]
-    out = {k: told[k] for k in KEPT} | {
+    out: dict[str, Any] = {k: told[k] for k in KEPT} | {
         "probabilities": dict(likely),
-        "remainder": told["remainder"]["share"],
+        "remainder": {"share": told["remainder"]["share"], "regimes": told["remainder"]["regimes"]},
     }
     if found.shrinkage is not None:
         out["by_fold"] = [list(names) for names in found.shrinkage.found]
         rows, far = found.composed.rows, found.shrinkage
         out["rms_by_log"] = (
             {
-                log.name: [
-                    float((r[rows.log == k] ** 2).mean() ** 0.5) for r in (found.plain.residual, far.residual)
-                ]
+                log.name: [float((r[rows.log == k] ** 2).mean() ** 0.5) for r in (far.plain, far.residual)]
                 for k, log in enumerate(found.composed.recordings)
             }
             if len(rows.channels) == 1
             else {}
         )
-    return rounded(out)
+    done: Any = rounded(out)
+    return done
 
 
-def run(kind: str, folder: Path) -> dict:
-    """The diagnosis of a kind's logs."""
+def run(kind: str, folder: Path, only: Sequence[str] = ()) -> RobotDiagnosis:
+    """The diagnosis of a kind's logs, or of those of these names alone."""
     spec, pattern = KINDS[kind]
     simulator = load_simulator(f"{HERE / spec}")
-    logs = [read_recording(path, simulator.channels) for path in sorted(folder.glob(pattern))]
-    return summary(diagnose(simulator, logs, tell=print))
+    paths = [p for p in sorted(folder.glob(pattern)) if not only or p.stem in only]
+    return diagnose(simulator, [read_recording(p, simulator.channels) for p in paths], tell=print)
+
+
+def published(found: RobotDiagnosis, name: str, output: Path | None, figures: Path | None) -> None:
+    """Write the summary, and the figures NAME_signal.png and NAME_before_after.png where asked for."""
+    save(output or RESULTS / f"{name}.json", summary(found))
+    if figures is not None:
+        drawn = Drawn(found, body(found), found.warnings)
+        draw_signal(drawn, figures / f"{name}_signal.png")
+        draw_before_after(drawn, figures / f"{name}_before_after.png")
+
+
+def asked(doc: str, kinds: Sequence[str] = ()) -> argparse.Namespace:
+    """The command line: KIND where there are several, FOLDER, --output and --figures."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    if kinds:
+        parser.add_argument("kind", choices=kinds)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--output", type=Path)
+    parser.add_argument("--figures", type=Path, help="folder that figures go to, such as docs/figures")
+    return parser.parse_args()
 
 
 def main() -> None:
     """Run on a folder and write the results."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("kind", choices=sorted(KINDS))
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--output", type=Path)
-    given = parser.parse_args()
-    save(given.output or RESULTS / f"{given.kind}.json", run(given.kind, given.folder))
+    given = asked(__doc__ or "", sorted(KINDS))
+    published(run(given.kind, given.folder), given.kind, given.output, given.figures)
 
 
 if __name__ == "__main__":

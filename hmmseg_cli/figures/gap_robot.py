@@ -89,9 +89,8 @@ def draw_signal(drawn: Drawn, path: Path) -> None:
     t, window = rows.time[mine], rows.window[mine]
     breaks = np.flatnonzero(np.diff(window)) + 1
     unit = found.composed.simulator.channels[rows.channels[channel]].unit
-    held = found.shrinkage is not None
-    after = found.shrinkage.residual if found.shrinkage is not None else found.linear.residual
-    label = "with the causes, held out" if held else "with what was fitted"
+    before, after = _both(found)
+    label = "with the causes, held out" if found.shrinkage is not None else "with what was fitted"
 
     def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan)
@@ -100,7 +99,7 @@ def draw_signal(drawn: Drawn, path: Path) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
         observed = rows.observed[mine]
         above.plot(t, observed, color="black", lw=1.2, label="recorded")
-        for residual, colour, name in ((found.plain.residual, RED, "model as it came"), (after, BLUE, label)):
+        for residual, colour, name in ((before, RED, "model as it came"), (after, BLUE, label)):
             above.plot(*split(observed - residual[mine]), color=colour, lw=0.8, label=name)
             below.plot(*split(residual[mine]), color=colour, lw=0.8, label=name)
         above.set_ylabel(f"{rows.channels[channel]} [{unit}]")
@@ -110,6 +109,12 @@ def draw_signal(drawn: Drawn, path: Path) -> None:
         above.set_title(
             f"{_short(found.composed.recordings[log].name)}: windows restarted from the recording"
         )
+
+
+def _both(found: RobotDiagnosis) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals before and after, each log predicted from the others where that was done."""
+    far = found.shrinkage
+    return (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
 
 
 def draw_probabilities(drawn: Drawn, path: Path) -> None:
@@ -126,14 +131,14 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
     """Root mean square residual by log of the channel with the largest gap, before and after, held out."""
     found = drawn.found
     rows = found.composed.rows
-    after = found.shrinkage.residual if found.shrinkage is not None else found.linear.residual
+    before, after = _both(found)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)
     at = np.arange(len(logs))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
         for place, residual, colour, name in (
-            (-0.2, found.plain.residual, RED, "before"),
+            (-0.2, before, RED, "before"),
             (0.2, after, BLUE, "after"),
         ):
             each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
@@ -142,5 +147,5 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
         axes.set_yscale("log")
         axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
         axes.set_ylabel("rms residual [sd of noise]")
-        axes.legend()
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         axes.set_title("Held-out logs" if found.shrinkage is not None else "All logs")

@@ -55,9 +55,14 @@ def _log_likelihood(f: Forms, effects: tuple[int, ...], x: np.ndarray) -> float:
 
 
 def _chances(gain: np.ndarray) -> np.ndarray:
-    """Chance (sets,) of gains (folds, sets) as good without any: one-sided t test over folds."""
-    sd = np.maximum(gain.std(0, ddof=1), 1e-9) / np.sqrt(len(gain))
-    return student.sf(gain.mean(0) / sd, len(gain) - 1)
+    """Chance (sets,) of gains (folds, sets) [nats] as good without any: one-sided t test over folds.
+
+    Gains beyond a nat count by their logarithm: one log in which a cause shows a hundred times as much as in
+    the others must not make the others' agreement look like scatter.
+    """
+    told = np.arcsinh(gain)
+    sd = np.maximum(told.std(0, ddof=1), 1e-9) / np.sqrt(len(told))
+    return student.sf(told.mean(0) / sd, len(told) - 1)
 
 
 def chance_of_gain(gap: Gap, one: tuple[int, ...], other: tuple[int, ...], fold: np.ndarray) -> float:
@@ -66,15 +71,22 @@ def chance_of_gain(gap: Gap, one: tuple[int, ...], other: tuple[int, ...], fold:
     return float(_chances(score[:, :1] - score[:, 1:])[0])
 
 
-def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> tuple[int, ...]:
-    """Of a set's effects those that held-out rows bear out beside the others; the least one goes first."""
+def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> int | None:
+    """Of a set's effects that held-out rows do not bear out beside the others the one that gains least; None
+    where all are borne out."""
     kept = tuple(sorted(effects))
-    while kept and np.unique(fold).size >= 2:
-        sets = [kept, *(tuple(j for j in kept if j != out) for out in kept)]
-        score = held_out_scores(gap, sets, fold)
-        chance = _chances(score[:, :1] - score[:, 1:])
-        worst = int(chance.argmax())
-        if chance[worst] < BORNE_OUT:
-            break
-        kept = sets[1 + worst]
+    if not kept or np.unique(fold).size < 2:
+        return None
+    score = held_out_scores(gap, [kept, *(tuple(j for j in kept if j != out) for out in kept)], fold)
+    gain = score[:, :1] - score[:, 1:]
+    failing = _chances(gain) >= BORNE_OUT
+    least = np.where(failing, np.arcsinh(gain).mean(0), np.inf)
+    return kept[int(least.argmin())] if failing.any() else None
+
+
+def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> tuple[int, ...]:
+    """Of a set's effects those that held-out rows bear out beside the others; the weakest one goes first."""
+    kept = tuple(sorted(effects))
+    while (out := weakest(gap, kept, fold)) is not None:
+        kept = tuple(j for j in kept if j != out)
     return kept

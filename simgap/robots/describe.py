@@ -27,6 +27,7 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
             "share": v.remainder if v.causes else (0.0 if v.verdict == "none" else 1.0),
             "p_value": None if v.verdict == "none" else _remainder_p(found),
             "where": _cells(v.remainder_where),
+            "regimes": dict(v.left),
         },
         "attribution": _attribution(found),
         "where": _cells(v.where),

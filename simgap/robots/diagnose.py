@@ -16,9 +16,10 @@ from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
-from simgap.robots.borne_out import borne_out, folds_of
+from simgap.robots.borne_out import folds_of
 from simgap.robots.discrepancy import learned
 from simgap.robots.experiments import NextLog, next_log
+from simgap.robots.explained import explained
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
@@ -27,9 +28,10 @@ from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
+from simgap.robots.prune import pruned
 from simgap.robots.search import Found, moved_to, point_of, search
 from simgap.robots.twins import healthy_twins
-from simgap.robots.whiten import NONE, covariances
+from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -41,7 +43,8 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class RobotDiagnosis:
-    """All that was found; `plain` is the gap as the simulator comes, `found` where the search ended; `linear`
+    """All that was found; `plain` is the gap as the simulator comes (what is fitted along, by least squares),
+    `found` where the search ended; `linear`
     and `forms` are the gap where the causes alone act."""
 
     composed: Composed
@@ -108,17 +111,16 @@ def diagnose(
     twins = healthy_twins(composed, plain, parts, seed)
     found = search(composed, parts, wanted, tell, forced, twins.factor)
     fold = folds_of(found.linear, len(recordings))
-    gap = found.forms.gap
     rows = np.flatnonzero(np.isfinite(found.linear.residual))
-    kept = found.models[0].effects
-    if not forced:
+    if forced:
+        chosen = found.models[0].effects
+        borne = tuple(found.names[j] for j in chosen)
+        point = point_of(composed, found.forms, chosen, found.linear.point)
+    else:
         tell("held-out logs")
-        kept = borne_out(gap, kept, fold[rows])
-    borne = tuple(found.names[j] for j in kept)
+        borne, point = pruned(composed, parts, found, fold, twins.factor)
     tell("refit")
-    linear, off = _refitted(
-        composed, point_of(composed, found.forms, kept, found.linear.point), [*along, *wanted], twins.factor
-    )
+    linear, off = _refitted(composed, point, [*along, *wanted], twins.factor)
     usable = [n for n in wanted if n in linear.moved]
     kinds = {n: c.kind for n, c in simulator.channels.items()}
     cov = covariances(linear, composed.windows, kinds, twins.factor)
@@ -128,11 +130,16 @@ def diagnose(
     s = forms(gap_of(composed, linear, sensor, parts, usable))
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
     told_apart = fold[rows] if off and len(recordings) >= 3 else None
-    verdict = judge(f, s, causes, null, rng, bool(forced), told_apart)
+    tell("shares")
+    names = tuple(usable[j] for j in causes)
+    told_by = explained(composed, linear, sensor, plain.point, names)
+    verdict = judge(f, s, causes, null, rng, told_by, bool(forced), told_apart)
     far = None
     if verdict.causes:
         tell("how far")
-        far = shrinkage(composed, found, plain, sensor, fold, borne, forced=bool(forced))
+        ended = Found(linear, cov.whitener(off), cov, off, f, (fitted(f, causes),), borne)
+        far = shrinkage(composed, ended, plain, sensor, fold, names, forced=bool(forced))
+    plain = _least_squares(composed, plain, sensor)
     following = next_log(f, verdict, [r.name for r in recordings])
     return RobotDiagnosis(
         composed,
@@ -159,6 +166,13 @@ def _plain(composed: Composed, point: Point, wanted: Sequence[str]) -> Linear:
         cov = covariances(rough, composed.windows, kinds)
         point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
     return linearise(composed, point, [*point, *wanted])
+
+
+def _least_squares(composed: Composed, plain: Linear, sensor: Whitener) -> Linear:
+    """The gap as the simulator comes at its best: whatever the causes gain must be gained over this."""
+    if not plain.point:
+        return plain
+    return linearise(composed, moved_to(composed, plain, sensor, plain.point), [])
 
 
 def _refitted(composed: Composed, point: Point, effects: Sequence[str], factor: np.ndarray):

@@ -59,22 +59,20 @@ def learned(cov: Covariances, residual: np.ndarray) -> Discrepancy:
 
 
 def _multipliers(cov: Covariances, residual: np.ndarray, scale: Mapping[str, float]) -> dict[int, float]:
-    """Each window's multiplier, the mode on a grid; how far they spread is learned with them."""
+    """Each window's multiplier, the mode on a grid.
+
+    Their spread is not learned: a multiplier is found from the residual that it then discounts, so with a
+    spread to match, windows in which a cause shows most would count least and the fit would follow those in
+    which nothing happens.
+    """
     cost: dict[int, np.ndarray] = {}
     for block, number, noise, sources in zip(cov.blocks, cov.window, cov.noise, cov.sources, strict=True):
-        own = cost.setdefault(number, np.zeros(len(GRID)))
+        own = cost.setdefault(number, 0.5 * (np.array(GRID) / SPREAD) ** 2)
         for i, g in enumerate(GRID):
             factor = cholesky(total(noise, sources, scale, np.exp(g)), lower=True, check_finite=False)
             white = solve_triangular(factor, residual[block], lower=True, check_finite=False)
             own[i] += float(np.log(np.diag(factor)).sum() + 0.5 * white @ white)
-    likelihood, grid = -np.array(list(cost.values())), np.array(GRID)
-    spread = SPREAD
-    for _ in range(20):  # expectation maximisation of the spread
-        prior = -0.5 * (grid / spread) ** 2
-        each = likelihood + prior
-        weight = np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True))
-        spread = max(SPREAD, float(np.sqrt((weight @ grid**2).mean())))
-    return {number: float(np.exp(grid[i])) for number, i in zip(cost, each.argmax(1), strict=True)}
+    return {number: float(np.exp(GRID[int(own.argmin())])) for number, own in cost.items()}
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ from scipy.stats import t as student
 from simgap.attribution.posterior import forms
 from simgap.attribution.search import sought
 from simgap.robots.borne_out import borne_out
-from simgap.robots.linear import Linear, base_at
+from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.search import Found, moved_to, point_of
-from simgap.robots.whiten import Whitener
+from simgap.robots.whiten import Whitener, covariances
 
 
 @dataclass(frozen=True)
 class Shrinkage:
     """Mean squares of whitened residuals of held-out stretches `before` and `after` (noise's own: 1), and
     the gap's `fraction` that is gone with its 90 % interval by fold. `rms`: by channel before and after, in
-    its unit; `found` by fold."""
+    its unit; `found` by fold; `plain` (N,), `residual` (N,): what both leave of the rows."""
 
     before: float
     after: float
@@ -30,6 +30,7 @@ class Shrinkage:
     interval_90: tuple[float, float]
     rms: dict[str, tuple[float, float]]
     found: tuple[tuple[str, ...], ...]
+    plain: np.ndarray
     residual: np.ndarray
 
 
@@ -47,7 +48,8 @@ def shrinkage(
     they are `forced`."""
     rows, index = found.linear.rows, np.flatnonzero(np.isfinite(found.linear.residual))
     gap = found.forms.gap
-    after, told = np.full(rows.log.size, np.nan), []
+    before, after = plain.residual.copy(), np.full(rows.log.size, np.nan)
+    told = []
     whole_logs = all(np.unique(fold[rows.log == log]).size == 1 for log in np.unique(rows.log))
     for number in np.unique(fold):
         inside = fold == number
@@ -62,25 +64,41 @@ def shrinkage(
         if whole_logs:
             point = _refitted(composed, found, point, np.unique(rows.log[~inside]).tolist())
         logs = np.unique(rows.log[inside])
+        part, mine = composed.along(logs.tolist()), np.isin(rows.log, logs)
         if whole_logs:
             point = _own(composed, found, point, logs.tolist())
-        mine = np.isin(rows.log, logs)
-        predicted = base_at(composed.along(logs.tolist()), point).rows
+            bare = _plain(composed, plain.point, np.unique(rows.log[~inside]).tolist())
+            bare = _own(composed, found, bare, logs.tolist())
+            before[mine] = rows.observed[mine] - base_at(part, bare).rows
+        predicted = base_at(part, point).rows
         after[mine] = np.where(inside[mine], rows.observed[mine] - predicted, after[mine])
-    return _measured(found.linear, plain, after, sensor, fold, tuple(told))
+    return _measured(found.linear, before, after, sensor, fold, tuple(told))
+
+
+def _plain(composed: Composed, point: Point, logs: Sequence[int]) -> Point:
+    """What is fitted along, without any cause, by least squares on some logs: the least that it leaves."""
+    if not point:
+        return point
+    part = composed.along(logs)
+    linear = linearise(part, point, list(point))
+    return moved_to(part, linear, covariances(linear, part.windows, _kinds(composed)).whitener(), point)
+
+
+def _kinds(composed: Composed) -> dict[str, str]:
+    return {n: c.kind for n, c in composed.simulator.channels.items()}
 
 
 def _measured(
     linear: Linear,
-    plain: Linear,
+    before: np.ndarray,
     after: np.ndarray,
     sensor: Whitener,
     fold: np.ndarray,
     told: tuple[tuple[str, ...], ...],
 ) -> Shrinkage | None:
-    usable = np.isfinite(after) & np.isfinite(plain.residual) & np.isfinite(linear.residual)
+    usable = np.isfinite(after) & np.isfinite(before) & np.isfinite(linear.residual)
     numbers = np.unique(fold)
-    white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (plain.residual, after)]
+    white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (before, after)]
     square = np.array(
         [
             [float(np.sum(w[(fold == n) & usable])) for w in white] + [float(np.sum((fold == n) & usable))]
@@ -99,7 +117,7 @@ def _measured(
     for c, name in enumerate(linear.rows.channels):
         mine = usable & (linear.rows.channel == c)
         if mine.any():
-            rms[name] = tuple(float(np.sqrt(np.mean(r[mine] ** 2))) for r in (plain.residual, after))
+            rms[name] = tuple(float(np.sqrt(np.mean(r[mine] ** 2))) for r in (before, after))
     total = square.sum(0)
     return Shrinkage(
         total[0] / total[2],
@@ -109,6 +127,7 @@ def _measured(
         (fraction - wide, min(fraction + wide, 1.0)),
         rms,
         told,
+        before,
         after,
     )
 
@@ -123,13 +142,9 @@ def _refitted(
     composed: Composed, found: Found, point: Point, logs: Sequence[int], only: Sequence[str] | None = None
 ) -> Point:
     """The point fitted to some of the logs alone, exactly."""
-    from simgap.robots.linear import linearise
-    from simgap.robots.whiten import covariances
-
     part = composed.along(logs)
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     linear = linearise(part, point, list(point))
-    cov = covariances(linear, part.windows, kinds)
+    cov = covariances(linear, part.windows, _kinds(composed))
     numbers = {
         i: found.discrepancy.multiplier.get(composed.windows.index(w), 1.0)
         for i, w in enumerate(part.windows)

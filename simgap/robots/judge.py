@@ -12,9 +12,10 @@ from simgap.attribution.attribute import ALARM
 from simgap.attribution.cells import Cell, significant
 from simgap.attribution.detection import Detection, statistic
 from simgap.attribution.posterior import Forms, Model, fitted
-from simgap.attribution.shares import Shares, shares
+from simgap.attribution.shares import Shares
 from simgap.attribution.verdict import LEAST, MOST, WIDTH
 from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
+from simgap.robots.explained import Explained
 
 RIVALS = 8  # chosen: sets that are compared on held-out rows
 TWENTY = 20.0  # chosen: to one: odds from which on a rival is ruled out
@@ -33,6 +34,7 @@ class Verdict:
     where: tuple[Cell, ...]
     remainder_where: tuple[Cell, ...]
     shares: Shares
+    left: dict[str, float]  # share of the gap that is left, by regime
     shared: tuple[str, ...]  # effects that the shares are of, in their order
     model: Model  # of all that was borne out, too small to be told or not, discrepancies whitened
     chance: dict[str, float]  # of each candidate to act
@@ -53,11 +55,16 @@ def judge(
     causes: tuple[int, ...],
     twins: Sequence[float],
     rng: np.random.Generator,
+    told_by: Explained,
     forced: bool = False,
     fold: np.ndarray | None = None,
 ) -> Verdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
-    `causes` were borne out by held-out rows; `twins` are healthy twins' statistics."""
+    `causes` were borne out by held-out rows, and explain what `told_by` says, in that order; `twins` are
+    healthy twins' statistics.
+
+    Causes are known where they leave little of the gap of any regime (flight, contact); what they leave in
+    another is the remainder, which is told."""
     gap = f.gap
     models = rivals(f, causes)
     score = np.array([m.score for m in models])
@@ -67,15 +74,10 @@ def judge(
     exceed = sum(t >= value for t in twins)
     p = max(p, exceed / len(twins)) if twins else p
     detection = Detection(value, p, 1 / (len(twins) + 1) if twins else 0.0)
-    one = np.ones(sensor.count.size)
-    explained = shares(sensor, fitted(sensor, causes), one, rng)
-    part = explained.each.mean(0) if causes else np.zeros(0)
-    kept = (
-        causes if forced else tuple(j for j, s in zip(causes, part, strict=True) if s >= LEAST * part.sum())
-    )
-    if kept != causes:
-        explained = shares(sensor, fitted(sensor, kept), one, rng)
-    left = explained.remainder if kept else 1.0
+    part = told_by.part.max(1) if causes else np.zeros(0)
+    kept = causes if forced else tuple(j for j, s in zip(causes, part, strict=True) if s >= LEAST)
+    parts = told_by.shares([causes.index(j) for j in kept], rng)
+    left = float(told_by.left.min()) if kept else 1.0  # of the regime that they explain best
     none = float(expit((np.log(max(p, 1e-300)) - np.log(ALARM)) / 0.5))
     known = float(expit(np.log(MOST / max(left, 1e-6)) / WIDTH)) if kept else 0.0
     name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
@@ -113,10 +115,11 @@ def judge(
         name(partners),
         probabilities,
         detection,
-        left if told else 1.0,
+        parts.remainder if told else 1.0,
         significant(rows, band, before, noise[rows.channel]) if verdict != "none" else (),
         significant(rows, band, after, noise[rows.channel]) if verdict != "none" else (),
-        explained,
+        parts,
+        dict(zip(told_by.regimes, told_by.left.tolist(), strict=True)) if told else {},
         tuple(gap.candidates[j].name for j in kept),
         fitted(f, causes),
         chance,

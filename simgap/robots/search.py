@@ -67,7 +67,7 @@ def search(
             point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
             rough = linearise(composed, point, along)
     best: tuple[str, ...] = ()
-    last = None
+    last, seen = None, set[tuple[str, ...]]()
     for number in range(ROUNDS):
         tell(f"round {number + 1}")
         linear = linearise(composed, point, [*along, *candidates])
@@ -87,8 +87,10 @@ def search(
         last = Found(linear, whiten, cov, off, f, tuple(models), now)
         tell(f"round {number + 1}: {' + '.join(now) or 'nothing'}")
         settled = now == best and number and _gain(last) < SETTLED
-        if settled or number == ROUNDS - 1:
+        again = now != best and now in seen  # sets that take turns are alike, and none will win
+        if settled or again or number == ROUNDS - 1:
             break
+        seen.add(now)
         best = now
         point = moved_to(composed, linear, whiten, point_of(composed, f, models[0].effects, point))
     assert last is not None

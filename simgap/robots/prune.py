@@ -1,0 +1,46 @@
+"""Which effects of a set held-out logs bear out, each set judged where it fits best.
+
+A search ends on more effects than there are: each was the best at its time, and some of them stand in for
+others. They are taken out one by one, and after each everything is fitted anew and linearised there: a set
+judged about the point of a larger one is judged by straight lines that do not reach to its own best fit, and
+loses causes that no log would miss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from simgap.attribution.posterior import forms
+from simgap.robots.borne_out import weakest
+from simgap.robots.discrepancy import learned
+from simgap.robots.gap import fitted_along, gap_of
+from simgap.robots.linear import linearise
+from simgap.robots.model import Composed, Point
+from simgap.robots.phases import Phases
+from simgap.robots.search import Found, moved_to, point_of
+from simgap.robots.whiten import covariances
+
+
+def pruned(
+    composed: Composed, phases: Phases, found: Found, fold: np.ndarray, factor: np.ndarray | None
+) -> tuple[tuple[str, ...], Point]:
+    """The effects that are left, and the point of their best fit. `fold` (N,): of each row; `factor` (N,)
+    multiplies the noise's sd."""
+    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
+    along = fitted_along(composed)
+    kept = tuple(found.names[j] for j in found.models[0].effects)
+    point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
+    linear, whiten = found.linear, found.whiten
+    while kept:
+        point = moved_to(composed, linear, whiten, point)
+        linear = linearise(composed, point, [*along, *kept])
+        cov = covariances(linear, composed.windows, kinds, factor)
+        whiten = cov.whitener(learned(cov, linear.residual))
+        f = forms(gap_of(composed, linear, whiten, phases, kept))
+        rows = np.flatnonzero(np.isfinite(linear.residual))
+        out = weakest(f.gap, range(len(kept)), fold[rows])
+        if out is None:
+            break
+        kept = tuple(n for j, n in enumerate(kept) if j != out)
+        point = {n: values for n, values in point.items() if n in along or n in kept}
+    return kept, point
