@@ -18,6 +18,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
+UNSTATED = 0.8  # chosen: prior sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
 CLOSED = 0.15  # chosen: of the grip's own force: below it, one finger may not touch yet
 MIN_SAMPLES = 6  # numerics
 TAIL = 4.0  # chosen: of the residuals, Student-t, as everywhere (hmmseg.segmentation.emissions)
@@ -89,7 +90,7 @@ def slope(
         basis, _ = np.linalg.qr((np.concatenate([x[None], others]) * np.sqrt(trust)).T)
         alone = residual / np.maximum(1 - (basis**2).sum(axis=1), 1e-3)
         spread = max(float((weights**2 * alone**2).sum()), scale**2 / power)
-        found = Slope(weights, spread + SLOPE_SD**2)
+        found = Slope(weights, spread)
     return found
 
 
@@ -100,20 +101,33 @@ def _less(values: np.ndarray, others: np.ndarray, trust: np.ndarray) -> np.ndarr
     return values - fitted @ others
 
 
+def middle_share(shares: np.ndarray, variances: np.ndarray, error: np.ndarray | float) -> tuple[float, float]:
+    """Weighted median of slopes (K,) and its standard error, each off by `error` beside its variance."""
+    order = np.argsort(shares)
+    cumulative = np.cumsum((1 / (variances + error**2))[order])
+    # A median of normal draws has pi / 2 times the variance of their mean.
+    return float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)]), np.sqrt(
+        np.pi / 2 / cumulative[-1]
+    )
+
+
 def unexpected_share(shares: np.ndarray, variances: np.ndarray, stated: bool, admitted: float) -> float:
     """Share by which all slopes (K,) together disagree with the rig, 0 where it admits as much.
 
     `stated`: whether the rig has pads that give; of those that it calls rigid any give is a surprise. The
-    weighted median, so that no single grip decides; variances include SLOPE_SD.
+    weighted median, so that no single grip decides.
     """
     if not shares.size:
         return 0.0
-    if not stated:  # a slope's own error is a share of what truly gives
-        variances = variances - SLOPE_SD**2 + (SLOPE_SD * shares) ** 2
-    order = np.argsort(shares)
-    cumulative = np.cumsum(1 / variances[order])
-    middle = float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
-    # A median of normal draws has pi / 2 times the variance of their mean.
+    # A slope's own error is a share of what truly gives.
+    middle, error = middle_share(shares, variances, SLOPE_SD if stated else SLOPE_SD * np.abs(shares))
     alike = SLOPE_SD if stated else SLOPE_SD * abs(middle)
-    allowed = np.sqrt(np.pi / 2 / cumulative[-1] + alike**2 + admitted**2)
-    return middle if abs(middle) > SURPRISING * allowed else 0.0
+    return middle if abs(middle) > SURPRISING * np.hypot(np.hypot(error, alike), admitted) else 0.0
+
+
+def possible_share(shares: np.ndarray, variances: np.ndarray) -> float:
+    """What slopes (K,) say of how much unstated pads may give, as a share of the give of RIGID ones."""
+    if not shares.size:
+        return UNSTATED
+    middle, error = middle_share(shares, variances, 0.0)
+    return min(max(abs(middle), error), max(UNSTATED, abs(middle)))

@@ -20,7 +20,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation.compliance import SLOPE_SD
 from estimation.moments import (
+    SLOPES,
     free_means,
     level_rises,
     observe,
@@ -56,6 +58,7 @@ class Design:
     `shifts` (K, N) per standard deviation of each deviation; `channel` (K,) indexes CHANNELS;
     `unit` (K,): what shares of model error are taken of; `trial`, `move` (K,): where it was seen;
     `slope` (K,): whether a slope over the give rather than a mean (its shares are those of the mean).
+    `slope_sd` (3,): by channel, the error that all slopes have alike and each has of its own.
     `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
     free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
     that free motion shows and the rig does not admit, `doubt`: the like of the pads; `level_rises`: by
@@ -77,6 +80,7 @@ class Design:
     free_variance: np.ndarray
     free_shifts: np.ndarray
     scale_count: np.ndarray
+    slope_sd: np.ndarray = field(default_factory=lambda: np.full(len(CHANNELS), SLOPE_SD))
     unexpected: tuple[Nuisance, ...] = ()
     doubt: PadDoubt = field(default_factory=PadDoubt)
     level_rises: dict[int, float] = field(default_factory=dict)
@@ -114,14 +118,16 @@ def build(
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
     free_mean, free_variance = free_means(aligned, noise)
     surprise = unexpected_bias(free_mean, free_variance, rig)
-    slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in aligned])  # T, M, 3
-    slopes[..., ~there.any(axis=(0, 1))] = np.nan  # of channels that tell no unknown
+    slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in aligned])  # T, M, K
+    sloped = np.array([channel for channel, _ in SLOPES.values()])
+    slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that tell no unknown
     slope_variance = np.stack([slope_variances(a, moves) for a in aligned])
     doubt = pad_doubt(slopes, slope_variance, aligned, rig)
+    slope_variance += doubt.slope_sd()[sloped] ** 2
     deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}
     shifts = np.zeros((*there.shape, len(deviations)))
-    slope_shifts = np.zeros((*there.shape, len(deviations)))
+    slope_shifts = np.zeros((*slopes.shape, len(deviations)))
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))
     for j, deviation in enumerate(deviations):
         for i, (trial, a) in enumerate(zip(trials, aligned, strict=True)):
@@ -139,12 +145,13 @@ def build(
     return Design(
         unknowns=unknowns, nuisances=deviations, mean=np.concatenate([mean, slopes[steep]]),
         variance=np.concatenate([spread, slope_variance[steep]]), coefficients=rows, shifts=shifts,
-        channel=np.concatenate([where[2], steep[2]]),
+        channel=np.concatenate([where[2], sloped[steep[2]]]),
         unit=np.concatenate([units(aligned, raw, rig)[where], np.ones(steep[0].size)]),
         trial=np.concatenate([where[0], steep[0]]), move=np.concatenate([where[1], steep[1]]),
         slope=np.repeat([False, True], [where[0].size, steep[0].size]),
         free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
-        scale_count=np.array(counts), unexpected=tuple(d for d in deviations if d.name in surprising),
+        scale_count=np.array(counts), slope_sd=doubt.slope_sd(),
+        unexpected=tuple(d for d in deviations if d.name in surprising),
         doubt=doubt, level_rises=level_rises(raw, rises),
     )  # fmt: skip
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from estimation.actual import Actual
-from estimation.compliance import unit_pads
 from estimation.design import Design, build
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.observations import CHANNELS, Aligned, Noise, aligned_weights
+from estimation.observations import Aligned, Noise, aligned_weights
 from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
+from estimation.remarks import misfits, soft_pads, unnamed, unrepeated, unstated_pads
 from estimation.sampler import Draws, sample
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
@@ -28,7 +28,6 @@ from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import as_html, as_text
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
-NOT_LEVEL = 2e-3  # chosen: m; more than a tilted table or a slip in the grip make of a move on a level
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # chosen
 
 
@@ -168,7 +167,7 @@ def identify_aligned(
     if "friction" in hidden:
         friction = {obj: FrictionPosterior(None, reason=hidden["friction"], ground=f.ground)
                     for obj, f in friction.items()}  # fmt: skip
-    warnings, notes = _misfits(aligned), []
+    warnings, notes = misfits(aligned), []
     sampled, predictive = None, None
     reasons = _reasons(aligned, design, friction)
     if design.unknowns:
@@ -177,7 +176,7 @@ def identify_aligned(
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings
-            notes += _unrepeated(design)
+            notes += [*unrepeated(design), *unstated_pads(design)]
         if sampled.method != "emcee":
             warnings.append("the chain did not converge: intervals are of the weighted Laplace approximation")
         if not sampled.converged:
@@ -192,8 +191,8 @@ def identify_aligned(
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
     ]
-    warnings += _soft_pads(design, rig)
-    warnings += _unnamed(aligned.task, design)
+    warnings += soft_pads(design, rig)
+    warnings += unnamed(aligned.task, design)
     return Identification(
         aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in kept[:num]),
         draws[:, :num], tuple(kept[num:]), draws[:, num:], sampled if kept else None,
@@ -245,49 +244,3 @@ def _not_recorded(aligned: AlignedTrials, obj: str, prop: str) -> str:
     if not needed:
         return f"no subtask of this task lifts {obj}"
     return f"the recording does not show {' and '.join(needed)} as the task has it"
-
-
-def _soft_pads(design: Design, rig: Rig) -> list[str]:
-    """Pads that give otherwise than the rig says, as every grip shows while its force changes."""
-    out, tip = [], unit_pads(rig)
-    for kind, share, compliance in (
-        ("normal", design.doubt.normal, tip.normal1), ("shear", design.doubt.shear, tip.shear1),
-    ):  # fmt: skip
-        stated = getattr(rig.fingertip, f"{kind}_stiffness")
-        if not share:
-            continue
-        true = compliance * (share + (1.0 if np.isfinite(stated) else 0.0))
-        seen = f"about {1 / true:.2g} N/m" if true > 0 else "no give at all, or forces that are late"
-        out.append(
-            f"[fingertip] {kind}_stiffness = {stated:g}, but readings within each grip show {seen}: "
-            f"{'widths' if kind == 'normal' else 'heights'} allow for it"
-        )
-    return out
-
-
-def _unnamed(task: BlockTask, design: Design) -> list[str]:
-    """Moves that should be level and are not: something that the task does not name lies beneath."""
-    return [
-        f"{task.performed[move].object} was {'raised' if rise > 0 else 'lowered'} by {abs(rise) * 1e3:.1f} "
-        "mm, though the task moves it on a level: an object that the task does not name may lie beneath"
-        for move, rise in design.level_rises.items()
-        if abs(rise) > NOT_LEVEL
-    ]
-
-
-def _misfits(aligned: AlignedTrials) -> list[str]:
-    found = [trial.segmentation for trial in aligned.trials]
-    remarks = dict.fromkeys(remark for s in found for remark in s.remarks)
-    return [*(f"{s.file}: {failure}" for s in found for failure in s.failures), *remarks]
-
-
-def _unrepeated(design: Design) -> list[str]:
-    """Where no grip repeats another, the prior alone says how far off the contact equations may be."""
-    seen = np.bincount(design.channel, minlength=len(CHANNELS)) > 0
-    alone = [name for name, n, s in zip(CHANNELS, design.repeats(), seen, strict=True) if s and n == 0]
-    if not alone:
-        return []
-    return [
-        f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
-        "from its prior; a second trial would show it"
-    ]

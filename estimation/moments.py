@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.combinations import Terms
-from estimation.compliance import shear_give, squeeze_give, unexpected_share, unit_pads
+from estimation.compliance import possible_share, shear_give, squeeze_give, unexpected_share, unit_pads
 from estimation.nuisance import PadDoubt
 from estimation.observations import (
-    CHANNELS,
     Aligned,
     Noise,
     channel_values,
@@ -20,7 +19,8 @@ from estimation.unknowns import DISTANCE, FORCE, RISE
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 
-READINGS = {DISTANCE: "distance", RISE: "place"}  # the samples whose slopes show the pads
+# Slopes that show the pads, by their names in `Weights.slopes`: the channel they are of, whose samples.
+SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
 
 def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
@@ -35,41 +35,53 @@ def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) 
 
 
 def observe_slopes(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
-    """Slopes of readings over the pads' give (num_moves, 3) of one trial, NaN where there is none."""
-    values, out = channel_values(signals, rig), np.full((len(moves), len(CHANNELS)), np.nan)
+    """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where none."""
+    values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
-        for c, reading in READINGS.items():
-            found = aligned.weights.slopes.get(move, {}).get(CHANNELS[c])
+        for k, (name, (_, reading)) in enumerate(SLOPES.items()):
+            found = aligned.weights.slopes.get(move, {}).get(name)
             if found is not None:
-                out[i, c] = found.weights @ np.nan_to_num(values[reading])
+                out[i, k] = found.weights @ np.nan_to_num(values[reading])
     return out
 
 
 def slope_variances(aligned: Aligned, moves: Sequence[int]) -> np.ndarray:
-    """Variances (num_moves, 3) of the slopes, infinite of none."""
-    found = [[aligned.weights.slopes.get(m, {}).get(name) for name in CHANNELS] for m in moves]
+    """Variances (num_moves, len(SLOPES)) of the slopes, infinite of none."""
+    found = [[aligned.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
     return np.array([[np.inf if s is None else s.variance for s in row] for row in found])
 
 
 def pad_doubt(slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[Aligned], rig: Rig) -> PadDoubt:
-    """What slopes (num_trials, num_moves, 3) say against the rig's pads, and a usual grip force."""
+    """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, and usual forces.
+
+    A share that several kinds of slope find is the largest of them.
+    """
     admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
-    found = {}
-    for c, stiffness in ((DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness)):
-        seen = np.isfinite(slopes[..., c])
+    found, possible = {DISTANCE: 0.0, RISE: 0.0}, {DISTANCE: 0.0, RISE: 0.0}
+    for channel, stiffness in (
+        (DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness),
+    ):  # fmt: skip
         stated = bool(np.isfinite(stiffness))
-        found[c] = unexpected_share(
-            slopes[..., c][seen], variance[..., c][seen], stated, admitted if stated else 0.0
-        )
-    squeeze = np.concatenate([_squeeze(a) for a in aligned])
+        kinds = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
+        for k in kinds:
+            mine = slopes[..., k][np.isfinite(slopes[..., k])], variance[..., k][np.isfinite(slopes[..., k])]
+            share = unexpected_share(*mine, stated, admitted if stated else 0.0)
+            found[channel] = max(found[channel], share, key=abs)
+        if not stated:
+            seen = np.isfinite(slopes[..., kinds])
+            possible[channel] = possible_share(slopes[..., kinds][seen], variance[..., kinds][seen])
+    usual = [float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, aligned), strict=True)]
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
-    return PadDoubt(-found[DISTANCE], found[RISE], max(float(np.median(squeeze)), 1e-3))
+    return PadDoubt(-found[DISTANCE], found[RISE], possible[DISTANCE], possible[RISE], *usual)
 
 
-def _squeeze(aligned: Aligned) -> np.ndarray:
-    """Mean grip force of one finger (num_moves,) [N]."""
-    force = np.nan_to_num(aligned.signals.fx1 - aligned.signals.fx2) / 2
-    return np.array([np.mean(w["distance"] @ force) for w in aligned.weights.grips.values()])
+def _usual(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
+    """Mean forces of one finger (num_moves,) along the grip, and in shear where the block is put down [N]."""
+    s, grips = aligned.signals, aligned.weights.grips.values()
+    along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
+    return np.array([np.mean(w["distance"] @ along) for w in grips]), np.array(
+        [abs(np.mean(w["place"] @ up)) for w in grips]
+    )
 
 
 def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -89,19 +101,23 @@ def sampling_variance(aligned: Aligned, noise: Noise, moves: Sequence[int]) -> n
 def units(aligned: Sequence[Aligned], raw: np.ndarray, rig: Rig) -> np.ndarray:
     """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
 
-    Of a rise at least the give under the weight: contact forces that balance leave other errors.
+    Of a rise at least the give under the weight, and what it changed by in landing: what a pad does on
+    its way from one to the other need not cancel where contact forces balance.
     """
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
-    grip, lever = [], []
+    grip, lever, landed = [], [], []
     for a in aligned:
         squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
         grips = a.weights.grips.values()
         grip.append([np.mean(w["distance"] @ squeeze) for w in grips])
-        lever.append([np.mean(w["place"] @ shear) - np.mean(w["pickup"] @ shear) for w in grips])
+        place = [np.mean(w["place"] @ shear) for w in grips]
+        lever.append([p - np.mean(w["pickup"] @ shear) for p, w in zip(place, grips, strict=True)])
+        landed.append([abs(p - np.mean(w["force"] @ shear)) for p, w in zip(place, grips, strict=True)])
     hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
     rise = np.array(lever)
-    rise = np.where(rise < 0, -1.0, 1.0) * np.maximum(np.abs(rise), hanging)
+    least = np.maximum(hanging, np.array(landed))
+    rise = np.where(rise < 0, -1.0, 1.0) * np.maximum(np.abs(rise), least)
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
 
 

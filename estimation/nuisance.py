@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.compliance import unit_pads
+from estimation.compliance import SLOPE_SD, UNSTATED, unit_pads
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial
@@ -20,6 +20,7 @@ from hmmseg.io.trial import Trial
 # chosen: a pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off
 # by as much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
 MOST_BENT = 0.5
+UNLIKE = 0.3  # chosen: by which share of what both pads have alike one may differ: foams of one make do
 
 
 @dataclass(frozen=True)
@@ -60,32 +61,45 @@ class PadDoubt:
     """What recordings show of the pads and the rig does not admit: how much softer they are, as shares.
 
     Along the grip and in shear, 0 for no doubt: the compliance is 1 + share times the nominal, and its
-    extra prior sd is as large. `squeeze` is a usual grip force of one finger [N].
+    extra prior sd is as large. `normal_give`, `shear_give`: how much pads may give, by what the
+    recordings show, whose stiffness the rig leaves unstated; 0 where it states one. `usual_normal`,
+    `usual_shear`: forces of one finger as they usually are in a grip, and where a block is put down [N].
     """
 
     normal: float = 0.0
     shear: float = 0.0
-    squeeze: float = 1.0
+    normal_give: float = 0.0
+    shear_give: float = 0.0
+    usual_normal: float = 1.0
+    usual_shear: float = 1.0
+
+    def slope_sd(self) -> np.ndarray:
+        """Standard deviations (3,) by channel of a slope's own error, a share of what truly gives."""
+        return SLOPE_SD * np.array([1.0, self.normal_give or 1.0, self.shear_give or 1.0])
 
 
-def _softer_pad(finger: int, axis: str):
+def _softer_pads(fingers: tuple[int, ...], axis: str):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """A pad whose compliance is 1 + size of the nominal: its face lies elsewhere under a force."""
-        signals, name = task_space(trial, rig), f"{axis}{finger}"
-        give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
-        return replace(signals, **{name: getattr(signals, name) - give * size})
+        """Pads whose compliance is 1 + size of the nominal: their faces lie elsewhere under a force."""
+        signals, moved = task_space(trial, rig), {}
+        for finger in fingers:
+            name = f"{axis}{finger}"
+            give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
+            moved[name] = getattr(signals, name) - give * size
+        return replace(signals, **moved)
 
     return read
 
 
-def _bent_pads(squeeze: float):
+def _bent_pads(axis: str, usual: float):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads that give as force^(1 + size), as the nominal at the force `squeeze`; to first order."""
+        """Pads that give as force^(1 + size), as the nominal at the force `usual`; to first order."""
         signals, moved = task_space(trial, rig), {}
         for finger in (1, 2):
-            force = getattr(signals, f"fx{finger}")
-            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * squeeze) / squeeze)
-            moved[f"x{finger}"] = getattr(signals, f"x{finger}") - _compliance(rig, finger, "x") * bend * size
+            name = f"{axis}{finger}"
+            force = getattr(signals, f"f{name}")
+            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * usual) / usual)
+            moved[name] = getattr(signals, name) - _compliance(rig, finger, axis) * bend * size
         return replace(signals, **moved)
 
     return read
@@ -126,17 +140,23 @@ def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0
             if s.link_length[i] > 0:
                 out.append(Nuisance(f"link_length.{finger}{link + 1}", s.link_length[i], 1e-5,
                                     _longer_link(finger, link)))  # fmt: skip
-    # What slopes show is compliance and exponent together, so either may be off by as much as both.
-    bent = min(max(abs(doubt.normal), *s.pad_stiffness) / np.log(2), MOST_BENT)
-    extra = {"normal": float(np.hypot(doubt.normal, bent)) if doubt.normal else 0.0, "shear": doubt.shear}
+    # What slopes show is compliance and exponent together, so either may be off by as much as both; the bend
+    # is that of what gives.
+    stated = min(max(abs(doubt.normal), *s.pad_stiffness) / np.log(2), MOST_BENT)
+    bends = {"normal": MOST_BENT * doubt.normal_give or stated, "shear": MOST_BENT * doubt.shear_give}
     for axis, kind in (("x", "normal"), ("y", "shear")):
-        rigid = np.isinf(getattr(rig.fingertip, f"{kind}_stiffness"))
+        found, give = abs(getattr(doubt, kind)), getattr(doubt, f"{kind}_give")
+        both = max(found, UNSTATED if give else 0.0)
+        if both:
+            both = float(np.hypot(both, bends[kind]))
+            out.append(Nuisance(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis)))
         for finger in (1, 2):
-            sd = float(np.hypot(0.0 if rigid else s.pad_stiffness[finger - 1], extra[kind]))
+            sd = float(np.hypot(0.0 if give else s.pad_stiffness[finger - 1], UNLIKE * max(found, give)))
             if sd > 0:
-                out.append(Nuisance(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pad(finger, axis)))
-    if any(n.name.startswith("pad_normal") for n in out):
-        out.append(Nuisance("pad_exponent", bent, 1e-3, _bent_pads(doubt.squeeze)))
+                out.append(Nuisance(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis)))
+        if bends[kind] and any(n.name.startswith(f"pad_{kind}") for n in out):
+            usual = max(getattr(doubt, f"usual_{kind}"), 1e-3)
+            out.append(Nuisance(f"pad_{kind}_exponent", bends[kind], 1e-3, _bent_pads(axis, usual)))
     if touch_sd > 0:
         out.append(Nuisance("touch", touch_sd, 1e-5, _wider))
     return tuple(out)

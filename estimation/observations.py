@@ -15,10 +15,12 @@ pooled over grips, with the integrated autocorrelation time of the residuals (Hu
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
-from estimation.compliance import Slope, closed, shear_give, slope, squeeze_give
+from estimation.compliance import Slope
+from estimation.pad_slopes import slope_of_landing, slopes_within
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
@@ -44,7 +46,8 @@ class Weights:
     samples (0 everywhere: nothing recorded), `counts[m]` to effective sample numbers
     (num_alignments,); `free` are weights (num_timesteps,) over free motion, `free_robust`
     (4, num_timesteps) those of each force, which a finger that touches early does not sway.
-    `slopes[m]` maps "distance" and "rise" to slopes over the pads' give within the grip, where seen.
+    `slopes[m]` maps "distance" and "rise" to slopes over the pads' give within the grip, and "landing" to
+    that of heights from the touch to the place, where seen.
     """
 
     grips: dict[int, dict[str, np.ndarray]]
@@ -137,7 +140,7 @@ def aligned_weights(
 ) -> tuple[list[Aligned], Noise]:
     """Weights of every grip's means for drawn alignments, and the noise of each channel."""
     steps, rig = aligned.subtasks, aligned.rig
-    prepared, felt = [], []  # felt: what the fingers press with is measured
+    prepared, felt, touches = [], [], []  # felt: what the fingers press with is measured
     for trial in aligned.trials:
         thinned = thin(trial.signals, MAX_RATE)
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
@@ -147,12 +150,15 @@ def aligned_weights(
         masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
         prepared.append((thinned, best & present[:, None], masks))
         felt.append("friction" not in trial.trial.hidden)
+        touches.append([(boundary.mean, boundary.sd) for boundary in trial.boundaries])
     moves = sorted({s.move for s in steps if s.move is not None})
+    landings = [(a, b) for a, b in pairwise(steps) if (a.state, b.state) == (ABOVE_GROUND, ON_GROUND)]
+    touched = {b.move: a.index for a, b in landings}
     keys = ("force", "distance", "pickup", "place")
     scales = {key: _scale(prepared, steps, moves, key, rig) for key in keys}
     pooled: dict[str, list] = {key: [] for key in keys}
     out = []
-    for (thinned, best, masks), squeezed in zip(prepared, felt, strict=True):
+    for (thinned, best, masks), squeezed, moments in zip(prepared, felt, touches, strict=True):
         values, factor = channel_values(thinned, rig), gravity_factor(thinned, rig)
         grips, counts = {}, {}
         for move in moves:
@@ -178,29 +184,20 @@ def aligned_weights(
             row[:] = np.where(free, weight, 0.0) / max(weight[free].sum(), 1e-9)
             scales[name] = max(scales.get(name, 0.0), scale)
             pooled.setdefault(name, []).append((residual[free], weight[free]))
-        slopes = {m: _slopes(thinned, values, best, _members(steps, m), scales, rig) for m in moves}
+        slopes = {}
+        for m in moves:
+            members = _members(steps, m)
+            groups = {k: np.asarray(best[i].any(axis=0)) for k, i in members.items() if k != "force"}
+            slopes[m] = slopes_within(thinned, values, groups, scales, rig)
+            if m in touched:
+                k, place = touched[m], grips[m]["place"].mean(axis=0)
+                net = values["force"] / factor
+                slopes[m] |= slope_of_landing(thinned, values, net, best[k], place, moments[k], scales, rig)
         if not squeezed:
             slopes = {m: {k: v for k, v in of.items() if k != "distance"} for m, of in slopes.items()}
         weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()), slopes)
         out.append(Aligned(thinned, masks, weights))
     return out, _noise(pooled, scales)
-
-
-def _slopes(
-    signals: Signals, values: dict[str, np.ndarray], best: np.ndarray, members: dict[str, list[int]],
-    scales: dict[str, float], rig: Rig,
-) -> dict[str, Slope]:  # fmt: skip
-    """Slopes of the width's and the height's readings over the pads' give, within one grip."""
-    out = {}
-    held = {k: closed(signals, np.asarray(best[i].any(axis=0))) for k, i in members.items() if k != "force"}
-    for name, key, give, groups in (
-        ("distance", "distance", squeeze_give(signals, rig), [held["distance"]]),
-        ("rise", "place", shear_give(signals, rig), [held["pickup"], held["place"]]),
-    ):
-        found = slope(signals.t, values[key], give, groups, scales[key])
-        if found is not None:
-            out[name] = found
-    return out
 
 
 def free_forces(signals: Signals, aligned: Aligned) -> np.ndarray:

@@ -6,7 +6,8 @@ model error that all grips have alike,
 
     mean = A q + J z + unit (e_c + own) + N(0, s_c^2 variance),        own ~ N(0, k_c^2),
     slope = J z + e_c + own + f_c + other + N(0, s_c^2 variance),        other ~ N(0, k_c^2),
-    z ~ N(0, 1) and as free motion has it,    e_c ~ N(0, COMMON_c^2 + k_c^2),  f_c ~ N(0, SLOPE_SD^2 + k_c^2).
+    z ~ N(0, 1) and as free motion has it,
+    e_c ~ N(0, COMMON_c^2 + k_c^2),        f_c ~ N(0, slope_sd_c^2 + k_c^2).
 
 (What all grips have alike no repeat can show. It is at least what the prior says and at least as
 large as what differs between them. A slope shows the same shares as its grip's mean, but a grip that
@@ -25,7 +26,6 @@ from functools import cached_property
 import numpy as np
 
 from estimation import priors
-from estimation.compliance import SLOPE_SD
 from estimation.design import Design
 from estimation.observations import CHANNELS
 
@@ -86,7 +86,7 @@ class Posterior:
     def common(self, theta: np.ndarray) -> np.ndarray:
         """Prior variances (..., 6) of the shares e and f that all grips have alike."""
         own = self.shares(theta) ** 2
-        return np.concatenate([priors.COMMON**2 + own, SLOPE_SD**2 + own], axis=-1)
+        return np.concatenate([priors.COMMON**2 + own, self.design.slope_sd**2 + own], axis=-1)
 
     def log_prior(self, theta: np.ndarray) -> np.ndarray:
         """Log prior (W,) of scales (W, 6), up to a constant."""
@@ -160,36 +160,34 @@ def posterior(design: Design) -> Posterior:
 
 
 def independent(design: Design) -> tuple[Design, np.ndarray]:
-    """The design with each grip's mean and slope turned into two independent rows, and levers (K, 2).
+    """The design with each grip's mean and slopes turned into as many independent rows; levers (K, 2).
 
-    Their covariance is s^2 D + k^2 B, D diagonal, B = [[unit^2, unit], [unit, 2]]: the eigenvectors of
-    D^-1/2 B D^-1/2 make both diagonal whatever s and k. New rows have the mean's variance.
+    Their covariance is s^2 D + k^2 B, D diagonal, B = a a' + the slopes' own, a = unit of the mean, 1 of
+    slopes: the eigenvectors of D^-1/2 B D^-1/2 make both diagonal whatever s and k. New rows have the
+    variance of a grip's first row.
     """
     d = design
-    keys = list(zip(d.trial, d.move, d.channel, strict=True))
-    slopes = {key: i for i, key in enumerate(keys) if d.slope[i]}
-    means = [i for i, key in enumerate(keys) if not d.slope[i] and key in slopes]
-    levers = np.stack([d.unit, np.where(d.slope, 1.0, 0.0)], axis=1)
-    if not means:
-        return replace(d, unit=np.where(d.slope, np.sqrt(2.0), d.unit)), levers
-    first, second = np.array(means), np.array([slopes[keys[i]] for i in means])
-    sd = np.sqrt(d.variance[first] / d.variance[second])  # of the mean, in units of the slope's
-    own = np.array([[d.unit[first] ** 2, d.unit[first] * sd], [d.unit[first] * sd, 2 * sd**2]])
-    values, vectors = np.linalg.eigh(np.moveaxis(own, -1, 0))
-
-    def turned(rows: np.ndarray) -> np.ndarray:
-        out, shape = rows.copy(), (-1, *(1,) * (rows.ndim - 1))
-        a, b = rows[first], sd.reshape(shape) * rows[second]
-        for target, k in ((first, 1), (second, 0)):
-            weight = vectors[:, :, k]
-            out[target] = weight[:, 0].reshape(shape) * a + weight[:, 1].reshape(shape) * b
-        return out
-
-    variance, unit = d.variance.copy(), np.where(d.slope, np.sqrt(2.0), d.unit)
-    variance[second] = d.variance[first]
-    unit[first], unit[second] = np.sqrt(np.maximum(values.T[::-1], 0.0))
-    rows = {name: turned(getattr(d, name)) for name in ("mean", "coefficients", "shifts")}
-    return replace(d, **rows, unit=unit, variance=variance), turned(levers)
+    lever = np.where(d.slope, 1.0, d.unit)
+    levers = np.stack([lever, np.where(d.slope, 1.0, 0.0)], axis=1)
+    out = {name: getattr(d, name).copy() for name in ("mean", "coefficients", "shifts", "variance", "unit")}
+    keys = np.stack([d.trial, d.move, d.channel], axis=1)
+    _, grip, sizes = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    by_grip = np.argsort(grip.ravel(), kind="stable")
+    starts = np.cumsum(sizes) - sizes
+    for size in np.unique(sizes):
+        rows = by_grip[starts[sizes == size][:, None] + np.arange(size)]  # (grips, size)
+        sd = np.sqrt(d.variance[rows[:, :1]] / d.variance[rows])  # of the first row, in units of each
+        a = lever[rows] * sd
+        own = a[:, :, None] * a[:, None, :] + np.eye(size) * (d.slope[rows] * sd**2)[:, None, :]
+        values, vectors = np.linalg.eigh(own)
+        for name in ("mean", "coefficients", "shifts"):
+            given = getattr(d, name)[rows].reshape(*rows.shape, -1) * sd[..., None]
+            turned = np.swapaxes(vectors, 1, 2) @ given
+            out[name][rows] = turned.reshape(out[name][rows].shape)
+        levers[rows] = np.swapaxes(vectors, 1, 2) @ (levers[rows] * sd[..., None])
+        out["variance"][rows] = d.variance[rows[:, :1]]
+        out["unit"][rows] = np.sqrt(np.maximum(values, 0.0))
+    return replace(d, **out), levers
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ import emcee
 import numpy as np
 
 from estimation import priors
-from estimation.compliance import SLOPE_SD
 from estimation.mode import find_mode
 from estimation.posterior import NUM_CHANNELS, REACH, STEP, Posterior, posterior
 from estimation.proposal import proposal
@@ -52,7 +51,7 @@ def log_prob_of(post: Posterior) -> Callable:
     def of(theta):
         log_s, log_k = theta[:NUM_CHANNELS], theta[NUM_CHANNELS:]
         own = (priors.SCATTER_MEDIAN * jnp.exp(log_k)) ** 2
-        common = jnp.concatenate([priors.COMMON**2 + own, SLOPE_SD**2 + own])
+        common = jnp.concatenate([priors.COMMON**2 + own, post.design.slope_sd**2 + own])
         precision, gradient = hand + jnp.diag(jnp.concatenate([jnp.zeros(num), 1 / common])), pull
         out = -0.5 * ((log_s / post.scale_sd) ** 2).sum() - 0.5 * jnp.log(common).sum()
         out -= 0.5 * ((log_k / priors.SCATTER_LOG_SD) ** 2).sum()

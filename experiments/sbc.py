@@ -22,7 +22,6 @@ import numpy as np
 from scipy import stats
 
 from estimation import priors
-from estimation.compliance import SLOPE_SD
 from estimation.design import Design
 from estimation.nuisance import Nuisance
 from estimation.posterior import posterior
@@ -77,7 +76,7 @@ def drawn(design: Design, rng: np.random.Generator) -> tuple[Design, np.ndarray]
     log_s = rng.normal(size=3) / np.sqrt(2 * d.scale_count)
     share = priors.SCATTER_MEDIAN * np.exp(priors.SCATTER_LOG_SD * rng.normal(size=3))
     common = np.hypot(priors.COMMON, share) * rng.normal(size=3)
-    slopes = np.hypot(SLOPE_SD, share) * rng.normal(size=3)
+    slopes = np.hypot(d.slope_sd, share) * rng.normal(size=3)
     z = rng.normal(size=len(d.nuisances))
     grips, grip = np.unique(np.stack([d.trial, d.move, d.channel], 1), axis=0, return_inverse=True)
     own = (share[grips[:, 2]] * rng.normal(size=len(grips)))[grip.ravel()]

@@ -96,7 +96,6 @@ def jax_objective(post):
     from jax.scipy.linalg import solve_triangular
 
     from estimation import priors
-    from estimation.compliance import SLOPE_SD
     from estimation.posterior import NUM_CHANNELS, REACH, STEP
 
     num, counts = len(post.design.nuisances), [t.count for t in post._tables]
@@ -106,7 +105,9 @@ def jax_objective(post):
         tables, hand_precision, hand_gradient, scale_sd = data
         log_s = theta[:NUM_CHANNELS]
         own = (jnp.asarray(priors.SCATTER_MEDIAN) * jnp.exp(theta[NUM_CHANNELS:])) ** 2
-        common = jnp.concatenate([jnp.asarray(priors.COMMON) ** 2 + own, SLOPE_SD**2 + own])
+        common = jnp.concatenate(
+            [jnp.asarray(priors.COMMON) ** 2 + own, jnp.asarray(post.design.slope_sd) ** 2 + own]
+        )
         precision = jnp.zeros((size, size)).at[:num, :num].set(hand_precision)
         precision = precision + jnp.diag(jnp.concatenate([jnp.zeros(num), 1 / common]))
         gradient = jnp.zeros(size).at[:num].set(hand_gradient)
