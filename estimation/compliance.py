@@ -105,10 +105,9 @@ def middle_share(shares: np.ndarray, variances: np.ndarray, error: np.ndarray | 
     """Weighted median of slopes (K,) and its standard error, each off by `error` beside its variance."""
     order = np.argsort(shares)
     cumulative = np.cumsum((1 / (variances + error**2))[order])
+    middle = float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
     # A median of normal draws has pi / 2 times the variance of their mean.
-    return float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)]), np.sqrt(
-        np.pi / 2 / cumulative[-1]
-    )
+    return middle, float(np.sqrt(np.pi / 2 / cumulative[-1]))
 
 
 def unexpected_share(shares: np.ndarray, variances: np.ndarray, stated: bool, admitted: float) -> float:
