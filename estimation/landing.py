@@ -72,7 +72,7 @@ def first_push(
     if not free.size or free[-1] == before[-1]:
         return touch
     last, first = t[free[-1]], t[before[before > free[-1]][0]]
-    return (last + first) / 2, (first - last) / 12**0.5
+    return float(last + first) / 2, float(first - last) / 12**0.5
 
 
 def _extrapolation(t: np.ndarray, degree: int) -> np.ndarray:

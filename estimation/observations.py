@@ -110,6 +110,18 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
     }
 
 
+def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
+    """Of the subtasks that a recording shows (num_subtasks,), those of which its samples tell properties.
+
+    A grip before a carry that never came held who knows what.
+    """
+    out = present.copy()
+    for carry in steps:
+        if carry.state == ABOVE_GROUND and not present[carry.index]:
+            out[[s.index for s in steps if s.move == carry.move and s.state == ON_GROUND]] = False
+    return out
+
+
 def robust_weights(
     values: np.ndarray, mask: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -146,7 +158,7 @@ def aligned_weights(
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
         drawn = draw_boundaries(trial, rng, num_alignments)
         best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]
-        present = trial.present
+        present = held_as_described(trial.present, steps)
         masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
         prepared.append((thinned, best & present[:, None], masks))
         felt.append("friction" not in trial.trial.hidden)

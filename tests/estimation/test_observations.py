@@ -10,9 +10,11 @@ from estimation.observations import (
     channel_values,
     draw_boundaries,
     gravity_factor,
+    held_as_described,
     robust_weights,
     subtask_masks,
 )
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.segmentation.align import TrialAlignment
@@ -131,3 +133,11 @@ def test_gravity_factor_is_one_plus_acceleration_over_g():
     t = np.arange(30) * 0.05
     signals = made_signals(t, vy1=2.0 * t, vy2=2.0 * t)
     np.testing.assert_allclose(gravity_factor(signals, Rig()), 1 + 2.0 / 9.80665)
+
+
+def test_a_grip_before_a_carry_that_never_came_tells_nothing():
+    states = [FREE, *2 * (ON_GROUND, ABOVE_GROUND, ON_GROUND, FREE)]
+    steps = tuple(Subtask(i, "", "block", s, (i - 1) // 4) for i, s in enumerate(states))
+    present = np.arange(9) < 6  # the second grip is there, its carry is not
+    assert held_as_described(present, steps).tolist() == [True] * 5 + [False] * 4
+    assert held_as_described(np.ones(9, bool), steps).all()
