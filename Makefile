@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -51,19 +51,53 @@ before-after: $(INSTALLED)  ## published numbers of release 0.1.0's code and of 
 	$(BIN)/python -m experiments.write_tables
 
 bench: $(INSTALLED)  ## kernels beside hmmlearn and dynamax, stages of the commands; fills docs/benchmarks.md
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[bench]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m experiments.benchmarks.kernels
 	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
 	$(BIN)/python -m experiments.write_tables
 
 bench-solvers: $(INSTALLED)  ## optimistix and SciPy beside our own solver on the same problems; fills docs/benchmarks.md
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[bench]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m experiments.benchmarks.solvers recordings/force_bias_1
 	$(BIN)/python -m experiments.write_tables
 
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
 	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
+
+bench-long: $(INSTALLED)  ## time and memory over four decades of samples; fills docs/benchmarks.md
+	$(BIN)/python -m experiments.benchmarks.long_recordings $(or $(RECORDINGS),recordings/paper_blocks)
+	$(BIN)/python -m experiments.write_tables
+
+gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
+	$(BIN)/python -m experiments.gap_recordings $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.patch_heldout $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.write_tables
+
+blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
+	$(BIN)/python -m experiments.blind_check diagnose --cases $(SET)/cases --out $(SET)/results
+	$(BIN)/python -m experiments.blind_check score --sealed $(SET) --results $(SET)/results --json experiments/results/blind_check.json
+	$(BIN)/python -m experiments.spent_sets
+	$(BIN)/python -m paper_figs.gap_reliability
+	$(BIN)/python -m experiments.write_tables
+
+REAL := $(or $(RECORDINGS),../shared/real)
+real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECORDINGS; fills docs/results.md, draws their figures
+	$(BIN)/python -m experiments.real.hiro_snap $(REAL)/hiro_snap
+	$(BIN)/python -m experiments.real.hiro_gap $(REAL)/hiro_snap
+	$(BIN)/python -m experiments.real.kth_handover $(REAL)/kth_handover
+	$(BIN)/python -m experiments.real.way_eeg_gal $(REAL)/way_eeg_gal_p1
+	$(BIN)/python -m experiments.real.robot_gap xl330 $(REAL)/xl330_pendulum --figures docs/figures
+	$(BIN)/python -m paper_figs.hiro_gap
+	$(BIN)/python -m paper_figs.way_eeg_gal
+	$(BIN)/python -m experiments.write_tables
+
+wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and of our own; the figures of docs/wrist.md
+	$(BIN)/python -m experiments.wrist $(RECORDINGS)
+
+readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
+	$(BIN)/python -m experiments.readme_figures
+	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
@@ -92,7 +126,9 @@ paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills doc
 
 sweeps: $(INSTALLED)  ## robustness sweeps in full (half an hour on 2 cores), resumable; tables and figures
 	$(BIN)/python -m experiments.sweeps --workers 2
-	for figure in plane lines coverage; do $(BIN)/python -m paper_figs.sweep_$$figure || exit 1; done
+	$(BIN)/python -m paper_figs.sweep_plane
+	$(BIN)/python -m paper_figs.sweep_lines
+	$(BIN)/python -m paper_figs.sweep_coverage
 
 CHECKED := build/check_gap
 SEALED := experiments/blind_check/sealed_small

@@ -1,4 +1,4 @@
-"""Figures of the README: run the demo and keep two of its pictures in docs/figures."""
+"""The README's figure: run the demo and keep one of its pictures in docs/figures."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ def main() -> None:
         command = [sys.executable, "-m", "hmmseg_cli.main", "demo", "--figures", folder, "--quiet"]
         subprocess.run(command, check=True)
         DOCS.mkdir(parents=True, exist_ok=True)
-        for source, target in (("trial_01_segments", "demo_segments"), ("estimates", "demo_estimates")):
-            shutil.copyfile(Path(folder) / f"{source}.png", DOCS / f"{target}.png")
+        shutil.copyfile(Path(folder) / "trial_01_segments.png", DOCS / "demo_segments.png")
 
 
 if __name__ == "__main__":

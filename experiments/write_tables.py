@@ -14,6 +14,7 @@ from pathlib import Path
 from experiments import (
     before_after,
     patch_heldout,
+    provenance,
     spent_sets,
     table_blind_check,
     table_calibration,
@@ -151,35 +152,41 @@ def moves() -> str | None:
     return markdown(head, rows)
 
 
-TABLES: tuple[tuple[str, str, Callable[[], str | None]], ...] = (
-    ("README.md", "results", results),
-    ("docs/results.md", "results", results),
-    ("docs/results.md", "rivals", rivals),
-    ("docs/results.md", "real", real),
-    ("docs/calibration.md", "ablation", ablation),
-    ("docs/calibration.md", "calibration", calibration),
-    ("docs/calibration.md", "identified", table_calibration.identified),
-    ("docs/calibration.md", "identified_boundaries", table_calibration.boundaries),
-    ("docs/calibration.md", "worlds", table_calibration.worlds),
-    ("docs/calibration.md", "sbc", table_calibration.sbc),
-    ("docs/calibration.md", "reference", table_calibration.reference),
-    ("docs/calibration.md", "moves", moves),
-    ("docs/calibration.md", "misfits", misfits),
-    ("docs/results.md", "gap", table_gap.summary),
-    ("docs/gap_results.md", "recordings", table_gap.recordings),
-    ("docs/gap_results.md", "patch", patch_heldout.table),
-    ("docs/gap_results.md", "blind", table_blind_check.table),
-    ("docs/history.md", "blind_sets", spent_sets.table),
-    ("README.md", "kernels", table_speed.kernels_short),
-    ("docs/benchmarks.md", "kernels", table_speed.kernels),
-    ("docs/benchmarks.md", "smoothing", table_speed.smoothing),
-    ("docs/benchmarks.md", "samplers", table_speed.samplers),
-    ("docs/benchmarks.md", "commands", table_speed.commands),
-    ("docs/benchmarks.md", "lengths", table_speed.lengths),
-    ("docs/benchmarks.md", "solvers", table_speed.solvers),
-    ("docs/watch.md", "watch", table_speed.watch),
-    ("docs/before_after.md", "before_after", before_after.table),
+# Page, name of the table on it, what writes it, and the make target that makes its numbers anew.
+TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
+    ("README.md", "results", results, "results"),
+    ("docs/results.md", "results", results, "results"),
+    ("docs/results.md", "rivals", rivals, "results"),
+    ("docs/results.md", "real", real, "real"),
+    ("docs/calibration.md", "ablation", ablation, "results"),
+    ("docs/calibration.md", "calibration", calibration, "results"),
+    ("docs/calibration.md", "identified", table_calibration.identified, "identified"),
+    ("docs/calibration.md", "identified_boundaries", table_calibration.boundaries, "identified"),
+    ("docs/calibration.md", "worlds", table_calibration.worlds, "calibrate"),
+    ("docs/calibration.md", "sbc", table_calibration.sbc, "calibrate"),
+    ("docs/calibration.md", "reference", table_calibration.reference, "calibrate"),
+    ("docs/calibration.md", "moves", moves, "results"),
+    ("docs/calibration.md", "misfits", misfits, "results"),
+    ("docs/results.md", "gap", table_gap.summary, "gap-results"),
+    ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
+    ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
+    ("docs/gap_results.md", "blind", table_blind_check.table, "blind-check"),
+    ("docs/history.md", "blind_sets", spent_sets.table, "blind-check"),
+    ("README.md", "kernels", table_speed.kernels_short, "bench"),
+    ("docs/benchmarks.md", "kernels", table_speed.kernels, "bench"),
+    ("docs/benchmarks.md", "smoothing", table_speed.smoothing, "bench"),
+    ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),
+    ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
+    ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
+    ("docs/benchmarks.md", "solvers", table_speed.solvers, "bench-solvers"),
+    ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
+    ("docs/before_after.md", "before_after", before_after.table, "before-after"),
 )
+
+
+def targets() -> str:
+    """docs/architecture.md: what each make target makes."""
+    return provenance.table((page, name, target) for page, name, _, target in TABLES)
 
 
 def fill(text: str, name: str, table: str) -> str:
@@ -191,7 +198,8 @@ def fill(text: str, name: str, table: str) -> str:
 
 
 def main() -> None:
-    for file, name, make in TABLES:
+    pages = [(page, name, make) for page, name, make, _ in TABLES]
+    for file, name, make in [*pages, ("docs/architecture.md", "targets", targets)]:
         table, path = make(), ROOT / file
         if table is not None:
             path.write_text(fill(path.read_text(encoding="utf-8"), name, table), encoding="utf-8")
