@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -107,6 +107,11 @@ results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills th
 	$(BIN)/python -m experiments.benchmarks.moves
 	$(BIN)/python -m experiments.benchmarks.identify
 	$(BIN)/python -m experiments.write_tables
+
+ROBOTS := build/robots
+robots-models: $(INSTALLED)  ## models of robots by others out of packages, in build/robots, for experiments.robots_check
+	$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps --only-binary :all: -d $(ROBOTS) dm-control robosuite
+	cd $(ROBOTS) && for wheel in *.whl; do ../../$(BIN)/python -m zipfile -e $$wheel .; done
 
 calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds that differ, NUTS beside the sampler; resumable
 	$(BIN)/python -m experiments.sbc

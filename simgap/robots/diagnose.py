@@ -7,7 +7,7 @@ gap that healthy twins show too, verdict, how far, next experiment; `describe` m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
 from simgap.robots.judge import Verdict, judge
-from simgap.robots.linear import Linear, linearise
+from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
@@ -96,6 +96,8 @@ def diagnose(
     along = fitted_along(composed)
     wanted = [n for n in effects if n not in along]
     plain = _plain(composed, {n: effects[n].neutral() for n in along}, wanted)
+    composed = wobbling(composed, plain)
+    plain = replace(plain, wobble=composed.wobble)
     for name in plain.diverged:
         said(f"{name}: the simulator diverges with it, and it is left out")
     if plain.dropped:
@@ -202,8 +204,6 @@ def _alike(composed: Composed, linear: Linear, names: Sequence[str]) -> Identifi
 
 def _twin_statistic(s, white: np.ndarray, rows: np.ndarray) -> float:
     """The statistic of a healthy twin: its residual with the recording's sensitivities."""
-    from dataclasses import replace
-
     gap = replace(s.gap, residual=white[rows] if white.size != s.gap.residual.size else white)
     f = forms(gap)
     single = [fitted(f, (j,)) for j in range(len(gap.candidates))]

@@ -22,11 +22,9 @@ START_STEP = 0.3  # numerics: of a start's
 
 @dataclass(frozen=True)
 class Moved:
-    """How an effect moves rows: `shift` (N,) from neutral to `at` (k,), and its derivatives there (N, k);
-    `usual` (k,): usual sizes of its parameters."""
+    """How an effect moves rows: `shift` (N,) from neutral to `at` (k,), and its derivatives there (N, k)."""
 
     at: np.ndarray
-    usual: np.ndarray
     shift: np.ndarray
     jacobian: np.ndarray
 
@@ -44,6 +42,7 @@ class Linear:
     diverged: tuple[str, ...]
     dropped: int  # windows whose rollout was not finite
     rates: np.ndarray  # (N,) the simulated channel's rate
+    wobble: np.ndarray | None  # (N, K) as in `Composed`
 
     def with_moved(self, more: Mapping[str, Moved], diverged: Sequence[str] = ()) -> Linear:
         """With some effects' columns added or replaced."""
@@ -88,6 +87,7 @@ def linearise(composed: Composed, point: Point, effects: Sequence[str], progress
         (),
         sum(c is None for c in base.read),
         _rates(composed, base),
+        composed.wobble,
     )
     moved, diverged = {}, []
     for name in effects:
@@ -140,7 +140,17 @@ def vary(
     point = np.array([here[n] for n in effect.parameters])
     if name in base.point:  # a straight line back to neutral
         shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
-    return Moved(point, np.array([p.sd for p in effect.parameters.values()]), shift, jacobian)
+    return Moved(point, shift, jacobian)
+
+
+def wobbling(composed: Composed, linear: Linear) -> Composed:
+    """With the wobble of contacts by all effects that were linearised (see `Composed`)."""
+    touching = linear.rows.touching
+    if not (linear.starts and touching.any() and linear.moved):
+        return composed
+    size = {n: np.array([p.sd for p in composed.effects[n].parameters.values()]) for n in linear.moved}
+    columns = np.concatenate([m.jacobian * size[n] for n, m in linear.moved.items()], 1)
+    return replace(composed, wobble=np.where(touching[:, None] & np.isfinite(columns), columns, 0.0))
 
 
 def _each_log_at_once(

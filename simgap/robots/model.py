@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.rows import Rows, rows_of
 from simgap.robots.windows import LENGTH, Window, alike, cut, start_of
@@ -16,7 +18,11 @@ Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; what 
 
 @dataclass(frozen=True)
 class Composed:
-    """A simulator with effects around it, along the windows of recordings."""
+    """A simulator with effects around it, along the windows of recordings.
+
+    `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
+    touch; None where nothing touches.
+    """
 
     simulator: Simulator
     recordings: tuple[Recording, ...]
@@ -24,6 +30,7 @@ class Composed:
     effects: Mapping[str, RobotEffect]
     noise: Mapping[str, float]
     rows: Rows
+    wobble: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -47,7 +54,10 @@ class Composed:
     def along(self, logs: Sequence[int]) -> Composed:
         """The same along some of the logs alone, which keep their numbers."""
         windows = tuple(w for w in self.windows if w.log in logs)
-        return replace(self, windows=windows, rows=rows_of(self.recordings, windows, self.noise))
+        wobble = None if self.wobble is None else self.wobble[np.isin(self.rows.log, logs)]
+        return replace(
+            self, windows=windows, rows=rows_of(self.recordings, windows, self.noise), wobble=wobble
+        )
 
     def commanded(self, point: Point) -> list[Recording]:
         """The recordings with commands as the drives took them."""

@@ -9,7 +9,9 @@ N the sensors' noise, L_c two integrals over time for a position, one for a velo
 where the simulator cannot be restarted: what is not modelled moves a joint even where the model has it
 stuck. A body on a support is another matter, for the support takes what pushes it: in windows with contacts
 L_c is the model's own response to a change of the start's rate, come later. Times of samples are uncertain
-by s of the source `clock`, which adds s^2 times the squared rate.
+by s of the source `clock`, which adds s^2 times the squared rate. And no impact is like another: which corner
+strikes first, where a surface is rough. In the source `contacts` every effect may be off by s of its usual
+sizes, anew in each window with contacts, so that few impacts that a model misses decide nothing.
 The s_c are found by maximum likelihood (type II) and are zero where that gains nothing; the multiplier m of
 each window (log-normal: the model is off in some places more than in others) by its posterior mode. The
 Cholesky factor turns rows into innovations: what each says beyond those before it in its window.
@@ -110,13 +112,7 @@ def covariances(
     linear: Linear, windows: Sequence[Window], kinds: Mapping[str, str], factor: np.ndarray | None = None
 ) -> Covariances:
     """Covariances of all windows that did not diverge. `kinds` by channel; `factor` (N,) multiplies the
-    noise's sd.
-
-    Where bodies touch, the model's response to an effect differs from the robot's from one contact to the
-    next (which corner strikes first, where a surface is rough): every candidate's parameters may be off by
-    their usual size there, anew in each window, so that no impact is a precise measurement.
-    """
-    wobble = [m.jacobian * m.usual for m in linear.moved.values()] if linear.rows.touching.any() else []
+    noise's sd."""
     blocks, numbers, noises, sources = [], [], [], []
     free = bool(linear.starts)
     for number, mine in enumerate(linear.rows.of):
@@ -128,9 +124,6 @@ def covariances(
             for state, doubt in windows[number].doubt.items():
                 column = linear.starts[state][block] * doubt
                 noise += np.outer(column, column)
-            if free and linear.rows.touching[block[0]]:
-                for columns in wobble:
-                    noise += columns[block] @ columns[block].T
             blocks.append(block)
             numbers.append(number)
             noises.append(noise)
@@ -149,6 +142,7 @@ def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
 
 
 CLOCK = "clock"  # a source whose s [s] is the sd of samples' times
+CONTACTS = "contacts"  # a source whose s is how many usual sizes every effect is off by in each contact
 TOUCHING = ", touching"  # a model is off by other amounts where bodies touch: a source of its own
 INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # chosen
 
@@ -171,6 +165,8 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
                 response = _integral(t) @ response
         key = f"{name}{TOUCHING}" if touching else name
         out[key] = Source(moved, response @ np.exp(-np.abs(t[:, None] - t) / TAU) @ response.T)
+    if linear.wobble is not None and touching:
+        out[CONTACTS] = Source(np.arange(since.size), linear.wobble[block] @ linear.wobble[block].T)
     out[CLOCK] = Source(np.arange(since.size), np.diag(linear.rates[block] ** 2))
     return out
 

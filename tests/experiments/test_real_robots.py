@@ -1,8 +1,11 @@
 """Other robots' logs: verdicts that the docs show, on a small sample of them."""
 
+import numpy as np
+import pandas as pd
 import pytest
 
-from experiments.real import robot_gap
+from experiments.real import collins_alike, robot_gap
+from simgap.robot_effects.readout_pose import rotated
 
 FOUR = [
     "xl330_kp100_sin_sin",
@@ -25,3 +28,29 @@ def test_what_a_servo_lacks_is_named(shared):
     rms = found["shrinkage"]["rms"]["position"]
     assert rms["after"] < 0.5 * rms["before"]
     assert found["remainder"]["share"] < 0.3
+
+
+@pytest.mark.slow
+def test_real_trials_show_no_gap_against_real_trials(shared):
+    """Random halves of an arm's trials, each begun by hand: no false alarm."""
+    found = collins_alike.run(shared / "real/collins")
+    assert found["false_alarms"] == 0 and len(found["p_values"]) == found["splits"] == 20
+
+
+def test_shifts_and_offsets_of_trials_are_found():
+    """The same course, started at other times and seen through markers set elsewhere, becomes one course."""
+    t, rng = np.arange(0.2, 24.0, 0.05), np.random.default_rng(1)
+    frames, begun = [], rng.uniform(-0.3, 0.3, 4)
+    for shift in begun:
+        angle = 0.5 * np.sin(0.7 * (t - shift))
+        turn = np.array([np.cos(angle / 2), 0 * t, 0 * t, np.sin(angle / 2)])
+        place = np.array([np.cos(angle), np.sin(angle), 0.1 * np.cos(angle)])
+        place = place + rotated(turn, rng.normal(0, 0.004, 3))
+        frames.append(
+            pd.DataFrame(
+                {"t": t, **dict(zip(collins_alike.PLACE + collins_alike.TURN, [*place, *turn], strict=True))}
+            )
+        )
+    places, _, shifts = collins_alike.aligned(frames)
+    assert np.std(np.array(places), 0).max() < 2e-4
+    np.testing.assert_allclose(shifts - shifts.mean(), begun - begun.mean(), atol=2e-3)

@@ -134,19 +134,20 @@ def test_flight_and_contact_are_told_apart(dropped):
 
 
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
-    """Windows in contact admit that each impact differs: their weight on the scale is small."""
+    """Windows that admit that each impact differs by a usual size: their weight on the scale is small."""
     from simgap.robot_effects.readout_scale import candidates
-    from simgap.robots.linear import linearise
+    from simgap.robots.linear import linearise, wobbling
     from simgap.robots.model import Composed
-    from simgap.robots.whiten import covariances
+    from simgap.robots.whiten import CONTACTS, Discrepancy, covariances
 
     simulator, log = dropped
     (scale,) = candidates(Setting(simulator, [log]))
     noise = dict.fromkeys(POSE, 1e-4)
     composed = Composed.of(simulator, [log], {scale.name: scale}, noise, 0.2)
+    composed = wobbling(composed, linearise(composed, {}, [scale.name]))
     linear = linearise(composed, {}, [scale.name])
     kinds = {n: c.kind for n, c in simulator.channels.items()}
-    whiten = covariances(linear, composed.windows, kinds).whitener()
+    whiten = covariances(linear, composed.windows, kinds).whitener(Discrepancy({CONTACTS: 1.0}, {}))
     slope = whiten(linear.moved[scale.name].jacobian)[:, 0]
     residual = whiten(linear.residual)
     free = ~composed.rows.touching
