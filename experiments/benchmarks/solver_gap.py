@@ -110,8 +110,8 @@ def _padded(values: np.ndarray) -> np.ndarray:
 def gap_optimistix(folder: Path) -> Solve:
     """Levenberg-Marquardt by optimistix, one program for all candidates.
 
-    Derivatives are differences, as ours are: exact ones had not compiled after five minutes. It knows no
-    bounds: unknowns are clipped to theirs before they are used.
+    Derivatives are differences, as ours are. It knows no bounds: unknowns are clipped to theirs before they
+    are used.
     """
     given, starts = gap_problem(folder)
 
