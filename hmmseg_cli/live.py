@@ -31,9 +31,6 @@ class Live:
     def __init__(self, watcher: Watcher, lines: bool) -> None:
         self.lines = lines
         self._watcher, self._shown = watcher, 0.0
-        channels = watcher.channels
-        self._grip = channels.index("fx1"), channels.index("fx2")
-        self._lift = channels.index("fy1"), channels.index("fy2")
         self._kept: deque[tuple[float, float, float]] = deque(maxlen=WIDTH)
         self._notes: deque[str] = deque(maxlen=3)
         self._console = Console(stderr=True)
@@ -41,13 +38,12 @@ class Live:
         self._live.start()
         self._last: Answer | None = None
 
-    def update(self, answer: Answer, row: Sequence[float]) -> None:
-        """Take one answer and its row; redraw if it is time to."""
+    def update(self, answer: Answer) -> None:
+        """Take one answer; redraw if it is time to."""
         if answer.note is not None:
             self._notes.append(f"{answer.t:.2f} s  {answer.note}")
         if not self._kept or answer.t >= self._kept[-1][0] + SECONDS / WIDTH:
-            grip = (row[self._grip[0]] - row[self._grip[1]]) / 2
-            self._kept.append((answer.t, grip, row[self._lift[0]] + row[self._lift[1]]))
+            self._kept.append((answer.t, *self._watcher.forces))
         self._last = answer
         now = time.monotonic()
         if now - self._shown >= REFRESH:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import math
 import sys
@@ -96,7 +97,7 @@ def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out
             write(answer.line() + "\n")
             flush()
         if show is not None:
-            show.update(answer, row[1])
+            show.update(answer)
 
 
 class Rows:
@@ -190,9 +191,22 @@ def _warm_up(task: Any, rig: Any, lag: float) -> None:
     from hmmseg.online.watcher import Watcher
 
     scratch = Watcher(task, rig, lag)
-    for i in range(60):
-        values = np.zeros(len(scratch.channels)) + 1e-4 * (i % 3)
-        if not scratch.filter.rig.jointed:
-            values[scratch.channels.index("x2")] = 0.05
-        scratch.update(0.02 * i, values).line()
-    scratch.finish().line()
+    names, hand = scratch.channels, scratch.filter.rig
+    gripper = hand.gripper
+    for i in range(200):
+        values = np.zeros(len(names)) + 1e-4 * (i % 3)
+        if gripper is not None:  # moves, closes and stands
+            for name in gripper.position.values():
+                values[names.index(name)] = 0.01 * math.sin(0.1 * i)
+            for name in gripper.wrench[:3]:
+                values[names.index(name)] = -(0.1**2) * math.sin(0.1 * i) * 25
+            for name in gripper.opening:
+                values[names.index(name)] = max(0.03, min(0.06, 0.06 - 0.004 * (i - 100)))
+            if gripper.quaternion is not None:
+                values[names.index(gripper.quaternion[3])] = 1.0
+        elif not hand.jointed:
+            values[names.index("x2")] = 0.05
+        with contextlib.suppress(InputError):  # made-up rows need not tell how a sensor is mounted
+            scratch.update(0.02 * i, values).line()
+    with contextlib.suppress(InputError):
+        scratch.finish().line()

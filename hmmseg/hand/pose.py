@@ -35,8 +35,11 @@ class Pose:
     window: float
 
 
-def pose_of(trial: Trial, gripper: Gripper) -> Pose:
-    """Pose in every sample, gaps bridged; InputError where it cannot be had."""
+def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose:
+    """Pose in every sample, gaps bridged; InputError where it cannot be had.
+
+    `window` [s]: over which to smooth; as wide as the noise wants where it is not given.
+    """
     t, n = trial.t, trial.t.size
     position = np.zeros((n, 3))
     for axis, name in gripper.position.items():
@@ -50,7 +53,7 @@ def pose_of(trial: Trial, gripper: Gripper) -> Pose:
         where = f"{trial.file}: [gripper] closing"
         problem = f"the pads close along {gripper.closing}, which is mostly up and down"
         raise InputError(where, problem, "the tool's axis along which they close")
-    window = _window(t, position)
+    window = _window(t, position) if window is None else window
     velocity, acceleration = (smooth(t, position, deriv, window) for deriv in (1, 2))
     return Pose(t, position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)
 

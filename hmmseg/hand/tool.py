@@ -16,7 +16,7 @@ throughout.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,7 +40,9 @@ class Tool:
     `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
     [N s/m]; `jerked` [kg s]: of how the acceleration changes, which is by how much later than the wrench the
     pose was taken, times the inertia; `noise` [N]: scale of one component of F in free motion about the
-    model; `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns tell it.
+    model; `since` [s]: when the drift has added nothing to the offset, `drift_sd`
+    [N/s]: its standard error; `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns
+    tell it.
     """
 
     axes: np.ndarray
@@ -52,7 +54,23 @@ class Tool:
     offset: np.ndarray
     drift: np.ndarray
     noise: float
+    since: float
+    drift_sd: float
     centre_of_mass: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FreeMotion:
+    """Samples of free motion at `t` (n,) [s]: smoothed readings `force` (n, 3) [N] and what they go with.
+
+    `terms` (4, n, 3): acceleration, minus gravity, velocity and jerk in the axes that the wrench is given in
+    or turns with; `window` [s]: samples nearer to each other than this are no two.
+    """
+
+    t: np.ndarray
+    force: np.ndarray
+    terms: np.ndarray
+    window: float
 
 
 def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
@@ -75,44 +93,70 @@ def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
     return np.stack([_in_tool(pose, gripper, v) for v in every])
 
 
-def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
-    """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
+def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMotion:
+    """What samples `free` (num_timesteps,) of a trial say of its tool."""
     gripper = rig.gripper
     assert gripper is not None
-    where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
-    if free.sum() < SAMPLES:
+    force = np.stack([bridged(trial.t, c) for c in wrench_of(trial, gripper).T], axis=1)
+    force = smooth(trial.t, force, window=pose.window)[free]
+    return FreeMotion(trial.t[free], force, _terms(pose, gripper, rig.gravity)[:, free], pose.window)
+
+
+def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
+    """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
+    motion = free_motion(trial, rig, pose, free)
+    tool = tool_of(trial.file, rig, motion, float(trial.t.mean()))
+    assert rig.gripper is not None
+    return replace(tool, centre_of_mass=_centre_of_mass(trial, rig.gripper, tool, free, motion.terms))
+
+
+def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool = True) -> Tool:
+    """The tool, its centre of mass left open; InputError where free motion says nothing, or another rig.
+
+    `between`: what is to be read lies between samples of free motion. Else the offset's drift is carried on
+    only where it shows clearly.
+    """
+    gripper = rig.gripper
+    assert gripper is not None
+    where = f"{file}: columns {', '.join(gripper.wrench[:3])}"
+    if motion.t.size < SAMPLES:
         raise InputError(where, "show no free motion to find the tool's own share from",
                          "samples before the first grip and after the last")  # fmt: skip
-    force = np.stack([bridged(trial.t, c) for c in wrench_of(trial, gripper).T], axis=1)
-    force, terms = (
-        smooth(trial.t, force, window=pose.window)[free],
-        _terms(pose, gripper, rig.gravity)[:, free],
-    )
-    time = trial.t[free] - trial.t.mean()
+    force, terms = motion.force, motion.terms
+    time = motion.t - since
     turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
     # Smoothed samples within one window go together.
-    together = max(1.0, pose.window / float(np.median(np.diff(trial.t))))
+    together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
+    axes, fitted, scale = _fit(rig, force, terms, time, turns)
+    error = scale * np.sqrt(together) * fitted.errors
+    if not between and np.all(np.abs(fitted.drift) < CLEAR * error[2:]):
+        axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
+    _check(where, gripper, fitted.inertia, float(error[0]), rig.gravity, fitted.offset, scale)
+    mass = fitted.mass if fitted.mass is not None else fitted.inertia
+    offset, drift = axes @ fitted.offset, axes @ fitted.drift
+    return Tool(
+        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, offset, drift, scale,
+        since, float(error[2:].max()),
+    )  # fmt: skip
+
+
+def _fit(rig: Rig, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool
+         ) -> tuple[np.ndarray, _Fitted, float]:  # fmt: skip
+    """Axes, the regression along them and the scale of what it leaves, robustly, in turns."""
+    gripper = rig.gripper
+    assert gripper is not None
     weights = np.ones(len(force))
     for _ in range(ROUNDS):
         axes = _axes(gripper, weights, force, terms[0] + terms[1])
         fitted = _regressed(weights, force @ axes, terms, time, turns, gripper.tool_mass)
-        residual = fitted.residual
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-        weights = (TAIL + 3) / (TAIL + ((residual / scale) ** 2).sum(axis=1))
-    error = scale * np.sqrt(together) * fitted.errors
-    _check(where, gripper, fitted.inertia, float(error[0]), rig.gravity, fitted.offset, scale)
-    mass = fitted.mass if fitted.mass is not None else fitted.inertia
-    centre = _centre_of_mass(trial, gripper, axes, mass, free, terms[0] + terms[1])
-    offset, drift = axes @ fitted.offset, axes @ fitted.drift
-    return Tool(
-        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, offset, drift, scale,
-        centre,
-    )  # fmt: skip
+        scale = max(1.4826 * float(np.median(np.abs(fitted.residual))), 1e-6)
+        weights = (TAIL + 3) / (TAIL + ((fitted.residual / scale) ** 2).sum(axis=1))
+    return axes, fitted, scale
 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """`mass` None where it goes into the offset; `errors` of inertia, drag for unit noise."""
+    """`mass` None where it goes into the offset; `errors` of inertia, drag and drift (3) for unit noise."""
 
     inertia: float
     mass: float | None
@@ -139,7 +183,7 @@ def _regressed(weights: np.ndarray, force: np.ndarray, terms: np.ndarray, time: 
     flat = (rows * root[:, :, None]).reshape(3 * n, -1)
     found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
     information = flat.T @ flat
-    errors = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-9)))[:2]
+    errors = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-9)))[[0, 1, -3, -2, -1]]
     mass = given if given is not None else float(found[3]) if turns else None
     residual = left - rows @ found
     inertia, drag, jerked = (float(each) for each in found[:3])
@@ -184,9 +228,10 @@ def _check(where: str, gripper: Gripper, inertia: float, error: float, gravity: 
                          "under [gripper], as they are mounted")  # fmt: skip
 
 
-def _centre_of_mass(trial: Trial, gripper: Gripper, axes: np.ndarray, mass: float, free: np.ndarray,
-                    felt: np.ndarray) -> np.ndarray | None:  # fmt: skip
+def _centre_of_mass(trial: Trial, gripper: Gripper, tool: Tool, free: np.ndarray,
+                    terms: np.ndarray) -> np.ndarray | None:  # fmt: skip
     """Where the tool's mass sits, from how torques go with its specific force as the hand turns."""
+    axes, felt = tool.axes, terms[0] + terms[1]
     if gripper.centre_of_mass is not None:
         return np.asarray(gripper.centre_of_mass)
     if len(gripper.wrench) < 6 or gripper.frame == "world":
@@ -195,7 +240,7 @@ def _centre_of_mass(trial: Trial, gripper: Gripper, axes: np.ndarray, mass: floa
         return None
     torque = np.stack([bridged(trial.t, trial.channels[name]) for name in gripper.wrench[3:]], axis=1)
     torque = smooth(trial.t, torque)[free] @ axes * np.linalg.det(axes)  # an axial vector in the tool's axes
-    arm = mass * felt
+    arm = tool.mass * felt
     # torque = c x arm + offset: linear in c
     cross = np.zeros((len(arm), 3, 3))
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = arm[:, 2], -arm[:, 1], arm[:, 0]
@@ -209,7 +254,7 @@ def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     """What the tool does to its environment (num_timesteps, 3), in the world's axes [N]."""
     gripper = rig.gripper
     assert gripper is not None
-    reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - trial.t.mean())[:, None]
+    reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - tool.since)[:, None]
     moved, hung, dragged, jerk = _terms(pose, gripper, rig.gravity)
     own = tool.inertia * moved + tool.drag * dragged + tool.jerked * jerk
     if tool.weighed:

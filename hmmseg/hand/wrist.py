@@ -79,10 +79,10 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     tool = free_tool(trial, rig, pose, free)
     force = applied_force(trial, rig, pose, tool)
     active = np.linalg.norm(np.nan_to_num(force), axis=1) > ACTIVE * tool.noise
-    pressing = _grip_force(trial, gripper)
+    pressing = grip_force_of(trial, gripper)
     grips = []
     for closing in held:
-        give = _give(rig, pressing, opening, closing)
+        give = give_of(rig, pressing, opening, closing)
         grip = grip_of(trial.t, opening, active, closing, give)
         if grip is not None:
             grips.append(grip)
@@ -93,7 +93,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
         raise lifts_pull(trial, rig, min(lifts))
     if grips and not lifts and _carries(-opening, trial, pose, force, tool):
         raise counts_closing(trial, rig)
-    return _as_fingers(trial, rig, pose, tool, opening, force, loaded or grips, pressing)
+    return as_fingers(trial, rig, pose, tool, opening, force, loaded or grips, pressing)
 
 
 def _carries(opening: np.ndarray, trial: Trial, pose: Pose, force: np.ndarray, tool: Tool) -> bool:
@@ -113,7 +113,7 @@ def _surely_free(opening: np.ndarray, held: list[tuple[int, int, int]]) -> np.nd
     return free
 
 
-def _grip_force(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
+def grip_force_of(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
     """What each pad presses with [N]: samples, or a number while it grips; None where nothing tells."""
     if isinstance(gripper.grip_force, str):
         return np.abs(trial.channels[gripper.grip_force])
@@ -124,8 +124,8 @@ def _grip_force(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
     return None
 
 
-def _give(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, closing: tuple[int, int, int]
-          ) -> float | None:  # fmt: skip
+def give_of(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, closing: tuple[int, int, int]
+            ) -> float | None:  # fmt: skip
     """What both pads give while held [m]; None where the force is not known."""
     if pressing is None:
         return None
@@ -164,8 +164,9 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
     return found if lifted else abs(found)
 
 
-def _as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,
-                grips: list[Grip], pressing: np.ndarray | float | None) -> Trial:  # fmt: skip
+def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,
+               grips: list[Grip], pressing: np.ndarray | float | None) -> Trial:  # fmt: skip
+    """The trial as two fingers', from what the tool does (`force`, (num_timesteps, 3), world) and holds."""
     t = trial.t
     x, y = pose.position @ pose.across, pose.position @ pose.up
     velocity = smooth(t, pose.position, deriv=1)

@@ -43,6 +43,19 @@ def log_between(value, low, high, scale, span):
 
 
 @compiled
+def log_rising(value, scale, span):
+    """Log density of value = w + noise (sd `scale`), w of a density that rises from 0 to `span`.
+
+    The integral of 2 w / span^2 times the normal density over w > 0 is
+    2 (v Phi(v / s) + s phi(v / s)) / span^2.
+    """
+    z = value / scale
+    tail = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+    share = z * 0.5 * math.erfc(-z / _ROOT2) + tail if z > -5.0 else tail / (z * z)
+    return math.log(2 * scale / span) - math.log(span) + max(math.log(max(share, 1e-300)), _LEAST)
+
+
+@compiled
 def log_broad(value, span):
     """Log density of a value that may be anywhere in `span`; 0 where missing."""
     return 0.0 if math.isnan(value) else -math.log(span)

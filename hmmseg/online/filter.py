@@ -24,17 +24,19 @@ from hmmseg.online import layout as at
 from hmmseg.online.answer import Answer, Crossing
 from hmmseg.online.layout import Layout
 from hmmseg.online.properties import Properties
-from hmmseg.online.readings import ROWS, hand_row, read, widen
+from hmmseg.online.readings import HISTORY, ROWS, hand_row, read, widen
 from hmmseg.online.refine import REACH, refined
+from hmmseg.online.scores import CREEP
 from hmmseg.online.step import LOG_DEPARTURE, advance
 from hmmseg.online.summary import boundary, summarise
 from hmmseg.segmentation.features import MAX_RATE, noise_sd
 
 WARM_UP = 8  # chosen: rows that tell a force noise which the rig does not state
+NUM_CHANNELS = len(CARTESIAN_CHANNELS)
 KINDS = {FREE: at.FREE_KIND, ON_GROUND: at.GROUND_KIND, SLIDING: at.SLIDING_KIND, ABOVE_GROUND: at.ABOVE_KIND}
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
-# hand at rest creeps by a few mm/s, and pads' foam gives by tenths of a mm.
-VELOCITY, LEVEL, WIDTH = 0.005, 2e-4, 2e-4
+# hand at rest creeps, and pads' foam gives by tenths of a mm.
+VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
 PRIOR = 4.0  # chosen
 # chosen: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; and of no more weight than a
 # few nats.
@@ -76,16 +78,18 @@ class Filter:
         self._written, self._written_t = "{}", -math.inf
         self.crossings: list[Crossing] = []
         self.first_t = math.nan  # of the first row [s]
+        self.touches: list[tuple[float, float]] = []  # known apart from forces [s]
         self._waiting: list[tuple[float, np.ndarray]] = []
         self._velocities = True
         width, rows = self.layout.width, 24 * len(self.kinds)
         self._fresh = np.zeros((len(self.kinds) + 2, width))
         self._x, self._row = np.full(at.NUM_READ, np.nan), np.zeros(12)
+        self._x[at.SD_FX :] = 0.0, 0.0, 1.0
         self._now, self._smoothed = np.zeros(self.num_steps + 1), np.zeros(self.num_steps + 1)
         self._means = np.zeros((2 * self.layout.num_objects + self.layout.num_moves, 3))
         self._best, self._least = np.zeros(5), np.array(LEAST_SPANS)
         self._state = _State(
-            np.zeros((rows, width)), 0, np.full((ROWS, 11), np.nan), -1, 0, math.nan, np.zeros(12), 0.0,
+            np.zeros((rows, width)), 0, np.full((ROWS, HISTORY), np.nan), -1, 0, math.nan, np.zeros(12), 0.0,
             np.array([[np.inf, -np.inf]] * 4), np.array([*LEAST_SPANS, 1.0]), 0, False,
         )  # fmt: skip
 
@@ -123,7 +127,7 @@ class Filter:
         position = noise.angle if rig.jointed else noise.position
         self._noise = np.array([(position or 0.0) ** 2, (noise.velocity or 0.0) ** 2])
         self._pads = np.array(pads_of(rig), dtype=float)
-        self._force_noise = noise.force
+        self.force_noise = noise.force
 
     def _begin(self, noise: float) -> None:
         """The one hypothesis to start from, and those of a recording that starts off its task."""
@@ -144,7 +148,10 @@ class Filter:
         s.spans[at.SPAN_FORCE] = LEAST_FORCE * noise
 
     def take(self, t: float, row: np.ndarray) -> None:
-        """One row (12,) in SI units, NaN where missing, at a time after all before."""
+        """One row (12,) in SI units, NaN where missing, at a time after all before.
+
+        Of a wrist's sensor (16,): what `hmmseg.online.wrist.Wrist` adds.
+        """
         self.rows.append((t, row))
         while self.rows[0][0] < t - self.lag - REACH:
             self.rows.popleft()
@@ -166,6 +173,8 @@ class Filter:
         x = self._x
         read(s.history, s.head, s.filled, t, dt, self._row, self._noise, not derived, x)
         widen(s.extremes, s.spans, self._least, x)
+        if row.size > NUM_CHANNELS:
+            x[at.SD_FX :] = row[NUM_CHANNELS + 1 :]
         s.since += dt
         since = s.since if s.since >= 0.999 / MAX_RATE else 0.0
         if since:
@@ -180,15 +189,21 @@ class Filter:
         )  # fmt: skip
         self._settle(t - self.lag)
 
+    def idle(self, t: float) -> None:
+        """Time goes on, though no row can be read yet."""
+        self.first_t = t if math.isnan(self.first_t) else self.first_t
+        if not self._state.started:
+            self._state.last_t = t
+
     def _wait(self, t: float, row: np.ndarray) -> None:
         """Until the force noise is known: from the rig, or from the first rows' second differences."""
         s = self._state
         if not s.num_rows:
-            self.first_t = t
+            self.first_t = t if math.isnan(self.first_t) else self.first_t
             self._velocities = self.rig.jointed or not np.isnan(row[[2, 3, 8, 9]]).all()
         self._waiting.append((t, row))
         s.last_t, s.num_rows = t, s.num_rows + 1
-        noise = self._force_noise
+        noise = self.force_noise
         if noise is None and len(self._waiting) >= WARM_UP:
             forces = np.array([each[[4, 5, 10, 11]] for _, each in self._waiting])
             found = [noise_sd(column) for column in forces.T]
@@ -205,7 +220,7 @@ class Filter:
         """Boundaries that are now older than the lag, each once."""
         s = self._state
         while self._now[-1] < 0.5:  # off the task nothing is a boundary of it
-            mean, variance, come, early = boundary(s.table, s.count, s.settled, before)
+            mean, variance, come, early = boundary(s.table, s.count, self.num_steps, s.settled, before)
             if early < 0.5 or come <= 0:
                 return
             self._settled(s.settled, mean, variance)
@@ -253,7 +268,7 @@ class Filter:
         """The last answer: every boundary that has come is settled, whatever its age."""
         s = self._state
         if not s.started and self._waiting:
-            self._force_noise = self._force_noise or 0.01
+            self.force_noise = self.force_noise or 0.01
             t, row = self._waiting.pop()
             s.num_rows -= 1
             self._wait(t, row)

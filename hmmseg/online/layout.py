@@ -26,9 +26,12 @@ OBJECTS = RING + 2 * NUM_RING  # weight [N] and width [m] of every block, four n
 FREE_KIND, GROUND_KIND, SLIDING_KIND, ABOVE_KIND = range(4)
 
 # A reading: time, forces, velocities, vertical acceleration, height, distance, noise of positions and
-# velocities; height and distance of the reading before.
-(T, FX1, FY1, FX2, FY2, VX, VY, AY, Y, D, SD_Y, SD_D, SD_VX, SD_VY, LAST_Y, LAST_D) = range(16)
-NUM_READ = 16  # chosen
+# velocities; height and distance of the reading before, net vertical force of the one 1 / MAX_RATE s before;
+# what may be wrong with net forces, across and up (of a wrist's sensor: the tool's own share), and whether
+# something else than forces tells that nothing is held (0), or that something is (2; 1: nothing does).
+(T, FX1, FY1, FX2, FY2, VX, VY, AY, Y, D, SD_Y, SD_D, SD_VX, SD_VY, LAST_Y, LAST_D, LAST_FY, SD_FX, SD_FY,
+ GRIPPED) = range(20)  # fmt: skip
+NUM_READ = 20  # chosen
 
 # Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
 SPAN_VX, SPAN_VY, SPAN_Y, SPAN_D, SPAN_FORCE = range(5)

@@ -29,7 +29,7 @@ from hmmseg.online.layout import (
     VY,
     WIDTH_SCALE,
 )
-from hmmseg.online.scores import held_height, held_width, scale2
+from hmmseg.online.scores import carry2, held_height, held_width, scale2
 from hmmseg.segmentation.emissions import TAIL
 
 MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
@@ -100,7 +100,7 @@ def learn(h, kind, block, x, pads, gravity, share, levels):
         if h[weight + 1] > 0.0:
             _learn_scale(h, CARRY, fy - factor * h[weight] / h[weight + 1], share, noise)
         if factor > 0.1:  # in free fall a force says nothing of the weight
-            _learn_mean(h, weight, fy / factor, scale2(h, CARRY) / (factor * factor), share, math.inf)
+            _learn_mean(h, weight, fy / factor, carry2(h, x) / (factor * factor), share, math.inf)
         return
     _learn_scale(h, VELOCITY, x[VY], share, FLOOR * x[SD_VY] ** 2)
     if levels:

@@ -36,6 +36,8 @@ class Properties:
                     self.signs[move] = np.sign(next(iter(rise.values())))
         gain = np.array(rig.systematic.force_gain)
         self.weight_gain = float(np.hypot(gain[1], gain[3]) / 2)  # half of it on each finger
+        self.touch_sd = 0.0  # how well the distance at which fingers touch is known, in all grips alike [m]
+        self.force_sd = 0.0  # how well the zero of the net force is known, in all grips alike [N]
         self._seen: bytes = b""
         self._heights: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
@@ -47,7 +49,9 @@ class Properties:
                 if means[q, 2] > 0.5:
                     variance = means[q, 1]
                     if prop == "weight":
-                        variance = variance + (self.weight_gain * means[q, 0]) ** 2
+                        variance = variance + (self.weight_gain * means[q, 0]) ** 2 + self.force_sd**2
+                    else:
+                        variance = variance + self.touch_sd**2
                     out.append((name, prop, float(means[q, 0]), float(np.sqrt(variance))))
         rises = means[2 * len(self.objects) :]
         if rises.size and (rises[:, 2] > 0.5).any():

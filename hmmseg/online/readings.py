@@ -10,12 +10,30 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
-from hmmseg.online.layout import AY, FX1, LAST_D, LAST_Y, SD_D, SD_VX, SD_VY, SD_Y, VX, VY, D, T, Y
+from hmmseg.online.layout import (
+    AY,
+    FX1,
+    FY1,
+    FY2,
+    LAST_D,
+    LAST_FY,
+    LAST_Y,
+    SD_D,
+    SD_VX,
+    SD_VY,
+    SD_Y,
+    VX,
+    VY,
+    D,
+    T,
+    Y,
+)
 from hmmseg.segmentation.features import MAX_RATE, WINDOW
 
 SLOPE = 1.0 / MAX_RATE
 ROWS = 512  # numerics: rows looked back at, at most: 20 kHz over SLOPE
 NUM_MEANS = 8  # chosen: forces, vx, vy, y, d
+HISTORY = 4 + NUM_MEANS  # numerics: of a row: time, reach that scales noise (2), values, net vertical mean
 
 
 @compiled
@@ -60,7 +78,7 @@ def hand_row(channels, jointed, geometry, velocities, before, dt, out):
 def read(history, head, filled, t, dt, row, noise, velocities, x):
     """The reading (NUM_READ,) at `t` from the rows so far.
 
-    `history` (ROWS, 11) is a ring with its newest row at `head`;
+    `history` (ROWS, 12) is a ring with its newest row at `head`;
     `noise` (2,): squared noise of one position and of one velocity [rad or m, and per s]; `dt` [s] since
     the row before.
     """
@@ -70,6 +88,7 @@ def read(history, head, filled, t, dt, row, noise, velocities, x):
     for k in range(NUM_MEANS):
         there[3 + k] = row[k]
         x[FX1 + k if k < 6 else (Y if k == 6 else D)] = 0.0
+    x[LAST_FY] = math.nan
     number = 0
     for k in range(NUM_MEANS):
         total, num = 0.0, 0
@@ -83,6 +102,7 @@ def read(history, head, filled, t, dt, row, noise, velocities, x):
             if k == 0:
                 number += 1
         x[FX1 + k if k < 6 else (Y if k == 6 else D)] = total / num if num > 0 else math.nan
+    there[11] = x[FY1] + x[FY2]
     number = max(number, 1)
     sum_t = sum_v = sum_tt = sum_tv = 0.0
     num = 0
@@ -90,6 +110,8 @@ def read(history, head, filled, t, dt, row, noise, velocities, x):
         old = history[(head - back) % ROWS]
         if back > 1 and old[0] < t - SLOPE - 1e-9:
             break
+        if back > 0:
+            x[LAST_FY] = old[11]
         if not math.isnan(old[8]):
             age = old[0] - t
             sum_t, sum_v, num = sum_t + age, sum_v + old[8], num + 1

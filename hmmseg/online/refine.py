@@ -23,6 +23,7 @@ from hmmseg.segmentation.crossings import HELD, contacts
 from hmmseg.segmentation.emissions import Parameters, log_likelihoods
 from hmmseg.segmentation.features import MAX_RATE, WINDOW, features, thin
 from hmmseg.segmentation.pads import sense
+from hmmseg.segmentation.posteriors import nearest_touch
 
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter
@@ -41,6 +42,7 @@ def refined(
     `h`: the heaviest hypothesis; `previous`: the boundary before.
     """
     touch = before.state == FREE or after.name == "place"
+    wrist = filter_.rig.gripper is not None
     start = max(mean - REACH, previous)
     rows = [each for each in filter_.rows if start <= each[0] <= mean + max(filter_.lag, REACH)]
     if len(rows) < 2 * NEAREST or filter_.failed_now:
@@ -49,9 +51,14 @@ def refined(
     if touch and 1.0 / np.median(np.diff(t)) > FINE:
         return None
     read = np.array([each[1] for each in rows])
-    there = np.flatnonzero((~np.isnan(read)).any(axis=0))
-    names = [filter_.channels[i] for i in there]
-    trial = Trial("stream", t, {name: read[:, filter_.channels.index(name)] for name in names})
+    names = [name for k, name in enumerate(filter_.channels) if not np.isnan(read[:, k]).all()]
+    trial = Trial(
+        "stream",
+        t,
+        {name: read[:, filter_.channels.index(name)] for name in names},
+        touches=tuple(filter_.touches),
+        timing=read[:, len(filter_.channels)] if wrist else None,
+    )
     if set(filter_.channels) - set(names) - set(filter_.optional):
         return None
     signals = thin(task_space(trial, filter_.rig), MAX_RATE, WINDOW)
@@ -80,6 +87,8 @@ def refined(
     table = contacts(signals, sense([], [], (), parameters, filter_.rig), parameters)
     change = table.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
     out = combine(t, probability, {}) if change is None else moment(change, Disagreement())
+    if wrist and FREE in (before.state, after.state):
+        out = nearest_touch(tuple(filter_.touches), out)
     median = out.quantile(0.5)
     if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
         return None  # another event than the filter's

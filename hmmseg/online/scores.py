@@ -3,8 +3,9 @@
 The emissions are those of hmmseg.segmentation.emissions (tested against them), with what is not yet known
 integrated out: an unknown weight, width or level has a broad density over the range seen, and known ones
 add their variance. And a hand that is free, or carries, may halt: without what follows, a halt would pass
-for a rest on something, as that predicts positions so much better. What was just lifted moves: a block held
-still on its support would pass for one carried at rest, whose weight is what the fingers happen to bear.
+for a rest on something, as that predicts positions so much better. What was just lifted moves, and what is
+held still bears what it bore a reading before: a block not weighed yet, held on its support, would pass for
+one carried at rest, whose weight is what the fingers happen to bear.
 What a hypothesis learns is in `learning`.
 """
 
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
-from hmmseg.online.densities import log_between, log_broad, log_student, log_sum
+from hmmseg.online.densities import log_between, log_broad, log_rising, log_student, log_sum
 from hmmseg.online.layout import (
     AY,
     BIAS,
@@ -23,8 +24,10 @@ from hmmseg.online.layout import (
     FX2,
     FY1,
     FY2,
+    GRIPPED,
     GROUND_KIND,
     LAST_D,
+    LAST_FY,
     LAST_Y,
     LEVEL,
     LEVEL_SCALE,
@@ -32,6 +35,8 @@ from hmmseg.online.layout import (
     OBJECTS,
     SCALES,
     SD_D,
+    SD_FX,
+    SD_FY,
     SD_VX,
     SD_VY,
     SD_Y,
@@ -51,6 +56,8 @@ from hmmseg.online.layout import (
 from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TOUCHING
 
 STILL = 0.2  # chosen: prior share of samples at which a hand that may move stands still,
+SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
+CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # chosen: ... times this while a lift begins: slow, but a motion
 ALIKE = 0.5  # chosen: prior probability that a block not met yet is like one that was
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
@@ -64,6 +71,12 @@ def scale2(h, which):
     """Squared scale of one kind of residual."""
     at = SCALES + 2 * which
     return h[at] / h[at + 1]
+
+
+@compiled
+def carry2(h, x):
+    """Variance of the net vertical force of what is carried."""
+    return scale2(h, CARRY) + x[SD_FY] * x[SD_FY]
 
 
 @compiled
@@ -115,12 +128,14 @@ def _log_known(value, factor, h, at, variance, share, others, span, rising):
         return 0.0
     if precision > 0.0:
         mean = h[at] / precision
+        if rising:
+            mean = max(mean, 0.0)
         total = variance + factor * factor / precision
         close = log_student(value - factor * mean, total)
         return log_sum(math.log1p(-share) + close, math.log(share) - math.log(span)) if share > 0 else close
     flat = -math.log(span)
     if rising:
-        flat += math.log(2 * max(value, math.sqrt(variance)) / span)
+        flat = log_rising(value, math.sqrt(variance), span)
     met, alike = 0, -math.inf
     for o in range(others):
         other = OBJECTS + 4 * o + (at - OBJECTS) % 4
@@ -159,7 +174,8 @@ def free(h, x, spans):
         still += log_student(x[D] - x[LAST_D], variance) + math.log(spans[SPAN_D])
     broad = log_broad(x[VX], spans[SPAN_VX]) + log_broad(x[VY], spans[SPAN_VY])
     broad += log_broad(x[Y], spans[SPAN_Y]) + log_broad(x[D], spans[SPAN_D])
-    return _ungripped(h, x, spans[SPAN_FORCE]) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
+    out = _ungripped(h, x, spans[SPAN_FORCE]) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
+    return out + SHUT if x[GRIPPED] == 2.0 else out
 
 
 @compiled
@@ -169,7 +185,11 @@ def held(h, block, x, spans, pads, num_blocks):
     fx1, fy1 = x[FX1] - h[BIAS] / h[BIAS + 1], x[FY1] - h[BIAS + 2] / h[BIAS + 3]
     fx2, fy2 = x[FX2] - h[BIAS + 4] / h[BIAS + 5], x[FY2] - h[BIAS + 6] / h[BIAS + 7]
     out = log_between((fx1 - fx2) / 2, 0.0, span, math.sqrt(scale2(h, FORCE)), span)
-    out += log_student(fx1 + fx2, scale2(h, NET_X)) + log_student((fy1 - fy2) / 2, scale2(h, SHEAR))
+    if x[GRIPPED] == 0.0:
+        out += SHUT
+    out += log_student(fx1 + fx2, scale2(h, NET_X) + x[SD_FX] * x[SD_FX]) + log_student(
+        (fy1 - fy2) / 2, scale2(h, SHEAR)
+    )
     spread = x[SD_D] * x[SD_D] + scale2(h, WIDTH_SCALE)
     width = OBJECTS + 4 * block + 2
     return out + _log_known(
@@ -189,7 +209,7 @@ def lifted(h, block, x, spans, gravity, num_blocks, settled):
     `settled`: probability that it has been there for a while, and may halt.
     """
     factor = 1.0 if math.isnan(x[AY]) else 1.0 + x[AY] / gravity
-    out = _log_known(_net_force(h, x), factor, h, OBJECTS + 4 * block, scale2(h, CARRY), 0.0, num_blocks,
+    out = _log_known(_net_force(h, x), factor, h, OBJECTS + 4 * block, carry2(h, x), 0.0, num_blocks,
                      spans[SPAN_FORCE], True)  # fmt: skip
     out += (
         log_broad(x[VX], spans[SPAN_VX]) + log_broad(x[VY], spans[SPAN_VY]) + log_broad(x[Y], spans[SPAN_Y])
@@ -206,20 +226,26 @@ def supported(h, kind, block, x, spans, pads, levels):
     """
     span, weight = spans[SPAN_FORCE], OBJECTS + 4 * block
     if h[weight + 1] > 0.0:
-        most, soft = h[weight] / h[weight + 1], math.sqrt(scale2(h, CARRY) + 1.0 / h[weight + 1])
+        most, soft = h[weight] / h[weight + 1], math.sqrt(carry2(h, x) + 1.0 / h[weight + 1])
     else:
-        most, soft = span, math.sqrt(scale2(h, CARRY))
-    out = log_between(_net_force(h, x), -span, most, soft, span + most)
+        most, soft = span, math.sqrt(carry2(h, x))
+    force = log_between(_net_force(h, x), -span, most, soft, span + most)
     moving = scale2(h, VELOCITY)
     upward, broad = log_student(x[VY], x[SD_VY] ** 2 + moving), log_broad(x[VY], spans[SPAN_VY])
+    resting, change = force + upward, x[FY1] + x[FY2] - x[LAST_FY]
+    if h[weight + 1] <= 0.0 and not math.isnan(change):  # what stands bears what it bore
+        same = log_student(change, 4 * scale2(h, FORCE)) + log_student(x[VY], x[SD_VY] ** 2 + CREEP**2)
+        resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same)
     if levels and h[LEVEL + 1] > 0.0:
         spread = x[SD_Y] * x[SD_Y] + scale2(h, LEVEL_SCALE) + 1.0 / h[LEVEL + 1]
-        upward += log_student(held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1], spread)
+        level = log_student(held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1], spread)
+        resting, upward = resting + level, upward + level
         broad += log_broad(x[Y], spans[SPAN_Y])
     else:
-        out += log_broad(x[Y], spans[SPAN_Y])
+        force += log_broad(x[Y], spans[SPAN_Y])
+        resting += log_broad(x[Y], spans[SPAN_Y])
     aside = log_broad(x[VX], spans[SPAN_VX])
     if kind != GROUND_KIND:
-        return out + aside + log_sum(_LOG_CLOSE + upward, _LOG_STRAY + broad)
+        return aside + log_sum(_LOG_CLOSE + resting, _LOG_STRAY + broad + force)
     still = log_student(x[VX], x[SD_VX] ** 2 + moving)
-    return out + log_sum(_LOG_REST + still + upward, _LOG_STRAY + aside + log_sum(upward, broad))
+    return log_sum(_LOG_REST + still + resting, force + _LOG_STRAY + aside + log_sum(upward, broad))

@@ -83,10 +83,15 @@ def summarise(table, count, num_steps, before, num_objects, num_moves, rises, no
 
 
 @compiled
-def boundary(table, count, number, before):
-    """Mean, variance of crossing `number` (from 0), the probability that it has come, and by `before`."""
+def boundary(table, count, num_steps, number, before):
+    """Mean, variance of crossing `number` (from 0), the probability that it has come, and by `before`.
+
+    Off the task nothing is a boundary of it: all of them given that the recording follows its task.
+    """
     total = come = early = mean = square = 0.0
     for i in range(count):
+        if table[i, STATE] >= num_steps:
+            continue
         p = math.exp(table[i, WEIGHT])
         total += p
         crossed = int(table[i, CROSSED])
@@ -97,4 +102,6 @@ def boundary(table, count, number, before):
             gap = table[i, at] - mean
             mean += p / come * gap
             square += p * (table[i, at + 1] + gap * (table[i, at] - mean))
+    if total == 0.0:
+        return 0.0, math.inf, 0.0, 0.0
     return mean, square / come if come > 0 else math.inf, come / total, early / total

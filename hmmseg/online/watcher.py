@@ -14,11 +14,18 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
+from hmmseg.online.wrist import Wrist, checked
 
 LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
 SNAPSHOTS = 10  # chosen: points over the lag to which a late row returns
 GAP = 3.0  # chosen: usual intervals between rows that make a gap
 USUAL = 0.02  # chosen: how fast the usual interval follows
+ODD = {
+    "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
+    "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",
+    "too late": "too late: {behind:.3g} s behind, more than the lag of {lag:g} s; left out",
+    "late": "late: {behind:.3g} s behind, put in its place",
+}
 
 
 class Watcher:
@@ -32,23 +39,35 @@ class Watcher:
 
     `lag` [s]: how long a boundary is waited for before it is settled. Time and memory a row do not grow.
     A late row is put in its place as long as that is within the lag; `counts` says how many rows were late,
-    repeated, or followed a gap. InputError for a plain ordered task or a gripper with a wrist sensor.
+    repeated, or followed a gap. A gripper with a sensor in its wrist is followed a smoothing window late,
+    from its first grip on (`hmmseg.online.wrist`). InputError for a plain ordered task.
     """
 
     def __init__(self, task: Any, rig: Any, lag: float = LAG) -> None:
         description, hand = Task.read(task), Rig.read(rig)
         if not isinstance(description, BlockTask):
             raise InputError("task", "a plain ordered task cannot be watched", "objects and moves")
-        if hand.gripper is not None:
-            raise InputError("rig", "a [gripper] cannot be watched", "[fingers], or a Cartesian hand")
         if not 0 <= lag < math.inf:
             raise InputError("lag", f"found {lag}", "0 s or more")
         self.filter = Filter(description, hand, float(lag))
+        self._wrist = None if hand.gripper is None else Wrist(hand)
         self.channels, self.optional = self.filter.channels, self.filter.optional
+        if self._wrist is not None:
+            self.channels, self.optional = self._wrist.names, ()
         self.counts: Counter[str] = Counter()
+        self._mark: Any = None  # where the last grip of a wrist's gripper began
         self._snapshots: deque[tuple[float, Any]] = deque()
         self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
+
+    @property
+    def forces(self) -> tuple[float, float]:
+        """Grip and net vertical force of the newest row that was read [N], NaN before the first."""
+        rows = self.filter.rows
+        if not rows:
+            return math.nan, math.nan
+        fx1, fy1, fx2, fy2 = rows[-1][1][[4, 5, 10, 11]]
+        return float(fx1 - fx2) / 2, float(fy1 + fy2)
 
     @property
     def lag(self) -> float:
@@ -70,6 +89,14 @@ class Watcher:
         if not math.isfinite(t):
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
+        f = self.filter
+        note = self._followed(t, row) if self._wrist is None else self._felt(self._wrist, t, row)
+        answer = f.answer()
+        answer.note = note
+        return answer
+
+    def _followed(self, t: float, row: np.ndarray) -> str | None:
+        """Take a row, in its place; what was odd about it."""
         f, note = self.filter, None
         rows = f.rows
         if rows and t <= rows[-1][0]:
@@ -82,9 +109,37 @@ class Watcher:
                 while len(self._snapshots) > SNAPSHOTS + 1:
                     self._snapshots.popleft()
             f.take(t, row)
-        answer = f.answer()
-        answer.note = note
-        return answer
+        return note
+
+    def _felt(self, wrist: Wrist, t: float, row: np.ndarray) -> str | None:
+        """Take a row of a wrist's sensor; what was odd about it."""
+        checked(self.filter.rig, t, row)
+        newest = wrist.newest
+        odd = wrist.place(t, row)
+        if odd is None:
+            note = None if math.isnan(newest) else self._gap(t - newest)
+        else:
+            self.counts[odd] += 1
+            note = ODD[odd].format(t=t, behind=newest - t, lag=wrist.delay)
+        self._take_felt(wrist, wrist.ready())
+        self.filter.idle(t)
+        return note
+
+    def _take_felt(self, wrist: Wrist, rows: list[tuple[float, np.ndarray]]) -> None:
+        f = self.filter
+        if wrist.tool is None:
+            return
+        if f.force_noise is None:  # each finger has half of the sensor's, and their sum all of it
+            f.force_noise = wrist.tool.noise / math.sqrt(2)
+        f.touches, f.properties.touch_sd = wrist.touches, wrist.touch_sd
+        f.properties.force_sd = wrist.force_sd
+        if wrist.back and self._mark is not None:
+            f.restore(self._mark)
+        wrist.back = False
+        for t, row in rows:
+            if wrist.mark is not None and t >= wrist.mark:
+                self._mark, wrist.mark = f.snapshot(), None
+            f.take(t, row)
 
     def _gap(self, dt: float) -> str | None:
         usual, self._usual = self._usual, dt if math.isnan(self._usual) else self._usual
@@ -101,22 +156,24 @@ class Watcher:
         if same is not None:
             if np.array_equal(same, row, equal_nan=True):
                 self.counts["repeated"] += 1
-                return f"repeated: the row at {t:.9g} s came before, and counts once"
+                return ODD["repeated"].format(t=t)
             self.counts["contradictory"] += 1
-            return f"contradictory: another row at {t:.9g} s came before; the first one counts"
+            return ODD["contradictory"].format(t=t)
         while len(self._snapshots) > 1 and self._snapshots[-1][0] >= t:
             self._snapshots.pop()
         if self._snapshots[0][0] >= t:
             self.counts["too late"] += 1
-            return f"too late: {newest - t:.3g} s behind, more than the lag of {self.lag:g} s; left out"
+            return ODD["too late"].format(behind=newest - t, lag=self.lag)
         self.counts["late"] += 1
         taken = f.restore(self._snapshots[-1][1])
         for at, each in sorted([*taken, (t, row)], key=lambda pair: pair[0]):
             f.take(at, each)
-        return f"late: {newest - t:.3g} s behind, put in its place"
+        return ODD["late"].format(behind=newest - t)
 
     def finish(self) -> Answer:
         """The last answer: every boundary that has come is settled, whatever its age."""
+        if self._wrist is not None:
+            self._take_felt(self._wrist, self._wrist.ready(final=True))
         return self.filter.finish()
 
     @property

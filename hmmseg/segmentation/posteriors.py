@@ -57,11 +57,11 @@ def boundary_posteriors(
             found.append(combine(t, np.exp(posterior.log_advance[:, k]), {}))
         else:
             posted = moment(change, known.get(change.sort, Disagreement()))
-            found.append(_known(touches, posted) if len(change.contacts) > 1 else posted)
+            found.append(nearest_touch(touches, posted) if len(change.contacts) > 1 else posted)
     return tuple(found)
 
 
-def _known(touches: Touches, found: BoundaryPosterior) -> BoundaryPosterior:
+def nearest_touch(touches: Touches, found: BoundaryPosterior) -> BoundaryPosterior:
     """The touch or release that is known apart from forces where there is one nearby, else as it is."""
     middle = found.quantile(0.5)
     for time, sd in sorted(touches, key=lambda touch: abs(touch[0] - middle))[:1]:

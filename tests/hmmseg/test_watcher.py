@@ -68,7 +68,8 @@ def test_emissions_are_those_off_line():
     pads = np.array(f.pads)
     for n in range(0, f.t.size, 3):
         x = np.array([f.t[n], *f.force[n], f.vx[n], f.vy[n], f.ay[n], f.y[n], f.d[n], f.sd_y[n], f.sd_d[n],
-                      f.sd_vx[n], f.sd_vy[n], f.y[n - 1] if n else np.nan, np.nan])  # fmt: skip
+                      f.sd_vx[n], f.sd_vy[n], f.y[n - 1] if n else np.nan, np.nan, np.nan, 0.0, 0.0,
+                      1.0])  # fmt: skip
         for step in steps[:4]:
             if step.state == FREE:
                 found, halt = scores.free(h, x, spans), scores.STILL

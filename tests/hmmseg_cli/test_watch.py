@@ -71,7 +71,7 @@ def test_the_live_picture_shows_where_the_task_is():
     for row in ROWS[1:60]:
         t, *values = map(float, row.split(","))
         answer = watcher.update(t, values)
-        live.update(answer, values)
+        live.update(answer)
     live.close()
     from hmmseg_cli.live import picture
 
