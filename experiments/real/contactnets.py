@@ -1,6 +1,6 @@
 """Real tosses of a cube against MuJoCo's model of it with the published parameters.
 
-    python -m experiments.real.contactnets FOLDER [--output FILE.json]
+    python -m experiments.real.contactnets FOLDER [--output FILE.json] [--figures DIR]
 
 FOLDER holds tosses.csv and source_params.json (DAIRLab/contact-nets). Every toss is a log of the cube's pose;
 the model is built from the published mass, side, friction and inertia. TOSSES of them, evenly chosen, are
@@ -12,17 +12,16 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.real.on_folder import run_on_folder
-from experiments.real.robot_gap import summary
-from simgap.robots.diagnose import diagnose
+from experiments.real.robot_gap import asked, published
+from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.mjcf.load import load_mjcf
 
-RESULTS = Path(__file__).resolve().parents[1] / "results" / "contactnets.json"
-TOSSES = 24
+TOSSES = 16
 SOURCE_UNIT = 0.0524  # m: half of the published side
 POSE = {"x": "x", "y": "y", "z": "z", "qw": "qw", "qx": "qx", "qy": "qy", "qz": "qz"}
 
@@ -57,7 +56,7 @@ def write_inputs(folder: Path, into: Path, count: int = TOSSES) -> list[Path]:
     params = json.loads((folder / "source_params.json").read_text(encoding="utf-8"))
     (into / "cube.xml").write_text(model_text(params), encoding="utf-8")
     (into / "map.toml").write_text(map_text(), encoding="utf-8")
-    tosses = pd.read_csv(folder / "tosses.csv")
+    tosses: Any = pd.read_csv(folder / "tosses.csv")
     numbers = np.unique(tosses.toss)
     chosen = numbers[np.linspace(0, numbers.size - 1, min(count, numbers.size)).round().astype(int)]
     out = []
@@ -68,19 +67,20 @@ def write_inputs(folder: Path, into: Path, count: int = TOSSES) -> list[Path]:
     return out
 
 
-def run(folder: Path, count: int = TOSSES) -> dict:
+def run(folder: Path, count: int = TOSSES) -> RobotDiagnosis:
     """The diagnosis of the tosses."""
     with tempfile.TemporaryDirectory() as into:
         paths = write_inputs(folder, Path(into), count)
         loaded = load_mjcf(Path(into) / "cube.xml", Path(into) / "map.toml")
         logs = [loaded.read(p) for p in paths]
         more = loaded.effects(logs)
-        return summary(diagnose(loaded.simulator, logs, more=more, tell=print, length=loaded.map.length))
+        return diagnose(loaded.simulator, logs, more=more, tell=print, length=loaded.map.length)
 
 
 def main() -> None:
     """Run on a folder and write the results."""
-    run_on_folder(__doc__ or "", run, RESULTS)
+    given = asked(__doc__ or "")
+    published(run(given.folder), "contactnets", given.output, given.figures)
 
 
 if __name__ == "__main__":

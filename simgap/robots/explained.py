@@ -50,10 +50,6 @@ class Explained:
         lost = np.maximum(self.without - self.after, 0.0)
         return lost / np.maximum(lost.sum(0), 1e-12)
 
-    def known(self, most: float) -> np.ndarray:
-        """Regimes (R,) of which the causes leave no more than this share."""
-        return self.left <= most
-
     def shares(self, kept: Sequence[int], rng: np.random.Generator) -> Shares:
         """All regimes together, with draws of each kept cause's share."""
         before, floor = float(self.before.sum()), float(self.floor.sum())

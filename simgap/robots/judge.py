@@ -74,7 +74,9 @@ def judge(
     exceed = sum(t >= value for t in twins)
     p = max(p, exceed / len(twins)) if twins else p
     detection = Detection(value, p, 1 / (len(twins) + 1) if twins else 0.0)
-    part = told_by.part.max(1) if causes else np.zeros(0)
+    # Where most of a gap is left, what the causes take of it may stand in for anything: no cause rests on it.
+    rests = told_by.left <= MOST
+    part = told_by.part[:, rests if rests.any() else ~rests].max(1) if causes else np.zeros(0)
     kept = causes if forced else tuple(j for j, s in zip(causes, part, strict=True) if s >= LEAST)
     parts = told_by.shares([causes.index(j) for j in kept], rng)
     left = float(told_by.left.min()) if kept else 1.0  # of the regime that they explain best

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
-from simgap.attribution.search import sought
 from simgap.robots.discrepancy import learned
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import Linear, base_at, linearise, vary
@@ -32,7 +31,7 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Found:
-    """Where a search ended: the linear model there, its whitener and discrepancies, and the sets found."""
+    """Where a search ended: the linear model there, its whitener and discrepancies, the best set first."""
 
     linear: Linear
     whiten: Whitener
@@ -81,8 +80,7 @@ def search(
             chosen = tuple(j for j, n in enumerate(leaders) if n in forced)
             models = [fitted(f, chosen), fitted(f, ())]
         else:
-            step = one_more(f, [leaders.index(n) for n in best if n in leaders])
-            models = [step, *(m for m in sought(f) if m.effects != step.effects)]
+            models = [one_more(f, [leaders.index(n) for n in best if n in leaders])]
         now = tuple(sorted(leaders[j] for j in models[0].effects))
         last = Found(linear, whiten, cov, off, f, tuple(models), now)
         tell(f"round {number + 1}: {' + '.join(now) or 'nothing'}")

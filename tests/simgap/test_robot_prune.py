@@ -1,0 +1,82 @@
+"""What held-out logs bear out, what is lost without a cause, and in which regime."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simgap_swing import Swing, log
+
+from simgap.attribution.problem import Candidate, Gap, Rows
+from simgap.robot_effects import candidates
+from simgap.robot_effects.base import Setting
+from simgap.robots.borne_out import borne_out, weakest
+from simgap.robots.explained import FREE, TOUCHING, explained
+from simgap.robots.linear import linearise
+from simgap.robots.model import Composed
+from simgap.robots.noise import noises
+from simgap.robots.whiten import covariances
+from simgap.simulators.user import checked
+
+FOLDS, EACH = 6, 300
+
+
+def gap_of(sizes, columns, rng) -> tuple[Gap, np.ndarray]:
+    """Folds of rows in which the first candidate acts, as strongly as `sizes` (FOLDS,) say."""
+    fold = np.repeat(np.arange(FOLDS), EACH)
+    n = fold.size
+    rows = Rows(fold, np.zeros(n, int), np.zeros(n, int), np.tile(np.arange(EACH) / 100, FOLDS),
+                tuple(f"log {k}" for k in range(FOLDS)), ("q",), ("whole",))  # fmt: skip
+    first = np.array(sizes)[fold] * rng.standard_normal(n)
+    every = [first, *(rng.standard_normal(n) for _ in range(columns - 1))]
+    one = np.ones(1)
+    made = tuple(
+        Candidate(f"e{k}", ("size",), 0 * one, 0 * one, one, np.zeros(n), c[:, None], -9 * one, 9 * one)
+        for k, c in enumerate(every)
+    )
+    return Gap(rows, first + rng.standard_normal(n), np.zeros((n, 0)), made), fold
+
+
+def test_a_cause_that_one_log_shows_a_hundred_times_as_well_is_borne_out():
+    """Its gains scatter by as much as their mean, and every one of them is a gain."""
+    gap, fold = gap_of([5.0, 0.3, 0.3, 0.3, 0.3, 0.3], 1, np.random.default_rng(0))
+    assert borne_out(gap, (0,), fold) == (0,)
+
+
+def test_what_no_log_bears_out_goes_and_the_least_first():
+    gap, fold = gap_of([0.5] * FOLDS, 4, np.random.default_rng(1))
+    assert weakest(gap, (0, 1, 2, 3), fold) in (1, 2, 3)
+    assert borne_out(gap, (0, 1, 2, 3), fold) == (0,)
+    assert weakest(gap, (0,), fold) is None
+
+
+@pytest.fixture(scope="module")
+def damped() -> Composed:
+    """Logs of a pendulum with damping that its model lacks."""
+    simulator, logs = checked(Swing(), "Swing"), [log(s, viscous=0.02) for s in range(2)]
+    return Composed.of(simulator, logs, candidates(Setting(simulator, logs)), noises(simulator, logs))
+
+
+def told(model: Composed, point, causes):
+    linear = linearise(model, point, [])
+    sensor = covariances(linear, model.windows, {"angle": "position"}).whitener()
+    return explained(model, linear, sensor, {}, causes)
+
+
+def test_a_planted_effect_explains_the_gap_and_another_does_not(damped):
+    there = {"viscous": {"viscous": 0.02}, "readout:angle.bias": {"bias": 1e-5}}
+    found = told(damped, there, tuple(there))
+    assert found.left[0] < 0.02
+    assert found.part[:, 0] == pytest.approx([1.0, 0.0], abs=0.02)
+
+
+def test_what_contacts_leave_does_not_deny_what_flight_bears_out(damped):
+    """The second half of the windows are said to touch, and there something else acts as well."""
+    rows = damped.rows
+    late = rows.window >= np.median(rows.window)
+    rough = rows.observed + np.where(late, 0.3 * np.sin(40 * rows.time), 0.0)
+    model = replace(damped, rows=replace(rows, touching=late, observed=rough))
+    found = told(model, {"viscous": {"viscous": 0.02}}, ("viscous",))
+    assert found.regimes == (FREE, TOUCHING)
+    assert found.left[0] < 0.05 and found.left[1] > 0.5
