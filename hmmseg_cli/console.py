@@ -226,7 +226,7 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
 
 
 def _publish(staged: dict[Path, Path]) -> None:
-    """Copy beside each destination first, then rename: nobody sees half a file."""
+    """Copy beside each destination first, then rename: nobody sees half a file, nor a copy after Ctrl-C."""
     beside: dict[Path, Path] = {}
     try:
         for destination, source in staged.items():
@@ -237,12 +237,26 @@ def _publish(staged: dict[Path, Path]) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
             beside[target] = target.with_name(f".{target.name}.{os.getpid()}")
             shutil.copyfile(source, beside[target])
-        for target, temporary in beside.items():
-            os.replace(temporary, target)
+        _put(beside)
     except OSError as error:
+        raise InputError(str(error.filename), f"cannot be written ({error.strerror})") from error
+    finally:
         for temporary in beside.values():
             temporary.unlink(missing_ok=True)
-        raise InputError(str(error.filename), f"cannot be written ({error.strerror})") from error
+
+
+def _put(beside: dict[Path, Path]) -> None:
+    """Rename all; interrupted in between, the rest first: results are whole or not there."""
+    interrupted: KeyboardInterrupt | None = None
+    for target, temporary in beside.items():
+        try:
+            os.replace(temporary, target)
+        except KeyboardInterrupt as interrupt:
+            interrupted = interrupt
+            if temporary.exists():
+                os.replace(temporary, target)
+    if interrupted is not None:
+        raise interrupted
 
 
 def _console(file: Any, quiet: bool) -> Console:

@@ -1,0 +1,140 @@
+"""Ctrl-C while results are put in place, or anywhere: whole or not there; two runs in one folder; one seed."""
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmmseg_cli.main import main
+
+STACK = Path(__file__).parents[1] / "data/stack"
+TASK = """[objects.block1]
+on = "block2"
+[objects.block2]
+on = "ground"
+[[moves]]
+object = "block1"
+to = "ground"
+[[moves]]
+object = "block2"
+to = "block1"
+"""
+PROPERTIES = {
+    "objects": {name: {"weight": 0.4, "width": 0.02, "height": 0.02} for name in ("block1", "block2")}
+}
+HAND = ["--task", "task.toml", "--rig", "rig.toml"]
+COMMANDS = {
+    "decompose": ["decompose", "task.toml", "--json", "out.json"],
+    "inspect": ["inspect", "theirs.csv", "--write", "new.toml", "--json", "out.json"],
+    "new": ["new", "lab"],
+    "segment": ["segment", "trial.csv", *HAND, "--method", "qualitative", "--json", "out.json", "--write",
+                "labelled.csv"],
+    "identify": ["identify", "trial.csv", *HAND, "--method", "paper", "--json", "out.json"],
+    "simulate": ["simulate", *HAND, "--trials", "1", "--output", "made", "--json", "out.json"],
+}  # fmt: skip
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "task.toml").write_text(TASK)
+    shutil.copyfile(STACK / "rig.toml", tmp_path / "rig.toml")
+    shutil.copyfile(STACK / "trial_01.csv", tmp_path / "trial.csv")
+    header, *rows = (tmp_path / "trial.csv").read_text().splitlines()
+    theirs = ["stamp", *(f"joint_{name}" for name in header.split(",")[1:])]
+    (tmp_path / "theirs.csv").write_text("\n".join([",".join(theirs), *rows]) + "\n")
+    return tmp_path
+
+
+def files(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def remove(folder, kept):
+    for path in folder.rglob("*"):
+        if path.is_file() and str(path.relative_to(folder)) not in kept:
+            path.unlink()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("step", ["copyfile", "replace"])
+def test_ctrl_c_while_results_are_put_in_place(name, step, lab, monkeypatch, capsys):
+    before = files(lab)
+    assert main(COMMANDS[name]) == 0
+    whole = files(lab)
+    assert whole.keys() > before.keys()
+    of, real = (shutil, shutil.copyfile) if step == "copyfile" else (os, os.replace)
+    for moment in range(len(whole) - len(before)):
+        remove(lab, before)
+        calls = iter(range(100))
+
+        def interrupted(*arguments, calls=calls, moment=moment):
+            if next(calls) == moment:
+                raise KeyboardInterrupt
+            return real(*arguments)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(of, step, interrupted)
+            assert main(COMMANDS[name]) == 130
+        found = files(lab)
+        assert found.keys() in (before.keys(), whole.keys())
+        assert found == {name: whole[name] for name in found}
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_ctrl_c_at_any_moment(name, lab, capsys):
+    """In process, everything loaded: an alarm interrupts at moments drawn from a run's length."""
+    import time
+
+    before = files(lab)
+    main(COMMANDS[name])
+    remove(lab, before)
+    began = time.perf_counter()
+    main(COMMANDS[name])
+    length, whole = time.perf_counter() - began, files(lab)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    usual = signal.signal(signal.SIGALRM, interrupt)
+    rng = np.random.default_rng(7)
+    try:
+        for moment in rng.uniform(0.02, 1.0, 4) * length:
+            remove(lab, before)
+            try:
+                signal.setitimer(signal.ITIMER_REAL, moment)
+                code = main(COMMANDS[name])
+            except KeyboardInterrupt:  # before or after the command itself
+                code = 130
+            finally:
+                signal.setitimer(signal.ITIMER_REAL, 0)
+            assert code in (0, 130)
+            assert files(lab).keys() in (before.keys(), whole.keys())
+    finally:
+        signal.signal(signal.SIGALRM, usual)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "new"])
+def test_the_same_seed_gives_the_same_digits(name, lab):
+    before = files(lab)
+    main([*COMMANDS[name], "--seed", "5"])
+    first = files(lab)
+    remove(lab, before)
+    main([*COMMANDS[name], "--seed", "5"])
+    assert files(lab) == first
+
+
+def test_a_run_that_fails_leaves_another_s_results(lab):
+    assert main(COMMANDS["identify"]) == 0
+    kept = files(lab)
+    (lab / "bad.csv").write_text("t,x\n0,1\n")
+    assert main(["identify", "bad.csv", *HAND, "--json", "out.json"]) == 2
+    (lab / "bad.csv").unlink()
+    assert files(lab) == kept
+    assert json.loads(kept["out.json"])["format"] == "hmmseg.identify/1"
