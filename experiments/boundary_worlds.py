@@ -24,6 +24,7 @@ from simgap.world.properties import random_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
+HOLDING = 0.2  # N
 TURN, TURNED = 1.5e-4, 0.05  # m that a turned block spreads the fingers, N of shear that holds it
 
 
@@ -86,8 +87,19 @@ def trials_of(world: World, numbers: Sequence[int]) -> list[Judged]:
         trial = disturbed(trial, simulated.boundaries, world.cell, simulated.seed)
         if world.untidy == "turned":
             trial = _turned(trial, simulated.boundaries, stated)
-        out.append(Judged(trial, stated, simulated.boundaries))
+        judged = Judged(trial, stated, simulated.boundaries)
+        if world.untidy != "slipping" or _still_held(judged):
+            out.append(judged)
     return out
+
+
+def _still_held(judged: Judged) -> bool:
+    """Whether every block is in the grip as it lands: what slips out of it is a drop, and a misfit."""
+    lands = judged.boundaries[2::4]
+    if not np.isfinite(judged.boundaries).all():
+        return False
+    signals = task_space(judged.trial, judged.rig)
+    return bool((np.interp(lands, signals.t, signals.grip) > HOLDING).all())
 
 
 def _rig(world: World) -> Rig:

@@ -20,7 +20,8 @@ OVER = 4e-4  # m beyond a block's face that a tap commands
 PUSH = 1.5e-3  # m that a push on the ground commands
 STILL = 10.0  # s of holding a block still in the air
 SLOWEST = 0.05  # of the usual pace, amid a hesitation
-LOOSENED = 0.06  # s for which a grip opens amid a carry
+LOOSENED = 0.06  # s for which a grip opens amid a carry, by ...
+SLACK = 0.42  # ... this share of its way: it is lost for 40 ms; from about 0.46 on blocks are dropped
 
 
 def _row(t: float) -> int:
@@ -115,7 +116,7 @@ def slipping(plan: Plan, rng: np.random.Generator) -> Plan:
         way = ((open_[2] - open_[0]) - (held[2] - held[0])) / 2
         n = _row(LOOSENED)
         change = np.zeros((2 * n, 4))
-        loosen = 0.5 * way * np.pad(_pulse(n), (0, n))
+        loosen = SLACK * way * np.pad(_pulse(n), (0, n))
         change[:, 0], change[:, 2] = -loosen, loosen
         plan = _inserted(plan, w.middle, change)
     return plan

@@ -58,7 +58,7 @@ def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
             vx[inside], vy[inside] = noise(2e-3), noise(2e-3)
             y[inside] = LEVELS[s.index] + fy * COMPLIANCE + noise(5e-5)
         force[inside] += np.stack([grip, fy / 2, -grip, fy / 2], axis=1)
-    spans = {"vx": np.ptp(vx), "vy": np.ptp(vy), "y": np.ptp(y), "d": np.ptp(d), "force": 6.0}
+    spans = {"vx": np.ptp(vx), "vy": np.ptp(vy), "y": np.ptp(y), "d": np.ptp(d), "force": 6.0, "press": 6.0}
     noises = {"sd_y": 5e-5, "sd_d": 6e-5, "sd_vx": 2e-3, "sd_vy": 2e-3}
     f = Features(
         t=np.arange(num) * dt, force=force, vx=vx, vy=vy, ay=ay, y=y, d=d,

@@ -90,7 +90,7 @@ class Filter:
         self._best, self._least = np.zeros(5), np.array(LEAST_SPANS)
         self._state = _State(
             np.zeros((rows, width)), 0, np.full((ROWS, HISTORY), np.nan), -1, 0, math.nan, np.zeros(12), 0.0,
-            np.array([[np.inf, -np.inf]] * 4), np.array([*LEAST_SPANS, 1.0]), 0, False,
+            np.array([[np.inf, -np.inf]] * 4), np.array([*LEAST_SPANS, 1.0, 1.0]), 0, False,
         )  # fmt: skip
 
     def _prepare_task(self, task: BlockTask) -> None:
@@ -145,7 +145,7 @@ class Filter:
             s.table[i, at.STATE], s.table[i, at.MISSED] = self.num_steps + i, 0.0
             s.table[i, at.LEFT_AT], s.table[i, at.WEIGHT] = s.last_t, LOG_DEPARTURE - math.log(off)
         s.count, s.started = off, True
-        s.spans[at.SPAN_FORCE] = LEAST_FORCE * noise
+        s.spans[[at.SPAN_FORCE, at.SPAN_PRESS]] = LEAST_FORCE * noise
 
     def take(self, t: float, row: np.ndarray) -> None:
         """One row (12,) in SI units, NaN where missing, at a time after all before.

@@ -34,7 +34,7 @@ FREE_KIND, GROUND_KIND, SLIDING_KIND, ABOVE_KIND = range(4)
 NUM_READ = 20  # chosen
 
 # Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
-SPAN_VX, SPAN_VY, SPAN_Y, SPAN_D, SPAN_FORCE = range(5)
+SPAN_VX, SPAN_VY, SPAN_Y, SPAN_D, SPAN_FORCE, SPAN_PRESS = range(6)
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ def read(history, head, filled, t, dt, row, noise, velocities, x):
 
 @compiled
 def widen(extremes, spans, least, x):
-    """Ranges that the emissions take as possible, so far and not below `least` (5,)."""
+    """Ranges that the emissions take as possible, so far and not below `least` (4,)."""
     for k in range(4):
         value = x[VX] if k == 0 else (x[VY] if k == 1 else (x[Y] if k == 2 else x[D]))
         if not math.isnan(value):
@@ -139,3 +139,5 @@ def widen(extremes, spans, least, x):
     for c in range(4):
         if not math.isnan(x[FX1 + c]):
             spans[4] = max(spans[4], 1.5 * abs(x[FX1 + c]))
+    if not math.isnan(x[FY1] + x[FY2]):
+        spans[5] = max(spans[5], 1.5 * abs(x[FY1] + x[FY2]))

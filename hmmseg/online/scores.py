@@ -43,6 +43,7 @@ from hmmseg.online.layout import (
     SHEAR,
     SPAN_D,
     SPAN_FORCE,
+    SPAN_PRESS,
     SPAN_VX,
     SPAN_VY,
     SPAN_Y,
@@ -224,7 +225,7 @@ def supported(h, kind, block, x, spans, pads, levels):
 
     `levels`: whether the height at which the block rests counts.
     """
-    span, weight = spans[SPAN_FORCE], OBJECTS + 4 * block
+    span, weight = spans[SPAN_PRESS], OBJECTS + 4 * block
     if h[weight + 1] > 0.0:
         most, soft = h[weight] / h[weight + 1], math.sqrt(carry2(h, x) + 1.0 / h[weight + 1])
     else:

@@ -32,6 +32,7 @@ from hmmseg.online.layout import (
 )
 from hmmseg.online.learning import learn
 from hmmseg.online.scores import free, held, lifted, supported
+from hmmseg.segmentation.emissions import LOST
 
 LOG_DEPARTURE = math.log(1e-4)  # chosen: as in hmmseg.segmentation.departure, as are the next four
 BRIEF = 1e-8  # chosen
@@ -257,7 +258,10 @@ def _explained(h, x, chain, spans, pads, gravity, num_blocks):
         else:
             other = lifted(h, block, x, spans, gravity, num_blocks, settled)
         own = log_sum(math.log1p(-ringing) + own, math.log(ringing) + max(own, other))
-    return own + held(h, block, x, spans, pads, num_blocks)
+    own += held(h, block, x, spans, pads, num_blocks)
+    if kind == ABOVE_KIND:  # a grip that slips has lost the block for a moment
+        own = log_sum(math.log1p(-LOST) + own, math.log(LOST) + free(h, x, spans))
+    return own
 
 
 @compiled

@@ -116,7 +116,8 @@ def align(
     of = [v for own in verdicts for v in own]
     fitting = [i for i, verdict in enumerate(of) if insist or verdict.failing is None]
     parameters = of[0].free.parameters
-    pool = pooled(flat, fitting, steps, rig) if fitting else unfitted(flat, parameters, rig)
+    taps = [v.free.taps for v in of]
+    pool = pooled(flat, fitting, steps, rig, taps) if fitting else unfitted(flat, parameters, rig, taps)
     pieces = iter([
         _aligned(reading, steps, pool, fitting.index(i)) if i in set(fitting)
         else _departed(reading, steps, of[i], pool)

@@ -31,6 +31,7 @@ TAIL = 4.0  # cited: degrees of freedom of the Student-t residuals
 STRAY = 0.02  # chosen: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # chosen: share of gripped samples whose distance is not the block's (foam giving late)
 STILL = 0.1  # chosen: prior share of a carry's samples at which the block is held still
+LOST = 1e-3  # chosen: share of a carry's samples at which a grip that slips has lost the block for a moment
 ONE_FINGER = 0.02  # chosen: prior share of free samples at which one finger alone touches
 
 
@@ -41,7 +42,8 @@ class Features:
     `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N]; vx, vy, ay: mean velocity and vertical
     acceleration of the fingers; y: mean height [m]; d: distance of the fingers [m];
     `pads`: their nominal compliances [m/N].
-    `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force [N]).
+    `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force of a
+    finger and press of both downwards [N]).
     """
 
     t: np.ndarray
@@ -191,8 +193,9 @@ def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, st
     broad_v = broad_vx + broad_vy
     broad_y = -np.log(span["y"]) * np.isfinite(f.y)
     broad_d = -np.log(span["d"]) * np.isfinite(f.d)
+    free = _log_ungripped(force, scale["force"], span["force"]) + broad_v + broad_y + broad_d
     if subtask.state == FREE:
-        return _log_ungripped(force, scale["force"], span["force"]) + broad_v + broad_y + broad_d
+        return free
     grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
     fy, shear = force[:, 1] + force[:, 3], (force[:, 1] - force[:, 3]) / 2
     out = _log_between(grip, 0.0, span["force"], scale["force"])
@@ -206,10 +209,11 @@ def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, st
     weight = p.weight[str(subtask.object)]
     if subtask.state == ABOVE_GROUND:
         out += log_student(fy - weight * f.carrying, scale["carry"]) + broad_v + broad_y
-        return out + np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
+        out += np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
+        return np.logaddexp(np.log1p(-LOST) + out, np.log(LOST) + free)
     if subtask.state not in (ON_GROUND, SLIDING):
         raise ValueError(f"no emission for the contact state {subtask.state!r}")
-    out += _log_between(fy, -span["force"], weight, scale["carry"])
+    out += _log_between(fy, -span["press"], weight, scale["carry"])
     level = p.levels[trial].get(subtask.index) if p.levels else None
     aside = None if subtask.state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
     upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), broad_vy

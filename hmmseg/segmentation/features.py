@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from hmmseg.contact.equations import pads_of
@@ -75,6 +78,7 @@ def features(signals: Signals, rig: Rig) -> Features:
         "y": _range(s.y, 1e-4),
         "d": _range(s.distance, 1e-4),
         "force": 1.5 * float(np.nanmax(np.abs(force))) + 1e-3,
+        "press": 1.5 * float(np.max(np.abs(s.fy), initial=0.0, where=np.isfinite(s.fy))) + 1e-3,
     }
     return Features(
         t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y,
@@ -82,6 +86,18 @@ def features(signals: Signals, rig: Rig) -> Features:
         sd_vx=stated(s.sd_vx, s.vx), sd_vy=stated(s.sd_vy, s.vy),
         pads=pads_of(rig), gravity=rig.gravity, span=span,
     )  # fmt: skip
+
+
+def without(f: Features, spans: Sequence[tuple[float, float]]) -> Features:
+    """The features without what was measured in some stretches of time [s]: there they say nothing."""
+    out = np.zeros(f.t.size, bool)
+    for start, end in spans:
+        out |= (f.t >= start) & (f.t <= end)
+    if not out.any():
+        return f
+    force = np.where(out[:, None], np.nan, f.force)
+    blank = {name: np.where(out, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
+    return replace(f, force=force, **blank)
 
 
 def _range(values: np.ndarray, least: float) -> float:

@@ -10,6 +10,7 @@ order forced on a trial that does not have it cannot spoil weights or widths.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,9 @@ APART = 10  # chosen: noise sds of the grip force between free and gripped
 # chosen: m from the heights at a grip's ends (medians of so many samples) to be lifted
 RAISED, ENDS = 3e-3, 3
 ROUNDS = 8  # numerics: of an iteration that settles sooner
+# cited: s; no touch that ends sooner can have been meant to lift: grip forces rise for about as long before a
+# lift as loads do in it, 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
+TAP = 0.2
 IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
 
@@ -53,7 +57,8 @@ class FreeContacts:
     """The fitted alternative: `table` (num_timesteps, num_states) of log-likelihoods of `states`.
 
     Samples are `interval` s apart. A state is (contact state, number of its block in `blocks`; None in
-    free motion); `path` (num_timesteps,) is the most probable sequence of states.
+    free motion); `path` (num_timesteps,) is the most probable sequence of states. `taps` [s] are touches of a
+    block before its grip: to the path they are free motion, in the table they say nothing.
     """
 
     parameters: Parameters
@@ -62,6 +67,7 @@ class FreeContacts:
     table: np.ndarray
     path: np.ndarray
     interval: float
+    taps: tuple[tuple[float, float], ...] = ()
 
     @property
     def num_grips(self) -> int:
@@ -106,7 +112,27 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
             )
             for i, b in enumerate(blocks)
         )
-    return FreeContacts(parameters, blocks, states, table, path, float(np.median(np.diff(f.t))))
+    interval = float(np.median(np.diff(f.t)))
+    tapped = _tapped(states, path, interval)
+    taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
+    for span in tapped:
+        table[span], path[span] = 0.0, 0
+    return FreeContacts(parameters, blocks, states, table, path, interval, taps)
+
+
+def _tapped(states: tuple[tuple[str, int | None], ...], path: np.ndarray, interval: float) -> list[slice]:
+    """Samples of touches too brief for a grip, of a block at rest that is gripped next."""
+    held = np.array([state != FREE for state, _ in states])[path]
+    edges = np.flatnonzero(np.diff(np.r_[False, held, False].astype(int)))
+    grips = [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    out = []
+    for grip, following in itertools.pairwise(grips):
+        touched = {states[k] for k in path[grip]}
+        same = {block for _, block in touched} == {states[path[following.start]][1]}
+        brief = (grip.stop - grip.start) * interval <= TAP and grip.start > 0
+        if brief and same and {state for state, _ in touched} == {ON_GROUND}:
+            out.append(grip)
+    return out
 
 
 def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Parameters) -> np.ndarray:

@@ -13,11 +13,12 @@ from hmmseg.io.rig import Rig
 from hmmseg.segmentation.boundaries import Kind
 from hmmseg.segmentation.changes import Change, Disagreement, disagreements
 from hmmseg.segmentation.emissions import Features, Parameters
-from hmmseg.segmentation.features import WINDOW, features, thin
+from hmmseg.segmentation.features import WINDOW, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import contact_changes
 
+Spans = Sequence[tuple[float, float]]
 LOCAL_RATE = 100.0  # chosen: Hz; contacts are located at up to this rate, at which readings share no noise
 
 
@@ -51,12 +52,16 @@ class Pool:
 
 
 def pooled(
-    recordings: Sequence[Signals], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig
-) -> Pool:
-    """One fit of all that fit; a second one where their forces come late."""
+    recordings: Sequence[Signals], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig,
+    taps: Sequence[Spans],
+) -> Pool:  # fmt: skip
+    """One fit of all that fit; a second one where their forces come late.
+
+    `taps` [s] of each recording are touches that belong to no subtask.
+    """
 
     def once(signals: Sequence[Signals], again: bool) -> tuple[list[Reading], Fit, Sensing]:
-        readings = [_read(s, rig) for s in signals]
+        readings = [_read(s, rig, t) for s, t in zip(signals, taps, strict=True)]
         fitted = fit([readings[i].features for i in fitting], steps)
         fine = [readings[i].fine for i in fitting]
         paths = [(readings[i].thinned.t, a.path) for i, a in zip(fitting, fitted.posteriors, strict=True)]
@@ -77,13 +82,15 @@ def pooled(
     return Pool(readings, fitted, sensing, changes, disagreement, remarks)
 
 
-def unfitted(recordings: Sequence[Signals], parameters: Parameters, rig: Rig) -> Pool:
+def unfitted(recordings: Sequence[Signals], parameters: Parameters, rig: Rig, taps: Sequence[Spans]) -> Pool:
     """Where no trial fits the task: what is known of the sensors, and no alignment."""
-    readings = [_read(s, rig) for s in recordings]
+    readings = [_read(s, rig, t) for s, t in zip(recordings, taps, strict=True)]
     return Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
 
 
-def _read(signals: Signals, rig: Rig) -> Reading:
+def _read(signals: Signals, rig: Rig, taps: Spans) -> Reading:
     thinned = thin(signals, window=WINDOW)
     fine = thin(signals, LOCAL_RATE, WINDOW)
-    return Reading(fine, thinned, features(thinned, rig), (float(signals.t[0]), float(signals.t[-1])))
+    return Reading(
+        fine, thinned, without(features(thinned, rig), taps), (float(signals.t[0]), float(signals.t[-1]))
+    )

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import list_cases, read_case
+from experiments.sweeps.trials import scene
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial, read_trial
@@ -129,6 +131,26 @@ def test_a_bounce_at_touchdown_is_no_drop():
     bounced = let_go(TRIALS[0], TRUTH[0], down, down + 0.05)
     (found,) = segment(bounced)
     assert found.complete
+
+
+@pytest.mark.parametrize("way", ["tapping", "slipping"])
+def test_touches_before_a_grip_and_a_grip_that_slips_are_no_misfit(way):
+    """Nor do they move a boundary by a sample of 50 ms."""
+    _, task = scene()
+    for judged in trials_of(WORLDS[way], [70000, 70001]):
+        (found,) = segmentation.segment([judged.trial], task, judged.rig)
+        assert found.complete
+        starts = np.array([span.start for span in found.spans[1:]])
+        assert np.abs(starts - judged.boundaries).max() < 0.05
+
+
+def test_a_touch_as_long_as_a_grip_is_one():
+    """0.3 s held on the ground and let go is no tap (the edits above); 0.1 s is."""
+    b = TRUTH[0]
+    tap = join(TRIALS[0], (-np.inf, b[0] + 0.1), (b[3], b[3] + 0.4), (b[0] - 0.4, np.inf))
+    (found,) = segment(tap)
+    assert found.complete
+    assert found.spans[1].start == pytest.approx(b[0] + 0.9, abs=0.06)
 
 
 def test_a_longer_recording_than_the_task():

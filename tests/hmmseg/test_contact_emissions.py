@@ -23,7 +23,7 @@ from hmmseg.segmentation.emissions import (
 
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
 SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
-SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0}
+SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0, "press": 6.0}
 PARAMETERS = Parameters(
     bias=np.array([0.02, -0.01, 0.0, 0.03]), weight={"block": 0.4}, width={"block": 0.02},
     scale={"force": 0.01, "carry": 0.02, "net_x": 0.05, "shear": 0.05, "velocity": 0.003,

@@ -17,7 +17,7 @@ from hmmseg.online import scores
 from hmmseg.online.readings import SLOPE, WINDOW
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
-from hmmseg.segmentation.emissions import STILL, Parameters, _log_halting, log_likelihoods
+from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, log_likelihoods
 from hmmseg.segmentation.features import features
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
@@ -64,7 +64,7 @@ def test_emissions_are_those_off_line():
         h[at.SCALES + 2 * which : at.SCALES + 2 * which + 2] = value**2, 1.0
     h[at.OBJECTS : at.OBJECTS + 8] = np.array([0.34, 1, 0.016, 1, 0.44, 1, 0.0254, 1]) * sure
     h[at.LEVEL : at.LEVEL + 2] = 0.05 * sure, sure
-    spans = np.array([f.span[name] for name in ("vx", "vy", "y", "d", "force")])
+    spans = np.array([f.span[name] for name in ("vx", "vy", "y", "d", "force", "press")])
     pads = np.array(f.pads)
     for n in range(0, f.t.size, 3):
         x = np.array([f.t[n], *f.force[n], f.vx[n], f.vy[n], f.ay[n], f.y[n], f.d[n], f.sd_y[n], f.sd_d[n],
@@ -87,6 +87,7 @@ def test_emissions_are_those_off_line():
                 found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
             if step.state == ABOVE_GROUND:
                 found += np.logaddexp(np.log1p(-STILL), np.log(STILL) + more)
+                found = np.logaddexp(np.log1p(-LOST) + found, np.log(LOST) + expected[n, 0])
             np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
 
 
