@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -122,6 +122,10 @@ calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds 
 boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/segmentation_results.md
 	$(BIN)/python -m experiments.calibration_boundaries --trials 8
 	$(BIN)/python -m experiments.table_boundaries
+
+sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL and PANDA: folders; fills docs/sequences.md
+	$(BIN)/python -m experiments.sequences check $(if $(REAL),--real $(REAL)) $(if $(PANDA),--panda $(PANDA))
+	$(BIN)/python -m experiments.write_tables
 
 paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills docs/reproduction.md
 	$(BIN)/python -m experiments.paper

@@ -19,6 +19,7 @@ from experiments import (
     table_blind_check,
     table_calibration,
     table_gap,
+    table_sequences,
     table_speed,
 )
 from experiments.table_misfits import misfits
@@ -180,6 +181,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
     ("docs/benchmarks.md", "solvers", table_speed.solvers, "bench-solvers"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
+    ("docs/sequences.md", "sequences", table_sequences.table, "sequences"),
     ("docs/before_after.md", "before_after", before_after.table, "before-after"),
 )
 

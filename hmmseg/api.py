@@ -90,7 +90,7 @@ def segment(
     """
     order = Task.read(task)
     if isinstance(order, SequenceTask):
-        return segment_sequence(read_trials(trials, task=order), order, model, seed)
+        return segment_sequence(read_trials(trials, task=order), order, model)
     if rig is None:
         raise InputError("rig", "missing", "the nominal hand of a task of blocks")
     return align(trials, order, rig).segmentations
@@ -119,4 +119,4 @@ def fit(
     order = Task.read(task)
     if not isinstance(order, SequenceTask):
         raise InputError("task", "a task of blocks needs no fit", 'sequence = ["approach", ...]')
-    return fit_sequence(read_trials(trials, task=order), order, labels, seed)
+    return fit_sequence(read_trials(trials, task=order), order, labels)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 from pathlib import Path
 from typing import Annotated
 
@@ -21,9 +20,11 @@ from hmmseg_cli.console import (
     distinct_trials,
     read_trials,
 )
+from hmmseg_cli.known import read_labels_given
 
 LabelsOption = Annotated[Path | None, typer.Option(
-    "--labels", metavar="DIR", help="Folder with NAME.json for some or all trials.")]  # fmt: skip
+    "--labels", metavar="FILE|DIR",
+    help="What is known of some boundaries: a folder with NAME.json, or a .csv or .json file.")]  # fmt: skip
 ModelOption = Annotated[Path, typer.Option("--model", metavar="M.npz", help="Where the model is written.")]
 RigFile = Annotated[Path | None, typer.Option(
     "--rig", metavar="R", help="Its [columns] or [topics], if the trials need them.")]  # fmt: skip
@@ -51,28 +52,14 @@ def fit(
             hand = read_rig(rig)
         recordings = read_trials(out, paths, hand, description)
         names = [trial.name for trial in recordings]
-        known = {} if labels is None else read_label_folder(labels, names)
-        learned = fit_sequence(recordings, description, known, seed)
+        known = {} if labels is None else read_labels_given(labels, names)
+        learned = fit_sequence(recordings, description, known)
         save_model(learned, out.stage(model))
         out.print(f"learned {len(description.sequence)} states from {len(recordings)} trials, {len(known)} "
                   f"of them labelled; written to {model}")  # fmt: skip
+        if learned.others:
+            out.warn(
+                f"the trials can be read in {1 + len(learned.others)} ways, the likeliest with probability "
+                f"{learned.readings[0][0]:.2f}; hmmseg segment says where, and which label would decide"
+            )
         out.finish({"model": str(model), "trials": [str(p) for p in paths], "labelled": sorted(known)})
-
-
-def read_label_folder(folder: Path, names: list[str]) -> dict[str, list[float]]:
-    """Boundaries [s] of the trials that have a NAME.json in the folder; InputError for what is amiss."""
-    if not folder.is_dir():
-        raise InputError(f"--labels {folder}", "no such folder", "a folder with NAME.json for trials")
-    paths = {name: folder / f"{Path(name).stem}.json" for name in names}
-    out = {name: _boundaries(path) for name, path in paths.items() if path.exists()}
-    if not out:
-        expected = ", ".join(path.name for path in list(paths.values())[:3])
-        raise InputError(f"--labels {folder}", "has labels for none of the trials", f"files like {expected}")
-    return out
-
-
-def _boundaries(path: Path) -> list[float]:
-    try:
-        return [float(b) for b in jsonlib.loads(path.read_text(encoding="utf-8"))["boundaries"]]
-    except (OSError, ValueError, TypeError, KeyError):
-        raise InputError(str(path), "cannot be read", '{"boundaries": [times in s]}') from None

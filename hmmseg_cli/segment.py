@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,7 +28,7 @@ from hmmseg_cli.labels import WriteOption, check_destination, write_labels
 
 if TYPE_CHECKING:
     from hmmseg.io.trial import Trial
-    from hmmseg.segmentation.spans import Segmentation
+    from hmmseg.segmentation.spans import Question, Segmentation
 
 
 class Method(StrEnum):
@@ -60,7 +61,7 @@ def segment(
         check_destination(write, paths)
         description = read_task(task)
         if isinstance(description, SequenceTask):
-            recordings, found = _segment_sequence(out, paths, description, rig, model, method, seed)
+            recordings, found = _segment_sequence(out, paths, description, rig, model, method)
         else:
             if rig is None:
                 raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
@@ -72,9 +73,11 @@ def segment(
             out.print(spans_table(segmentation))
             warn_of_misfit(out, segmentation)
         warn_of_rig(out, found)
+        question = ask(out, found)
         if write is not None:
             write_labels(out, write, paths, recordings, found)
-        out.finish({"method": method.value, "trials": [s.to_json() for s in found]})
+        asked = {} if question is None else {"question": asdict(question)}
+        out.finish({"method": method.value, "trials": [s.to_json() for s in found]} | asked)
 
 
 def _segment_blocks(
@@ -103,7 +106,7 @@ def _segment_blocks(
 
 
 def _segment_sequence(
-    out: Output, paths, task: SequenceTask, rig_file, model_file, method: Method, seed: int
+    out: Output, paths, task: SequenceTask, rig_file, model_file, method: Method
 ) -> tuple[list[Trial], list[Segmentation]]:
     from hmmseg.io.rig import read_rig
     from hmmseg.sequence.model import load_model
@@ -113,13 +116,27 @@ def _segment_sequence(
         raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
     recordings = read_trials(out, paths, None if rig_file is None else read_rig(rig_file), task)
     learned = None if model_file is None else load_model(model_file, task)
-    found = segment_sequence(recordings, task, learned, seed)
+    found = segment_sequence(recordings, task, learned)
     if out.figures is not None:
         from hmmseg.plot.channels import draw_channels
 
         for trial, segmentation in zip(recordings, found, strict=True):
             draw_channels(trial, segmentation, out.figure(f"{trial.stem}_segments.png"))
     return recordings, found
+
+
+def ask(out: Output, found: Sequence[Segmentation]) -> Question | None:
+    """Say that boundaries may lie elsewhere, and which label would decide most, if so."""
+    from hmmseg.sequence.places import most_telling
+
+    question = most_telling(found)
+    if question is not None:
+        name = Path(question.trial).name
+        out.warn(
+            f"some boundaries could as well be elsewhere; most would be decided by the start of "
+            f"{question.subtask} in {name}, given to hmmseg fit --labels"
+        )
+    return question
 
 
 def warn_of_misfit(out: Output, segmentation: Segmentation) -> None:

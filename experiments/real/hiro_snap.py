@@ -132,7 +132,7 @@ def without_labels(trials: list, kind: Kind, channels: tuple[str, ...], seed: in
     """Learned from the trials themselves."""
     rng = np.random.default_rng(seed)
     data = [cropped(trial, rng.uniform(0, MAX_CROP)) for trial, _ in trials]
-    results = segment_sequence(data, SequenceTask(kind.sequence, channels), seed=seed)
+    results = segment_sequence(data, SequenceTask(kind.sequence, channels))
     return [_scored(result, kind, labels) for result, (_, labels) in zip(results, trials, strict=True)]
 
 

@@ -8,12 +8,33 @@ from typing import Any
 
 
 @dataclass(frozen=True)
+class Place:
+    """A time [s] at which a boundary may lie, and the probability that it lies thereabouts."""
+
+    time: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class Question:
+    """The one boundary of a trial whose label would tell most.
+
+    `subtask`: the one that begins there. `gain`: expected reduction of entropy [nats].
+    """
+
+    trial: str
+    subtask: str
+    gain: float
+
+
+@dataclass(frozen=True)
 class Span:
     """One subtask's half-open interval [start, end) in s.
 
     Start and end are posterior medians and may lie between samples; one span's end is the next
     one's start. `*_sd` are posterior standard deviations [s], `*_90` central 90 % intervals [s]
-    (of width 0 at the recording's own first and last time).
+    (of width 0 at the recording's own first and last time). `alternatives`: all places where the start
+    may lie, this one among them, most probable first; empty where there is but one.
     """
 
     subtask: str
@@ -25,6 +46,14 @@ class Span:
     end_sd: float
     start_90: tuple[float, float]
     end_90: tuple[float, float]
+    alternatives: tuple[Place, ...] = ()
+
+    def to_json(self) -> dict:
+        """The entry of one segment in the JSON of `segment`."""
+        document = asdict(self)
+        if not self.alternatives:
+            del document["alternatives"]
+        return document
 
 
 @dataclass(frozen=True)
@@ -60,7 +89,8 @@ class Segmentation:
     `log_evidence` is None from a method that has no likelihood. Of a repeated task, `repetitions` says
     how often the recording shows it and `failures` holds all rounds that do not fit, `failed` the first.
     `recorded` is what `plot` shows: the signals of a block task's trial, the trial itself of a plain
-    ordered task. `remarks` say what the recording contradicts in the rig, or leaves open.
+    ordered task. `remarks` say what the recording contradicts in the rig, or leaves open. `question`: the
+    label of this trial that would decide most, where its boundaries may lie elsewhere.
     """
 
     file: str
@@ -72,6 +102,7 @@ class Segmentation:
     failures: tuple[Failure, ...] = ()
     recorded: Any = field(default=None, compare=False)
     remarks: tuple[str, ...] = ()
+    question: Question | None = None
 
     @property
     def complete(self) -> bool:
@@ -85,7 +116,7 @@ class Segmentation:
             "rate": self.rate,
             "log_evidence": self.log_evidence,
             "complete": self.complete,
-            "segments": [asdict(span) for span in self.spans],
+            "segments": [span.to_json() for span in self.spans],
         }
         if self.failed is not None:
             document["failed"] = self.failed.to_json()
@@ -98,7 +129,7 @@ class Segmentation:
         """One row a subtask: name, object, state, start and end [s] with their uncertainty."""
         import pandas as pd
 
-        return pd.DataFrame([asdict(span) for span in self.spans])
+        return pd.DataFrame([span.to_json() for span in self.spans])
 
     def __repr__(self) -> str:
         from hmmseg.segmentation.tables import spans_table

@@ -18,11 +18,16 @@ def spans_table(segmentation: Segmentation) -> Table:
     for head, justify in (("subtask", "left"), ("state", "left"), ("start [s]", "right"),
                           ("90 % interval", "left"), ("end [s]", "right")):  # fmt: skip
         table.add_column(head, justify=justify)  # type: ignore[arg-type]
+    elsewhere = any(span.alternatives for span in segmentation.spans)
+    if elsewhere:
+        table.add_column("could as well be at [s]", justify="left")
     for span in segmentation.spans:
         low, high = span.start_90
         interval = f"{low:.3f} to {high:.3f}" if high > low else ""
         name = f"{span.subtask} {span.object or ''}".strip()
-        table.add_row(name, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}")
+        places = ", ".join(f"{p.time:.3f} ({100 * p.probability:.0f} %)" for p in span.alternatives)
+        row = [name, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}"]
+        table.add_row(*row, *[places] * elsewhere)
     return table
 
 

@@ -19,7 +19,8 @@ from hmmseg.sequence.segment import segment_sequence
 class OrderedSegmenter(ClusterMixin, BaseEstimator):
     """States that follow one another in a known order, learned without labels or from some.
 
-    `n_states`: how many, each seen once and in order; `rate` [Hz] of the samples; `random_state`: the seed.
+    `n_states`: how many, each seen once and in order; `rate` [Hz] of the samples; `random_state`: taken and
+    not used, nothing is drawn.
     X is one sequence (num_timesteps, num_channels), or a list of several. After `fit`, `model_` is the
     learned model and `labels_` the states (num_timesteps,) of a single X, 0 to n_states - 1.
     """
@@ -38,8 +39,7 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
         sequences = self._checked(X, reset=True)
         trials = self._trials(sequences)
         labels = {} if y is None or not several else self._boundaries(trials, y)
-        seed = 0 if self.random_state is None else int(self.random_state)
-        self.model_ = fit_sequence(trials, self._order(sequences[0].shape[1]), labels or None, seed)
+        self.model_ = fit_sequence(trials, self._order(sequences[0].shape[1]), labels or None)
         self.labels_ = self.predict(X) if not several else np.concatenate(self.predict(X))
         return self
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,26 @@ from hmmseg.sequence.detectors import Detectors, learn
 from hmmseg.sequence.emissions import from_weights
 from hmmseg.sequence.features import Features
 from hmmseg.sequence.model import combined
+from hmmseg.sequence.readings import forbidding
 from hmmseg.sequence.transitions import Transitions
 
-Labels = Mapping[str, Any]  # a trial's name and its boundaries [s], checked here
+Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
 HALVES = (0.0075, 0.02, 0.05)  # chosen: half a window, as a share of a trial's length
 WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # chosen
 STATE_WEIGHTS = (0.03, 0.2, 1.0)  # chosen
 FORGIVING = 1e-4  # chosen: least probability of a held-out label, so that one odd label does not decide
 
 
-def read_labels(trials: Sequence[Trial], task: SequenceTask,
-                labels: Labels) -> list[np.ndarray | None]:  # fmt: skip
-    """Boundaries [s] of every trial, None where it has none; InputError where labels do not fit."""
-    found = []
+def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
+    """Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown; InputError for misfits."""
+    found, used = [], 0
     for trial in trials:
         given = labels.get(Path(trial.file).stem, labels.get(trial.name))
-        found.append(None if given is None else _checked(given, trial, task))
-    if labels and all(boundaries is None for boundaries in found):
+        used += given is not None
+        found.append(
+            np.full(len(task.sequence) - 1, np.nan) if given is None else _checked(given, trial, task)
+        )
+    if labels and not used:
         raise InputError("labels", f"none is for these trials (there are {', '.join(sorted(labels))})",
                          f"names such as {Path(trials[0].file).stem}")  # fmt: skip
     return found
@@ -41,8 +45,11 @@ def read_labels(trials: Sequence[Trial], task: SequenceTask,
 
 def _checked(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     where = f"labels of {trial.file}"
+    if isinstance(given, Mapping):
+        given = _by_subtask(given, where, task)
     try:
-        boundaries = np.array(given, dtype=float)
+        unknown = np.array([each is None for each in given], bool)
+        boundaries = np.array([np.nan if each is None else each for each in given], dtype=float)
     except (TypeError, ValueError):
         raise InputError(where, f"found {given!r}", "a list of times in s") from None
     expected = len(task.sequence) - 1
@@ -50,22 +57,48 @@ def _checked(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
         raise InputError(
             where, f"has {boundaries.size} boundaries", f"{expected} for {expected + 1} subtasks"
         )
-    if not np.isfinite(boundaries).all():
+    if not np.isfinite(boundaries[~unknown]).all():
         raise InputError(where, "has a boundary that is no number", "times in s")
-    if boundaries.size and (boundaries[0] < trial.t[0] or boundaries[-1] > trial.t[-1]):
-        raise InputError(where, f"has boundaries {boundaries.tolist()}",
+    at = np.flatnonzero(~unknown)
+    if not at.size:
+        raise InputError(where, "has no boundary", "at least one time in s")
+    if boundaries[at[0]] < trial.t[0] or boundaries[at[-1]] > trial.t[-1]:
+        raise InputError(where, f"has boundaries {boundaries[at].tolist()}",
                          f"times between {trial.t[0]:g} and {trial.t[-1]:g} s")  # fmt: skip
-    for k, gap in enumerate(np.diff(boundaries), 1):
-        if gap < 0 or (gap == 0 and task.sequence[k] not in task.optional):
+    for i, k in pairwise(at):
+        gap = boundaries[k] - boundaries[i]
+        skipped = all(name in task.optional for name in task.sequence[i + 1 : k + 1])
+        if gap < 0 or (gap == 0 and not skipped):
             raise InputError(where, f"boundary {k + 1} ({boundaries[k]:g}) does not come after "
-                             f"boundary {k} ({boundaries[k - 1]:g})", "increasing times")  # fmt: skip
+                             f"boundary {i + 1} ({boundaries[i]:g})", "increasing times")  # fmt: skip
     return boundaries
+
+
+def _by_subtask(given: Mapping[str, Any], where: str, task: SequenceTask) -> list[Any]:
+    """{subtask: its start} as a list of boundaries."""
+    names = task.sequence[1:]
+    for name in given:
+        if names.count(name) != 1:
+            raise InputError(where, f"gives the start of {name!r}, which "
+                             + ("comes more than once" if name in names else "has none in this task"),
+                             f"one of {', '.join(names)}, or a list of boundaries")  # fmt: skip
+    return [given.get(name) for name in names]
 
 
 def labelled_path(trial: Features, boundaries: np.ndarray) -> np.ndarray:
     """Path (num_cells,) of subtask numbers; a cell belongs to the subtask of its middle."""
     middle = (trial.edges[1:] + trial.edges[:-1]) / 2
     return np.searchsorted(boundaries, middle, side="right")
+
+
+def shares(trial: Features, boundaries: np.ndarray) -> np.ndarray:
+    """Boundaries [s] as shares of the trial."""
+    return (boundaries - trial.edges[0]) / (trial.edges[-1] - trial.edges[0])
+
+
+def forbidden(trial: Features, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
+    """Log weights (num_cells, num_states) that keep labelled boundaries [s] to a cell; None without any."""
+    return forbidding(len(trial.values), num_states, shares(trial, boundaries), 0.0)
 
 
 def choose_detectors(values: list[np.ndarray], boundaries: list[np.ndarray], edges: list[np.ndarray],

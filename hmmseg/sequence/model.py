@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from hmmseg.sequence.emissions import StudentEmissions
 from hmmseg.sequence.features import FeatureMap, Features
 from hmmseg.sequence.transitions import Transitions, transitions
 
-FORMAT = "hmmseg.sequence-model/1"
+FORMAT = "hmmseg.sequence-model/2"
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class SequenceModel:
     different. `mean_cells`, `presence` (num_states,): mean duration in cells and the probability
     that an optional state occurs. `typical` (num_states,) is the median duration [cells] in the
     trials learned from, `misfit` (2, 2) their median and spread of the two scores of
-    hmmseg.sequence.misfit.
+    hmmseg.sequence.misfit. `others` are further readings of the same trials where no labels decide
+    (hmmseg.sequence.readings), with what is left of probability for this one.
     """
 
     task: SequenceTask
@@ -40,6 +41,13 @@ class SequenceModel:
     detectors: Detectors | None
     typical: np.ndarray
     misfit: np.ndarray
+    others: tuple[Alternative, ...] = ()
+
+    @property
+    def readings(self) -> list[tuple[float, SequenceModel]]:
+        """All readings with their probabilities, this one first."""
+        rest = [(other.probability, other.model) for other in self.others]
+        return [(1.0 - sum(p for p, _ in rest), replace(self, others=())), *rest]
 
     @property
     def transitions(self) -> Transitions:
@@ -56,6 +64,14 @@ class SequenceModel:
         law = self.transitions
         return align_many([p[0] for p in parts], [p[1] for p in parts],
                           log_initial=law.log_initial, log_final=law.log_final)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another way to read the trials that a model was learned from, as a model without others."""
+
+    probability: float
+    model: SequenceModel
 
 
 def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
@@ -85,17 +101,29 @@ def combined(log_likelihoods: np.ndarray, log_ratios: np.ndarray, detectors: Det
 
 def save_model(model: SequenceModel, path: str | Path) -> None:
     """Write a model to an NPZ file."""
-    detectors = {} if model.detectors is None else {
-        f"detectors.{name}": value for name, value in vars(model.detectors).items()}  # fmt: skip
+    parts = _table(model)
+    for i, other in enumerate(model.others):
+        parts |= {f"others.{i}.{key}": value for key, value in _table(other.model).items()}
     with open(path, "wb") as file:
         np.savez(
             file, format=FORMAT, sequence=np.array(model.task.sequence),
             optional=np.array(model.task.optional, dtype=str), channels=np.array(model.mapping.channels),
             step=model.mapping.step, window=model.mapping.window, center=model.mapping.center,
-            scale=model.mapping.scale, loc=model.emissions.loc, spread=model.emissions.scale,
-            temper=model.emissions.temper, mean_cells=model.mean_cells, presence=model.presence,
-            settled=model.settled, typical=model.typical, misfit=model.misfit, **detectors,
+            scale=model.mapping.scale, others=np.array([other.probability for other in model.others]),
+            **parts,
         )  # fmt: skip
+
+
+def _table(model: SequenceModel) -> dict[str, np.ndarray]:
+    """What one reading has of its own."""
+    detectors = {} if model.detectors is None else {
+        f"detectors.{name}": np.asarray(value) for name, value in vars(model.detectors).items()}  # fmt: skip
+    return {
+        "loc": model.emissions.loc, "spread": model.emissions.scale,
+        "temper": np.asarray(model.emissions.temper),
+        "mean_cells": model.mean_cells, "presence": model.presence, "settled": np.asarray(model.settled),
+        "typical": model.typical, "misfit": model.misfit, **detectors,
+    }  # fmt: skip
 
 
 def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
@@ -113,10 +141,23 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
         raise InputError(where, f"has format {found!r}", repr(FORMAT))
     try:
         model = _from_table(table, task)
+        _check(model, table, task, where)
+        others = []
+        for i, probability in enumerate(np.ravel(table["others"])):
+            prefix = f"others.{i}."
+            own = {key.removeprefix(prefix): value for key, value in table.items() if key.startswith(prefix)}
+            shared = {
+                key: table[key]
+                for key in ("sequence", "optional", "channels", "step", "window", "center", "scale")
+            }
+            other = _from_table(shared | own, task)
+            _check(other, shared | own, task, f"{where}, reading {i + 2}")
+            if not 0 <= probability <= 1:
+                raise InputError(where, f"a reading has probability {probability}", "a number from 0 to 1")
+            others.append(Alternative(float(probability), other))
     except KeyError as error:
         raise InputError(where, f"lacks {error.args[0]}", "a complete model") from None
-    _check(model, table, task, where)
-    return model
+    return replace(model, others=tuple(others))
 
 
 def _from_table(table: dict[str, np.ndarray], task: SequenceTask) -> SequenceModel:

@@ -12,27 +12,29 @@ from hmmseg.hmm.alignment import Alignment
 from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.spans import Failure, Place, Question, Segmentation, Span
 from hmmseg.sequence import misfit as sequence_misfit
 from hmmseg.sequence.features import Features, features
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.labels import boundary_probabilities
 from hmmseg.sequence.model import SequenceModel, optional_states
+from hmmseg.sequence.places import gains, mixed, places
 
 SLOPE_DRAW = 0.75  # chosen: standard deviation of a boundary's shift, as a share of a slope's reach
 
 _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interval
 
 
-def segment_sequence(trials: Sequence[Trial], task: SequenceTask, model: SequenceModel | None = None,
-                     seed: int = 0) -> list[Segmentation]:  # fmt: skip
+def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
+                     model: SequenceModel | None = None) -> list[Segmentation]:  # fmt: skip
     """One segmentation a trial; without a model, one is learned from these trials themselves.
 
     A trial that does not follow the task says so in `failed` and keeps its spans. A skipped optional
-    subtask has no span. InputError where trials, task and model do not go together.
+    subtask has no span. Where trials can be read in several ways, spans have `alternatives` and the
+    segmentation a `question`. InputError where trials, task and model do not go together.
     """
     if model is None:
-        model = fit_sequence(trials, task, seed=seed)
+        model = fit_sequence(trials, task)
     elif model.task.sequence != task.sequence:
         raise InputError("model", f"was learned for {list(model.task.sequence)}",
                          f"the task's {list(task.sequence)}")  # fmt: skip
@@ -40,16 +42,29 @@ def segment_sequence(trials: Sequence[Trial], task: SequenceTask, model: Sequenc
 
 
 def _segment(trial: Trial, data: Features, model: SequenceModel) -> Segmentation:
-    try:
-        alignment = model.align([data])[0]
-    except InfeasibleAlignment as error:
-        k = min(error.subtask, len(model.task.sequence) - 1)
-        failed = Failure(k, model.task.sequence[k], None, f"has no samples left: {error.reason}")
-        return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
-    return Segmentation(
-        trial.file, trial.rate, alignment.log_evidence, _spans(trial, data, model, alignment),
-        _failure(data, model, alignment), recorded=trial,
-    )  # fmt: skip
+    names = model.task.sequence
+    readings, probability = [], []
+    for p, reading in model.readings:
+        try:
+            alignment = reading.align([data])[0]
+        except InfeasibleAlignment as error:
+            if readings:
+                continue
+            k = min(error.subtask, len(names) - 1)
+            failed = Failure(k, names[k], None, f"has no samples left: {error.reason}")
+            return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
+        readings.append((alignment, _crossing(reading, alignment)))
+        probability.append(p)
+    first = readings[0][0]
+    crossings = [crossing for _, crossing in readings]
+    weights = np.array(probability) / np.sum(probability)
+    spans = _spans(trial, data, model, first, weights, crossings)
+    question = None
+    if any(span.alternatives for span in spans):
+        gain = gains(weights, crossings)
+        question = Question(trial.file, names[int(gain.argmax()) + 1], float(gain.max()))
+    return Segmentation(trial.file, trial.rate, first.log_evidence, spans, _failure(data, model, first),
+                        recorded=trial, question=question)  # fmt: skip
 
 
 def _failure(data: Features, model: SequenceModel, alignment: Alignment) -> Failure | None:
@@ -63,22 +78,36 @@ def _failure(data: Features, model: SequenceModel, alignment: Alignment) -> Fail
     )  # fmt: skip
 
 
-def _spans(trial: Trial, data: Features, model: SequenceModel, alignment: Alignment) -> tuple[Span, ...]:
+def _crossing(model: SequenceModel, alignment: Alignment) -> np.ndarray:
+    """Probability (num_cells - 1, num_named - 1) that each boundary is at each edge, jitter included."""
+    crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1]
+    for b, jitter in enumerate(_jitter(model)[: crossing.shape[1]]):
+        if jitter > 0:
+            crossing[:, b] = gaussian_filter1d(crossing[:, b], jitter, mode="constant")
+    return crossing
+
+
+def _spans(trial: Trial, data: Features, model: SequenceModel, alignment: Alignment,
+           probability: np.ndarray, crossings: list[np.ndarray]) -> tuple[Span, ...]:  # fmt: skip
+    """Spans where the first reading has them, as uncertain as all readings together."""
     names = model.task.sequence
     visited = _visit_probabilities(alignment)[: len(names)]
     optional = optional_states(model.task, False)
     kept = [k for k in range(len(names)) if not optional[k] or visited[k] >= 0.5]
-    crossing = boundary_probabilities(alignment)
     first, last = float(trial.t[0]), float(trial.t[-1])
+    together = mixed(probability, crossings)
     starts: list[_Boundary] = [(first, 0.0, (first, first))]
-    for b, jitter in enumerate(_jitter(model)):
-        if jitter > 0:
-            crossing[:, b] = gaussian_filter1d(crossing[:, b], jitter, mode="constant")
-    starts += [_boundary(data.edges, crossing[:, k - 1], first, last) for k in kept[1:]]
+    elsewhere: list[tuple[Place, ...]] = [()]
+    for k in kept[1:]:
+        each = [_boundary(data.edges, crossing[:, k - 1], first, last) for crossing in crossings]
+        _, sd, (low, high) = _boundary(data.edges, together[:, k - 1], first, last)
+        median = each[0][0]
+        starts.append((median, sd, (min(low, median), max(high, median))))
+        elsewhere.append(places([b[0] for b in each], [b[2] for b in each], probability.tolist()))
     ends = [*starts[1:], (last, 0.0, (last, last))]
     return tuple(
-        Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2])
-        for k, start, end in zip(kept, starts, ends, strict=True)
+        Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2], others)
+        for k, start, end, others in zip(kept, starts, ends, elsewhere, strict=True)
     )
 
 

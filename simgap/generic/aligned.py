@@ -55,7 +55,7 @@ def align(
         made = [Cut(t, _edges(t, boundaries[t.file], task)) for t in (*real, *sim)]
         return _checked(task.sequence, channels, made[: len(real)], made[len(real) :], ())
     both = [*_standardised(real, channels), *_standardised(sim, channels)] if model is None else [*real, *sim]
-    given = model or fit_sequence(both, SequenceTask(task.sequence, channels, task.optional), seed=seed)
+    given = model or fit_sequence(both, SequenceTask(task.sequence, channels, task.optional))
     found = segment_sequence(both, given.task, given)
     kept = [s for s in found if s.complete]
     seen = tuple(n for k, n in enumerate(task.sequence) if _shown_by_all(kept, task, k))

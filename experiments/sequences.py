@@ -1,0 +1,217 @@
+"""Plain sequences without labels: are places and probabilities honest, and what does one label do?
+
+    python -m experiments.sequences check [--worlds N] [--seed S] [--real FOLDER] [--panda FOLDER]
+    python -m experiments.sequences learn [--worlds N] [--seed S]
+
+`check` segments drawn worlds (experiments/sequence_worlds.py), and published snap assemblies and a simulated
+arm's wrist signals where their folders are given: without labels; with the one boundary that the tool asks
+for; with one labelled trial. Writes experiments/results/sequences.json. `learn` finds what weighs readings
+(hmmseg.sequence.readings.Weighing) by maximum likelihood on other drawn worlds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from experiments.real import hiro_snap
+from experiments.saving import save
+from experiments.sequence_worlds import World, draw
+from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.spans import Segmentation
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.places import most_telling
+from hmmseg.sequence.segment import segment_sequence
+
+OUT = Path(__file__).parent / "results" / "sequences.json"
+WRIST = ("width", "ee_y", "ee_z", "Fx", "Fy", "Fz")
+BINS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95, 1.01)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Trials with true boundaries; `scored`: which of them the truth is known of."""
+
+    name: str
+    group: str
+    world: World
+    scored: tuple[int, ...]
+
+
+def drawn(first: int, count: int) -> list[Case]:
+    """Worlds drawn anew."""
+    cases = []
+    for seed in range(first, first + count):
+        world = draw(seed)
+        cases.append(Case(f"world {seed}", "drawn", world, tuple(range(len(world.task.sequence) - 1))))
+    return cases
+
+
+def snaps(folder: Path) -> list[Case]:
+    """Published snap assemblies, cropped at random."""
+    cases = []
+    for kind, description in hiro_snap.KINDS.items():
+        trials = hiro_snap.read_kind(folder, kind)
+        for heard, channels in (("wrench", hiro_snap.WRENCH), ("wrench and pose", hiro_snap.WRENCH_AND_POSE)):
+            rng = np.random.default_rng(0)
+            cut = [hiro_snap.cropped(trial, rng.uniform(0, hiro_snap.MAX_CROP)) for trial, _ in trials]
+            task = SequenceTask(description.sequence, channels)
+            world = World(task, cut, [np.asarray(labels) for _, labels in trials])
+            scored = tuple(range(len(task.sequence) - 1)[b] for b in description.scored)
+            cases.append(Case(f"{kind}, {heard}", "snap assemblies", world, scored))
+    return cases
+
+
+def wrists(folder: Path) -> list[Case]:
+    """A simulated arm that restacks two blocks, by its gripper's opening, place and wrist forces."""
+    cases = []
+    for each in sorted(folder.glob("wrist_*")):
+        files = sorted(each.glob("wrist_[0-9]*.csv"))
+        labels = [each / "truth" / f"trial_{file.stem[-2:]}.json" for file in files]
+        if not files or not all(path.exists() for path in labels):
+            continue
+        truth = [np.array(json.loads(path.read_text())["boundaries"]) for path in labels]
+        task = SequenceTask(tuple(f"subtask {i}" for i in range(truth[0].size + 1)), WRIST)
+        world = World(task, [Trial.read(file, task=task) for file in files], truth)
+        cases.append(Case(each.name, "arm's wrist", world, tuple(range(truth[0].size))))
+    return cases
+
+
+def answers(case: Case) -> dict:
+    """Scores without labels, with the one label asked for, with one labelled trial."""
+    world = case.world
+    model = fit_sequence(world.trials, world.task)
+    blind = segment_sequence(world.trials, world.task, model)
+    out = {"name": case.name, "group": case.group, "none": score(case, blind), "asked": None}
+    question = most_telling(blind)
+    if question is not None:
+        i = [trial.file for trial in world.trials].index(question.trial)
+        b = world.task.sequence.index(question.subtask) - 1
+        labels = {world.trials[i].name: {question.subtask: float(world.boundaries[i][b])}}
+        model = fit_sequence(world.trials, world.task, labels)
+        told = segment_sequence(world.trials, world.task, model)
+        out["asked"] = score(case, told, without=i)
+        out["gain"] = question.gain
+    labels = {world.trials[0].name: world.boundaries[0].tolist()}
+    taught = segment_sequence(world.trials, world.task, fit_sequence(world.trials, world.task, labels))
+    out["trial"] = score(case, taught, without=0)
+    return out
+
+
+def score(case: Case, found: list[Segmentation], without: int | None = None) -> dict:
+    """Errors as shares of the trial, coverage, and what was said of the places; one entry a boundary.
+
+    `place`: probability of the place given, and whether the truth is nearer to it than to any other (within
+    its 90 % interval's width of 2 % of the trial at least); `listed`: the truth is at some place told.
+    """
+    rows = []
+    for i, (segmentation, trial, truth) in enumerate(
+        zip(found, case.world.trials, case.world.boundaries, strict=True)
+    ):
+        if i == without:
+            continue
+        length = float(trial.t[-1] - trial.t[0])
+        starts = {span.subtask: span for span in segmentation.spans}
+        for b in case.scored:
+            span = starts.get(case.world.task.sequence[b + 1])
+            if span is None:
+                continue
+            told = [(p.time, p.probability) for p in span.alternatives] or [(span.start, 1.0)]
+            near = [abs(time - truth[b]) <= 0.03 * length for time, _ in told]
+            rows.append({
+                "error": (span.start - truth[b]) / length, "seconds": span.start - truth[b],
+                "in_90": bool(span.start_90[0] <= truth[b] <= span.start_90[1]),
+                "width": (span.start_90[1] - span.start_90[0]) / length,
+                "told": [[p, bool(n)] for (_, p), n in zip(told, near, strict=True)],
+            })  # fmt: skip
+    return {"boundaries": rows}
+
+
+def summary(scores: list[dict]) -> dict:
+    """Over all boundaries of some cases."""
+    rows = [row for each in scores for row in each["boundaries"]]
+    if not rows:
+        return {}
+    error = np.abs([row["error"] for row in rows])
+    silent = [row for row in rows if len(row["told"]) == 1]
+    told = np.array([pair for row in rows for pair in row["told"]], dtype=float)
+    reliability = []
+    for low, high in pairwise(BINS):
+        inside = (told[:, 0] >= low) & (told[:, 0] < high)
+        if inside.any():
+            said, true = told[inside].mean(0).tolist()
+            reliability.append({"said": said, "true": true, "count": int(inside.sum())})
+    return {
+        "boundaries": len(rows), "median": float(np.median(error)), "right": float((error <= 0.03).mean()),
+        "coverage_90": float(np.mean([row["in_90"] for row in rows])),
+        "width": float(np.median([row["width"] for row in rows])),
+        "listed": float(np.mean([any(n for _, n in row["told"]) for row in rows])),
+        "sure": len(silent) / len(rows),
+        "sure_right": float(np.mean([abs(row["error"]) <= 0.03 for row in silent])) if silent else None,
+        "reliability": reliability,
+    }  # fmt: skip
+
+
+def check(cases: list[Case]) -> dict:
+    """All cases, printed as they come."""
+    rows = []
+    for case in cases:
+        row = answers(case)
+        rows.append(row)
+        text = [
+            f"{kind} {s['median']:.1%} off, {s['right']:.0%} right, {s['coverage_90']:.0%} held"
+            for kind in ("none", "asked", "trial")
+            if row[kind] is not None and (s := summary([row[kind]]))
+        ]
+        print(f"{case.name}: {'; '.join(text)}", flush=True)
+    groups: dict = {}
+    for group in dict.fromkeys(case.group for case in cases):
+        mine = [row for row in rows if row["group"] == group]
+        groups[group] = {
+            kind: summary([row[kind] for row in mine if row[kind] is not None])
+            for kind in ("none", "asked", "trial")
+        } | {"cases": len(mine), "questions": sum(row["asked"] is not None for row in mine)}
+        open_ = [row for row in mine if row["asked"] is not None]
+        groups[group]["before_asked"] = summary([row["none"] for row in open_])
+    each = [
+        {"name": row["name"], "group": row["group"]}
+        | {kind: summary([row[kind]]) for kind in ("none", "asked", "trial") if row[kind]}
+        for row in rows
+    ]
+    return {"groups": groups, "cases": each}
+
+
+def main() -> None:
+    """Check or learn, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("check", "learn"))
+    parser.add_argument("--worlds", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=50_000)
+    parser.add_argument("--real", type=Path, help="folder of hiro_snap")
+    parser.add_argument("--panda", type=Path, help="folder of a simulated arm's recordings")
+    args = parser.parse_args()
+    if args.what == "learn":
+        from experiments.sequence_weighing import learn
+
+        learn([draw(seed) for seed in range(args.seed + 10_000, args.seed + 10_000 + args.worlds)])
+        return
+    cases = drawn(args.seed, args.worlds)
+    cases += snaps(args.real) if args.real else []
+    cases += wrists(args.panda) if args.panda else []
+    document = check(cases)
+    for group, entry in document["groups"].items():
+        for kind in ("none", "before_asked", "asked", "trial"):
+            values = {k: v for k, v in entry[kind].items() if k != "reliability" and v is not None}
+            print(group, kind, {k: round(float(v), 3) for k, v in values.items()})
+        print([(round(r["said"], 2), round(r["true"], 2), r["count"]) for r in entry["none"]["reliability"]])
+    save(OUT, {"worlds": args.worlds, "seed": args.seed} | document)
+
+
+if __name__ == "__main__":
+    main()
