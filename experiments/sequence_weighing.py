@@ -1,7 +1,8 @@
 """What makes a reading of plain sequences probable: learned by maximum likelihood on drawn worlds.
 
 The density of a true boundary is a mixture over readings of Laplace distributions about where each
-puts it, plus a uniform share for truths that no reading has; the weights are those of hmmseg.sequence.readings.probabilities.
+puts it, plus a uniform share for truths that no reading has; the weights are those of
+hmmseg.sequence.readings.probabilities.
 """
 
 from __future__ import annotations

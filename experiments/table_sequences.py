@@ -34,7 +34,10 @@ def table() -> str | None:
     _draw(found["groups"], FIGURE)
     head = ["cases", "known", "boundaries", "median error", "right", "truth at a listed place",
             "90 % intervals hold", "their width", "one place only", "of these right"]  # fmt: skip
-    note = f"{found['worlds']} drawn worlds. Errors and widths as shares of the trial. The labelled trial is not scored."
+    note = (
+        f"{found['worlds']} drawn worlds. Errors and widths as shares of the trial. "
+        "The labelled trial is not scored."
+    )
     return f"{markdown(head, rows)}\n\n{note}"
 
 

@@ -1,70 +1,137 @@
-"""Segmenting ever longer recordings of a repeated task: processor time and memory against their length.
+"""Segmenting ever longer recordings of a repeated task from disk: time and peak memory against their length.
 
     python -m experiments.benchmarks.long_recordings CASE
 
-CASE holds rig.toml, task.toml and trial_01.csv, which is performed again and again. Each length is a process
-of its own. Writes experiments/results/benchmark_long.json.
+CASE holds rig.toml, task.toml and trial_01.csv, which is performed again and again. Each length and kind of
+file is written piece by piece and segmented by a process of its own, whose peak memory includes Python and
+all libraries; up to a length that memory allows, the same in one piece, with the answers compared. Writes
+experiments/results/benchmark_long.json.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import resource
 import subprocess
 import sys
+import tempfile
 import time
+import zipfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from experiments.saving import save
+from hmmseg.io.formats import kind_of, rows_of
+from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.align import segment
+from hmmseg.segmentation.align import segment, segment_long
+from hmmseg.segmentation.spans import Segmentation
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_long.json"
-ROUNDS = (1, 10, 100)
+ROUNDS = (1, 10, 100, 360, 1000)  # an hour of 10 s rounds among them
+IN_MEMORY = 100  # numerics: rounds up to which the same is done in one piece
 
 
-def measure(case: Path, rounds: int) -> dict:
-    """One recording of so many rounds, segmented after one of a single round has loaded everything."""
-    rig, task = Rig.read(case / "rig.toml"), Task.read(case / "task.toml")
+def performed(case: Path) -> tuple[BlockTask, Rig]:
+    """The case's task, as often as it is seen, and its rig."""
+    task = Task.read(case / "task.toml")
     assert isinstance(task, BlockTask)
-    task = replace(task, repeat="unknown")
+    return replace(task, repeat="unknown"), Rig.read(case / "rig.toml")
+
+
+def rounds_of(case: Path, rig: Rig, rounds: int) -> Iterator[dict[str, np.ndarray]]:
+    """Columns of each round in turn."""
     trial = Trial.read(case / "trial_01.csv", rig)
-    segment([trial], task, rig)
     length = trial.t[-1] - trial.t[0] + float(np.median(np.diff(trial.t)))
-    t = np.concatenate([trial.t + k * length for k in range(rounds)])
-    channels = {name: np.tile(values, rounds) for name, values in trial.channels.items()}
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    began = time.process_time()
-    found = segment([Trial("long", t, channels)], task, rig)[0]
+    for k in range(rounds):
+        yield {"t": trial.t + k * length} | trial.channels
+
+
+def write(case: Path, rig: Rig, rounds: int, path: Path) -> None:
+    """A recording of so many rounds as Parquet or NPZ."""
+    if path.suffix == ".parquet":
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        pieces = rounds_of(case, rig, rounds)
+        first = pa.table(next(pieces))
+        with pq.ParquetWriter(path, first.schema) as file:
+            file.write_table(first)
+            for columns in pieces:
+                file.write_table(pa.table(columns))
+        return
+    names = list(next(rounds_of(case, rig, 1)))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for name in names:  # a column at a time, as numpy.savez has them
+            column = np.concatenate([columns[name] for columns in rounds_of(case, rig, rounds)])
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, column)
+
+
+def measure(case: Path, path: Path, in_memory: bool) -> dict:
+    """One recording segmented; what was found, time and peak memory of this process."""
+    task, rig = performed(case)
+    began, worked = time.perf_counter(), time.process_time()
+    if in_memory:
+        found = segment([Trial.read(path, rig)], task, rig)[0]
+    else:
+        found = segment_long(LongRecording(path, rig), task, rig)
     return {
-        "rows": t.size, "seconds": float(t[-1] - t[0]), "processor": time.process_time() - began,
-        "memory_mb": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
-        "rounds": rounds, "found": found.repetitions, "failed": len(found.failures),
+        "wall": time.perf_counter() - began, "processor": time.process_time() - worked,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "found": found.repetitions, "failed": len(found.failures), "answer": _digest(found),
     }  # fmt: skip
+
+
+def _digest(found: Segmentation) -> str:
+    entry = found.to_json() | {"file": ""}
+    return hashlib.sha256(json.dumps(entry, sort_keys=True).encode()).hexdigest()
 
 
 def main() -> None:
     """Measure every length, print, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", type=Path)
-    parser.add_argument("--rounds", type=int, help="this length alone, as JSON")
+    parser.add_argument("--file", type=Path, help="measure this recording alone, as JSON")
+    parser.add_argument("--in-memory", action="store_true")
+    parser.add_argument("--rounds", type=int, nargs="+", default=ROUNDS)
     args = parser.parse_args()
-    if args.rounds is not None:
-        print(json.dumps(measure(args.case, args.rounds)))
+    if args.file is not None:
+        print(json.dumps(measure(args.case, args.file, args.in_memory)))
         return
     rows = []
-    for rounds in ROUNDS:
-        command = [sys.executable, "-m", "experiments.benchmarks.long_recordings", str(args.case)]
-        done = subprocess.run([*command, "--rounds", str(rounds)], check=True, capture_output=True, text=True)
-        rows.append(json.loads(done.stdout))
-        print(rows[-1], flush=True)
+    _, rig = performed(args.case)
+    with tempfile.TemporaryDirectory() as folder:
+        for rounds in args.rounds:
+            for kind in (".parquet", ".npz"):
+                path = Path(folder) / f"long{kind}"
+                write(args.case, rig, rounds, path)
+                row = _row(args.case, path, rounds, False)
+                if rounds <= IN_MEMORY and kind == ".parquet":
+                    whole = _row(args.case, path, rounds, True)
+                    row["same_answer"] = whole.pop("answer") == row["answer"]
+                    rows.append(whole)
+                    print(whole, flush=True)
+                del row["answer"]
+                rows.append(row)
+                print(row, flush=True)
+                path.unlink()
     save(OUT, {"lengths": rows})
+
+
+def _row(case: Path, path: Path, rounds: int, in_memory: bool) -> dict:
+    command = [sys.executable, "-m", "experiments.benchmarks.long_recordings", str(case), "--file", str(path)]
+    done = subprocess.run(command + ["--in-memory"] * in_memory, check=True, capture_output=True, text=True)
+    count = rows_of(path, kind_of(path))
+    kind = "in one piece" if in_memory else {".parquet": "Parquet", ".npz": "NPZ"}[path.suffix]
+    return {"rows": count, "rounds": rounds, "from": kind} | json.loads(done.stdout)
 
 
 if __name__ == "__main__":

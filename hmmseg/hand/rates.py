@@ -22,12 +22,20 @@ ALIKE = 0.1
 
 def timely(signals: Signals, trial: Trial, rig: Rig) -> Signals:
     """The signals with central differences for velocities that are late differences of positions."""
+    return differenced(signals) if come_late(trial, rig) else signals
+
+
+def come_late(trial: Trial, rig: Rig) -> bool:
+    """Whether a trial's velocities are late differences of its positions."""
     names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
     rates = [f"d{n}" if rig.jointed else f"v{n}" for n in names]
     pairs = [(trial.channels[n], trial.channels[r]) for n, r in zip(names, rates, strict=True)
              if r in trial.channels]  # fmt: skip
-    if not pairs or not all(late_differences(trial.t, *pair) for pair in pairs):
-        return signals
+    return bool(pairs) and all(late_differences(trial.t, *pair) for pair in pairs)
+
+
+def differenced(signals: Signals) -> Signals:
+    """The signals with central differences of positions for velocities."""
     made = {}
     for axis in "xy":
         for i in (1, 2):

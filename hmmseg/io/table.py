@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,12 @@ def plain_table(file: str, columns: dict[str, np.ndarray], names: Sequence[str] 
         raise InputError(f"{file}: column {odd}", f"has {lengths[odd]} rows", f"{usual} as in the others")
     count = next(iter(lengths.values()), 0)
     return Table(file, tuple(names if names is not None else columns), columns, np.arange(1, count + 1))
+
+
+def appended(table: Table, more: Table) -> Table:
+    """A table with the rows of another, of the same columns, after its own."""
+    columns = {name: np.concatenate([values, more.columns[name]]) for name, values in table.columns.items()}
+    return replace(table, columns=columns, rows=np.concatenate([table.rows, more.rows]))
 
 
 def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

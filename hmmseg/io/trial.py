@@ -93,7 +93,7 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     """
     if task is None and rig is None:
         raise ValueError("a block task's trial needs its rig")
-    names, _ = _channels(rig, task)
+    names, _ = channels_of(rig, task)
     log = isinstance(source, str | Path) and kind_of(split_part(source)[0]) in LOGS
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if log else rig.columns)
     theirs = None if names is None else [source_of(name, columns) for name in ("t", *names)]
@@ -113,9 +113,12 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     return replace(trial, warnings=warnings)
 
 
-def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
-    """Trial from a table as it was read, whether or not it can be; InputError as `read_trial`."""
-    names, optional = _channels(rig, task)
+def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:
+    """Trial from a table as it was read, whether or not it can be; InputError as `read_trial`.
+
+    `whole`: all of a recording, whose channels must have some values.
+    """
+    names, optional = channels_of(rig, task)
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
     _check_names(table, columns, names, optional, task is not None)
     stamps, origin = times(table, source_of("t", columns))
@@ -129,7 +132,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
         values = _mapped(numbers(table, theirs_name), name, columns, table)
         if task is None:
             _check_size(values, theirs_name, table)
-        if np.isfinite(values).any():
+        if not whole or np.isfinite(values).any():
             channels[name] = values
         elif name not in optional:  # an optional one without values is as good as absent
             raise InputError(f"{table.file}: column {theirs_name}", "has no values", "at least one number")
@@ -149,7 +152,7 @@ def _check_size(values: np.ndarray, name: str, table: Table) -> None:
                          f"at most {LARGEST:.0g} in SI units")  # fmt: skip
 
 
-def _channels(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
+def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
     """Channels of the hand or the task (None: all there are), and which of them may be absent."""
     if task is not None:
         return task.channels, ()

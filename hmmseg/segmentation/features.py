@@ -26,14 +26,22 @@ def noise_sd(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(6.0)) if bend.size else np.nan
 
 
-def thin(signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf) -> Signals:
+def group_size(rate: float, max_rate: float) -> int:
+    """How many samples at `rate` [Hz] become one at no more than `max_rate`."""
+    return int(np.ceil(rate / max_rate - 1e-6))
+
+
+def thin(
+    signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf, rate: float | None = None
+) -> Signals:
     """Signals read at a rate of at most `max_rate` [Hz], each reading a mean over up to `window` s.
 
     White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing.
-    A short window keeps what changes within a reading apart.
+    A short window keeps what changes within a reading apart. `rate` [Hz]: of the recording that the signals
+    are a piece of; their own median otherwise.
     """
-    rate = 1.0 / np.median(np.diff(signals.t))
-    group = int(np.ceil(rate / max_rate - 1e-6))
+    rate = float(1.0 / np.median(np.diff(signals.t))) if rate is None else rate
+    group = group_size(rate, max_rate)
     if group <= 1:
         return signals
     width = int(np.clip(min(window, 1.0) * rate, 1, group))

@@ -64,11 +64,12 @@ def pooled(
         readings = [_read(s, rig, t) for s, t in zip(signals, taps, strict=True)]
         fitted = fit([readings[i].features for i in fitting], steps)
         fine = [readings[i].fine for i in fitting]
+        # Forces of a wrist's fingers show no pads of their own.
+        again = again or any(r.fine.touches for r in readings)
         paths = [(readings[i].thinned.t, a.path) for i, a in zip(fitting, fitted.posteriors, strict=True)]
         return readings, fitted, sense(fine, paths, steps, fitted.parameters, rig, again)
 
-    made_up = any(s.touches for s in recordings)  # forces of a wrist's fingers show no pads of their own
-    readings, fitted, sensing = once(recordings, again=made_up)
+    readings, fitted, sensing = once(recordings, again=False)
     remarks = sensing.remarks(rig)
     if sensing.late:
         readings, fitted, again = once([read_again(s, sensing) for s in recordings], again=True)

@@ -49,9 +49,11 @@ def cut(f: Features, task: BlockTask) -> list[float]:
     steps = subtasks(one_round(task))
     names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
     leave = min(0.5, max(4 * free.num_grips + 1, len(steps)) / len(f.t))
-    models = [_closed(free, steps, assignment, leave) for assignment in assignments(free, names)]
-    glances = [log_evidence(table[:GLANCE], *model) for table, model in models] if len(models) > 1 else [0.0]
-    table, model = models[int(np.argmax(glances))]
+    tried = assignments(free, names)
+    if len(tried) > 1:  # only the best one's table is made for the whole of a recording that may be long
+        glance = replace(free, table=free.table[:GLANCE])
+        tried = [max(tried, key=lambda each: _glanced(glance, steps, each, leave))]
+    table, model = _closed(free, steps, tried[0], leave)
     num_states = len(steps) + len(free.states)
     path = most_probable(table, *model) % num_states
     states = np.array([s.state for s in steps] + [state for state, _ in free.states])
@@ -65,6 +67,13 @@ def cut(f: Features, task: BlockTask) -> list[float]:
         before = held[-1] + 1 if held.size else 0  # the first sample of the free motion before the round
         cuts.append(float(f.t[(before + begin) // 2]))
     return cuts
+
+
+def _glanced(
+    free: FreeContacts, steps: Sequence[Subtask], assignment: dict[str, int | None], leave: float
+) -> float:
+    table, model = _closed(free, steps, assignment, leave)
+    return log_evidence(table, *model)
 
 
 def _closed(

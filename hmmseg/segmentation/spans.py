@@ -34,7 +34,7 @@ class Span:
     Start and end are posterior medians and may lie between samples; one span's end is the next
     one's start. `*_sd` are posterior standard deviations [s], `*_90` central 90 % intervals [s]
     (of width 0 at the recording's own first and last time). `alternatives`: all places where the start
-    may lie, this one among them, most probable first; empty where there is but one.
+    may lie, most probable first; empty where there is but one.
     """
 
     subtask: str

@@ -30,6 +30,12 @@ FORGIVING = 1e-4  # chosen: least probability of a held-out label, so that one o
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
     """Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown; InputError for misfits."""
+    stems = [Path(trial.file).stem for trial in trials]
+    for name in labels:
+        if stems.count(Path(name).stem) > 1:
+            raise InputError(
+                "labels", f"{name} names {stems.count(Path(name).stem)} trials", "one of each name"
+            )
     found, used = [], 0
     for trial in trials:
         given = labels.get(Path(trial.file).stem, labels.get(trial.name))

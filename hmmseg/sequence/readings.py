@@ -14,7 +14,7 @@ not grow with their number. It is that of a coarsened posterior (Miller and Duns
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,8 +27,6 @@ START_FLOORS = (0.1, 0.4)  # numerics: of the partitions of single trials from w
 TEACHERS = 4  # numerics: trials whose partition is a start for all trials
 MOST = 24  # numerics: readings that are learned, with and without a settled state
 SAME = 0.01  # chosen: of a trial: readings whose boundaries are as close are one
-# learned: by `experiments.sequences learn`: least spread of a state when readings are compared
-PHASES = 0.4
 MERGE_FLOOR = 0.1  # numerics: least scale of a merged stretch
 LEAST_SHARE = 1e-3  # numerics: of a trial, for a duration's logarithm
 NEAR = 0.02  # chosen: of a trial: how far from what the channels show a label may be
@@ -50,9 +48,9 @@ class Weighing:
 
 
 WEIGHING = Weighing(
-    independent=50.0,  # learned: by `make sequences`
-    settled=-2.0,  # learned: by `make sequences`
-    shares=0.9,  # learned: by `make sequences`
+    independent=23.8,  # learned: by `experiments.sequences learn --worlds 45`
+    settled=-0.58,  # learned: by `experiments.sequences learn --worlds 45`
+    shares=0.22,  # learned: by `experiments.sequences learn --worlds 45`
 )
 
 
@@ -137,10 +135,7 @@ def _learned(learner: Learner, start: Sequence[np.ndarray], settled: bool, named
              labels: Sequence[np.ndarray]) -> Reading:  # fmt: skip
     # While learning, a cell counts as one observation.
     features = learner.stacked.shape[1]
-    emissions, probability, _ = learner.run(learner.one_hot(start), 1 / features, FLOORS[2:], steps=3)
-    # Phases of its own may spread a state's features by so much; to be narrower is no evidence.
-    blunt = replace(emissions, scale=np.maximum(emissions.scale, PHASES))
-    evidence = sum(a.log_evidence for a in learner.align(blunt, probability))
+    emissions, probability, evidence = learner.run(learner.one_hot(start), 1 / features, FLOORS[2:], steps=3)
     ends = np.array([p[:, : named - 1].sum(0).cumsum() / len(p) for p in probability])
     agreement = 0.0
     if any(np.isfinite(known).any() for known in labels):

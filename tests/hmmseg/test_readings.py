@@ -19,7 +19,7 @@ from hmmseg.sequence.segment import segment_sequence
 TASK = SequenceTask(("wait", "push", "pull"))
 
 
-def ambiguous(count=5, events=(2.0, 4.0, 6.5), levels=(0.0, 3.0, 6.0, 9.0), seed=0):
+def ambiguous(count=5, events=(2.0, 4.0, 6.5), levels=(0.0, 3.0, 6.0, 9.0), noise=0.3, seed=0):
     """Trials with three like changes, of which a task of three states names two."""
     rng = np.random.default_rng(seed)
     trials, truth = [], []
@@ -28,7 +28,7 @@ def ambiguous(count=5, events=(2.0, 4.0, 6.5), levels=(0.0, 3.0, 6.0, 9.0), seed
         cuts.sort()
         t = np.arange(0, 9.0, 0.02)
         level = np.array(levels)[np.searchsorted(cuts, t, side="right")]
-        values = level[:, None] + 0.3 * rng.normal(size=(t.size, 2))
+        values = level[:, None] + noise * rng.normal(size=(t.size, 2))
         trials.append(Trial(f"trial_{i}.csv", t, {"a": values[:, 0], "b": -values[:, 1]}))
         truth.append(cuts)
     return trials, np.array(truth)
@@ -86,13 +86,15 @@ def test_mixture_and_gain_against_enumeration_of_readings_and_paths():
 
 
 def test_places_are_those_of_overlapping_readings():
-    found = places([2.0, 2.1, 5.0, 8.0], [(1.9, 2.15), (2.0, 2.2), (4.9, 5.1), (7, 9)], [0.3, 0.2, 0.46, 0.04])
+    found = places(
+        [2.0, 2.1, 5.0, 8.0], [(1.9, 2.15), (2.0, 2.2), (4.9, 5.1), (7, 9)], [0.3, 0.2, 0.46, 0.04]
+    )
     assert [(p.time, pytest.approx(p.probability)) for p in found] == [(2.0, 0.5), (5.0, 0.46)]
     assert places([2.0, 5.0], [(1.9, 2.1), (4.9, 5.1)], [0.97, 0.03]) == ()
 
 
 def test_what_cannot_be_known_is_told_with_the_label_that_would_decide():
-    trials, truth = ambiguous()
+    trials, truth = ambiguous(noise=2.0)
     found = segment_sequence(trials, TASK)
     for segmentation, cuts in zip(found, truth, strict=True):
         _, push, pull = segmentation.spans
@@ -100,7 +102,7 @@ def test_what_cannot_be_known_is_told_with_the_label_that_would_decide():
         for span, possible in ((push, cuts[:2]), (pull, cuts[1:])):
             told = [place.time for place in span.alternatives] or [span.start]
             for true in possible:
-                assert min(abs(np.array(told) - true)) < 0.15, (span, true)
+                assert min(abs(np.array(told) - true)) < 0.5, (span, true)
             if span.alternatives:
                 assert 0.5 < sum(place.probability for place in span.alternatives) <= 1 + 1e-9
     question = most_telling(found)
@@ -117,10 +119,10 @@ def test_labels_of_one_trial_decide(named):
     trials, truth = ambiguous()
     labels = {"trial_2": truth[2, list(named)].tolist()}
     model = fit_sequence(trials, TASK, labels)
-    assert model.readings[0][0] > 0.9
     for segmentation, cuts in zip(segment_sequence(trials, TASK, model), truth, strict=True):
         starts = [span.start for span in segmentation.spans[1:]]
         np.testing.assert_allclose(starts, cuts[list(named)], atol=0.1)
+        assert not any(span.alternatives for span in segmentation.spans)
 
 
 @pytest.mark.parametrize("form", ["list", "name"])
@@ -136,7 +138,7 @@ def test_one_boundary_decides_where_it_lies(form):
 
 
 def test_readings_are_saved(tmp_path):
-    trials, _ = ambiguous()
+    trials, _ = ambiguous(noise=2.0)
     model = fit_sequence(trials, TASK)
     assert model.others
     assert sum(p for p, _ in model.readings) == pytest.approx(1)

@@ -8,7 +8,7 @@ after a `#`: `demos.hdf5#demo_3`.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -71,6 +71,34 @@ def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
         raise InputError(
             str(path), f"cannot be read ({_told(error)})", "a table with a header row"
         ) from error
+
+
+def rows_of(path: Path, kind: str) -> int | None:
+    """Rows of a file that can be read in pieces; None of any other."""
+    module = _module(kind, path)
+    return module.num_rows(path) if hasattr(module, "read_pieces") else None
+
+
+def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) -> Iterator[Table]:
+    """Tables of about `rows` rows each, in order, none of fewer than `least`; InputError as `read_table`."""
+    from hmmseg.io.table import appended
+
+    file, _ = split_part(path)
+    waiting: Table | None = None
+    try:
+        for piece in _module(kind_of(file), path).read_pieces(file, wanted, rows):
+            if waiting is not None and len(piece.rows) < least:
+                waiting = appended(waiting, piece)
+                continue
+            if waiting is not None:
+                yield waiting
+            waiting = piece
+    except InputError:
+        raise
+    except Exception as error:  # parsers of hostile files raise anything
+        raise InputError(str(path), f"cannot be read ({_told(error)})") from error
+    if waiting is not None:
+        yield waiting
 
 
 def parts_of(path: str | Path) -> list[str]:

@@ -29,9 +29,15 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     return plain_table(str(path), columns, [*columns, *rest])
 
 
+def num_rows(path: Path) -> int:
+    """Rows of a file."""
+    with pq.ParquetFile(path) as file:
+        return file.metadata.num_rows
+
+
 def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
     """Tables of at most `rows` rows each, in order: a long file in bounded memory."""
-    with pq.ParquetFile(path) as file:
+    with pq.ParquetFile(path, pre_buffer=False) as file:  # which would hold all of the file
         names, first = file.schema_arrow.names, 1
         for batch in file.iter_batches(batch_size=rows, columns=_chosen(names, wanted)):
             columns = to_columns(pa.Table.from_batches([batch]))
