@@ -189,7 +189,7 @@ def check(cases: list[Case]) -> dict:
 
 def main() -> None:
     """Check or learn, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=("check", "learn"))
     parser.add_argument("--worlds", type=int, default=60)
     parser.add_argument("--seed", type=int, default=50_000)

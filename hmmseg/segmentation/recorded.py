@@ -88,7 +88,7 @@ class OnDisk:
             else value
             for name, value in vars(pieces[0]).items()
         }
-        return Signals(**joined)
+        return Signals(**joined)  # type: ignore[arg-type]
 
 
 class Parts(Sequence[Signals]):

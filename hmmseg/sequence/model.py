@@ -110,7 +110,7 @@ def save_model(model: SequenceModel, path: str | Path) -> None:
             optional=np.array(model.task.optional, dtype=str), channels=np.array(model.mapping.channels),
             step=model.mapping.step, window=model.mapping.window, center=model.mapping.center,
             scale=model.mapping.scale, others=np.array([other.probability for other in model.others]),
-            **parts,
+            **parts,  # type: ignore[arg-type]
         )  # fmt: skip
 
 
