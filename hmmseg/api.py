@@ -99,12 +99,13 @@ def segment(
 def fit(
     trials: Source | Sequence[Source],
     task: Source,
-    labels: Mapping[str, Sequence[float]] | None = None,
+    labels: Mapping[str, Sequence[float | None] | Mapping[str, float]] | None = None,
     seed: int = 0,
 ) -> SequenceModel:
     """Emissions and durations of a plain ordered task, from labels of some trials or none.
 
-    `labels`: boundaries [s] by the trial's name. InputError for input at fault.
+    `labels`: by the trial's name boundaries [s], None where unknown, or {subtask: its start}. `seed` is not
+    used, as nothing is drawn. InputError for input at fault.
 
     >>> import numpy as np
     >>> from hmmseg import fit, segment
