@@ -85,7 +85,8 @@ def measure(case: Path, path: Path, in_memory: bool) -> dict:
     return {
         "wall": time.perf_counter() - began, "processor": time.process_time() - worked,
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "found": found.repetitions, "failed": len(found.failures), "answer": [span.start for span in found.spans],
+        "found": found.repetitions, "failed": len(found.failures),
+        "answer": [span.start for span in found.spans],
     }  # fmt: skip
 
 
