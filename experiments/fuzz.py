@@ -1,6 +1,6 @@
 """Hostile input to every reader and command, in process: one line of InputError, or a result; nothing else.
 
-    python -m experiments.fuzz [--cases 100000] [--seed 0] [--keep FOLDER]
+    python -m experiments.fuzz [--cases 100000] [--seed 0] [--commands 0.02] [--keep FOLDER]
 
 A case takes a good file, damages it (cut, lines shuffled or doubled, bytes flipped, cells that are no
 numbers or beyond all reason, deep nesting, keys unknown or of another type), and reads it as users would.
@@ -16,11 +16,13 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
 import traceback
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,7 @@ from experiments.fuzz_scene import Scene
 from hmmseg.errors import InputError
 
 HAND = ("--task", "task.toml", "--rig", "rig.toml")
+LAB = ("--task", "lab-task.toml", "--rig", "lab-rig.toml")  # of recordings that fit their task
 COMMANDS: dict[str, list[list[str]]] = {
     "task.toml": [["decompose", "@"], ["segment", "trial.csv", "--task", "@", "--rig", "rig.toml"]],
     "sequence.toml": [["decompose", "@"], ["fit", "trial.csv", "--task", "@", "--model", "m.npz"]],
@@ -40,7 +43,18 @@ COMMANDS: dict[str, list[list[str]]] = {
                   ["identify", "@", *HAND, "--method", "paper"]],
     "semicolons.csv": [["inspect", "@", "--write", "new.toml"]],
     "actual.toml": [["identify", "trial.csv", *HAND, "--method", "paper", "--actual", "@"]],
+    "properties.json": [["simulate", *LAB, "--properties", "@", "--output", "made"]],
+    "model.npz": [["segment", "trial.csv", "--task", "sequence.toml", "--model", "@"]],
+    "lab.csv": [["watch", *LAB], ["watch", *LAB, "--skip-bad-rows"], ["segment", "@", *LAB],
+                ["identify", "@", *LAB], ["simulate", *LAB, "--replay", "@", "--output", "made"]],
+    "lab-rig.toml": [["watch", "--task", "lab-task.toml", "--rig", "@"],
+                     ["identify", "lab.csv", "--task", "lab-task.toml", "--rig", "@"],
+                     ["diagnose", "lab.csv", "--task", "lab-task.toml", "--rig", "@"]],
+    "lab-task.toml": [["identify", "lab.csv", "--task", "@", "--rig", "lab-rig.toml"],
+                      ["simulate", "--task", "@", "--rig", "lab-rig.toml", "--output", "made"],
+                      ["watch", "--task", "@", "--rig", "lab-rig.toml"]],
 }  # fmt: skip
+STREAM = "lab.csv"  # what `watch` reads where its input is not the damaged file
 
 
 def one_case(scene: Scene, name: str, data: bytes, command: list[str] | None) -> str:
@@ -67,11 +81,13 @@ def _command(scene: Scene, path: Path, command: list[str]) -> str:
 
     before = set(os.listdir(scene.folder))
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    stream = path if command[0] == "watch" and "@" not in command else scene.folder / STREAM
+    with _standard_input(stream), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         arguments = [path.name if part == "@" else part for part in command]
         code = main([*arguments, "--json", "result.json"])
     new = set(os.listdir(scene.folder)) - before
     if code == 2:
+        assert "Traceback" not in err.getvalue()
         assert not new, f"exit 2 wrote {sorted(new)}"
         line = err.getvalue().strip().split("\n")[-1]
         assert line, "exit 2 without a line"
@@ -79,8 +95,21 @@ def _command(scene: Scene, path: Path, command: list[str]) -> str:
         assert code == 0, f"exit {code}"
         json.loads((scene.folder / "result.json").read_text(), parse_constant=lambda c: _refuse(c))
     for made in new:
-        (scene.folder / made).unlink()
+        each = scene.folder / made
+        shutil.rmtree(each) if each.is_dir() else each.unlink()
     return f"exit {code}"
+
+
+@contextlib.contextmanager
+def _standard_input(path: Path) -> Iterator[None]:
+    """A file in the place of standard input."""
+    usual = sys.stdin
+    with path.open("rb") as file:
+        sys.stdin = io.TextIOWrapper(io.BytesIO(file.read()))
+    try:
+        yield
+    finally:
+        sys.stdin = usual
 
 
 def _refuse(constant: str) -> None:
@@ -145,10 +174,13 @@ def main() -> int:
     )
     parser.add_argument("--cases", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--commands", type=float, default=0.02, help="share of cases that go through a command"
+    )
     parser.add_argument("--keep", type=Path, help="folder for the files of cases that failed")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    found = run(given.cases, given.seed, given.keep)
+    found = run(given.cases, given.seed, given.keep, given.commands)
     if given.json is not None:
         given.json.write_text(json.dumps(found, indent=1) + "\n")
     print(f"{found['cases']} cases: {found['outcomes']}, {len(found['failures'])} failures")

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 from pathlib import Path
 
 import numpy as np
+
+from hmmseg.io.task import BlockTask, SequenceTask
 
 
 class Scene:
@@ -34,11 +37,18 @@ class Scene:
             "rig.toml": RIG, "gripper.toml": GRIPPER, "task.toml": TASK, "sequence.toml": SEQUENCE,
             "actual.toml": ACTUAL,
         }  # fmt: skip
-        self.good |= _binary(folder, table)
+        self.good |= _binary(folder, table) | _lab()
         for name, data in self.good.items():
             (folder / name).write_bytes(data)
         self.rig, self.task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
         self.gripper = read_rig(folder / "gripper.toml")
+        lab_task = read_task(folder / "lab-task.toml")
+        assert isinstance(lab_task, BlockTask)
+        self.lab_task = lab_task
+        sequence = read_task(folder / "sequence.toml")
+        assert isinstance(sequence, SequenceTask)
+        self.sequence = sequence
+        self.good["model.npz"] = _model(folder, self.sequence)
         self.order = parse_task({"sequence": ["reach", "lift"]})
 
     def read(self, name: str, path: Path) -> None:
@@ -49,12 +59,20 @@ class Scene:
         from hmmseg.io.rig import read_rig
         from hmmseg.io.task import read_task
         from hmmseg.io.trial import read_trial
+        from hmmseg.sequence.model import load_model
+        from simgap.world.properties import read_properties
 
         if name == "arm.csv":
             read_trial(path, self.gripper)
-        elif name in ("rig.toml", "gripper.toml"):
+        elif name == "lab.csv":
+            read_trial(path, read_rig(self.folder / "lab-rig.toml"))
+        elif name == "properties.json":
+            read_properties(path, self.lab_task)
+        elif name == "model.npz":
+            load_model(path, self.sequence)
+        elif name in ("rig.toml", "gripper.toml", "lab-rig.toml"):
             read_rig(path)
-        elif name in ("task.toml", "sequence.toml"):
+        elif name in ("task.toml", "sequence.toml", "lab-task.toml"):
             decompose(read_task(path))
         elif name == "actual.toml":
             read_actual(path, ("a", "b"))
@@ -109,7 +127,7 @@ to = "b"
 slide = false
 """
 SEQUENCE = b"""sequence = ["approach", "insert", "mate"]
-channels = ["fx", "fy"]
+channels = ["fx1", "fy1"]
 optional = ["insert"]
 """
 ACTUAL = b"""[a]
@@ -118,6 +136,34 @@ width = {value = 0.02, unit = "m"}
 [b]
 height = {value = 0.02, unit = "m"}
 """
+
+
+def _lab() -> dict[str, bytes]:
+    """A recording that fits its task, what was identified from it, and a model of a plain ordered task."""
+    from hmmseg.example import example_folder
+    from hmmseg.io.schema import parse_toml
+
+    folder = Path(example_folder())
+    made = {f"lab-{name}": (folder / name).read_bytes() for name in ("rig.toml", "task.toml")}
+    made["lab.csv"] = (folder / "trial_01.csv").read_bytes()
+    names = parse_toml(made["lab-task.toml"].decode(), "task")["objects"]
+    block = {"weight": 0.4, "width": 0.02, "height": 0.02}
+    made["properties.json"] = json.dumps({
+        "format": "hmmseg.identify/1",
+        "properties": {name: {p: {"value": v, "sd": 0.01 * v} for p, v in block.items()} for name in names},
+    }).encode()  # fmt: skip
+    return made
+
+
+def _model(folder: Path, task: SequenceTask) -> bytes:
+    """A model of a plain ordered task, written to its place."""
+    from hmmseg.io.trial import read_trial
+    from hmmseg.sequence.fit import fit_sequence
+    from hmmseg.sequence.model import save_model
+
+    path = folder / "model.npz"
+    save_model(fit_sequence([read_trial(folder / "trial.csv", None, task)], task), path)
+    return path.read_bytes()
 
 
 def _binary(folder: Path, table: dict[str, np.ndarray]) -> dict[str, bytes]:

@@ -88,14 +88,19 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
+def _share(value: float, low: float, high: float) -> float:
+    """Where a value lies between two, whose difference may be beyond all numbers."""
+    return (value / 2 - low / 2) / (high / 2 - low / 2)
+
+
 def sparkline(course: tuple[float, ...]) -> str:
     """A course in bars, a blank where nothing is."""
     there = [value for value in course if value == value]
     if not there:
         return ""
-    low, span = min(there), max(there) - min(there)
+    low, high = min(there), max(there)
     return "".join(
-        " " if value != value else BARS[0 if span == 0 else min(7, int(8 * (value - low) / span))]
+        " " if value != value else BARS[0 if low == high else min(7, int(8 * _share(value, low, high)))]
         for value in course
     )
 

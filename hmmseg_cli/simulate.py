@@ -153,6 +153,9 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     if segmentation.failed is not None:
         out.warn(f"{recording.file}: {segmentation.failed}")
     boundaries = np.array([span.start for span in segmentation.spans[1:]])
+    if len(boundaries) + 1 < len(subtasks(task)):
+        raise InputError(recording.file, "does not show the whole task: some blocks have no place",
+                         "a recording that `hmmseg segment` finds complete")  # fmt: skip
     if rig.effects:
         from simgap.patch import replayed
 

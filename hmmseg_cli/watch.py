@@ -13,6 +13,7 @@ import typer
 
 import hmmseg
 from hmmseg.errors import InputError, nearest
+from hmmseg.io.trial import LARGEST
 from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, SeedOption, TaskOption
 
 if TYPE_CHECKING:
@@ -159,6 +160,11 @@ class Rows:
             self._check(values, cells)
         if not self._plain:
             values = [s * v + o for v, (s, o) in zip(values, self._scales, strict=True)]
+        for i, value in enumerate(values):
+            if i and abs(value) > LARGEST:
+                where = f"{WHERE}: row {self._number}, column {self._names[self._picked[i]]}"
+                problem = f"{value:.3g} is no reading of a hand's sensor"
+                raise InputError(where, problem, f"at most {LARGEST:.0g} in SI units")
         return values[0], values[1:]
 
     def _number_in(self, cells: list[str], i: int) -> float:

@@ -13,9 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from hmmseg.errors import InputError, nearest
 
 Positive = Annotated[float, Field(gt=0, strict=True)]  # inf allowed: a rigid pad
-FinitePositive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Deviation = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+LARGEST = 1e12  # numerics: SI units; squares of what is larger overflow sooner or later
+FinitePositive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
+Deviation = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(min_length=1, max_length=500, strict=True)]
 MAX_TOML_BYTES = 1_000_000  # chosen: bytes; more is a damaged or hostile file
 DEEPEST = 32  # chosen: parts of a dotted key

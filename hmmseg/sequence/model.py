@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hmm.alignment import Alignment, Bands, align_many
+from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions
@@ -130,11 +130,12 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
     """Read a model; InputError where the file is no model or was learned for another task."""
     where = str(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            table = {name: file[name] for name in file.files}
+        table = unpack(Path(path))
     except FileNotFoundError:
         raise InputError(where, "no such file", "a model written by `hmmseg fit`") from None
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile):
+    except InputError:
+        raise
+    except Exception:  # of what a damaged archive may raise there is no list: zipfile's, zlib's, NumPy's
         raise InputError(where, "cannot be read", "a model written by `hmmseg fit`") from None
     found = str(table.get("format", "no format"))
     if found != FORMAT:
@@ -157,6 +158,10 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
             others.append(Alternative(float(probability), other))
     except KeyError as error:
         raise InputError(where, f"lacks {error.args[0]}", "a complete model") from None
+    except InputError:
+        raise
+    except (TypeError, ValueError):
+        raise InputError(where, "holds values that no model has", "a model written by `hmmseg fit`") from None
     return replace(model, others=tuple(others))
 
 

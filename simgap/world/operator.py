@@ -84,10 +84,12 @@ def read_operator(path: str | Path) -> OperatorSettings:
     if path.suffix.lower() == ".json":
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(str(path), f"cannot be read ({error})", "operator settings") from None
     else:
         table = read_toml(path)
+    if not isinstance(table, dict):
+        raise InputError(str(path), "holds no table", "operator settings by name")
     settings = {}
     for name, value in table.items():
         if name not in OperatorSettings.__dataclass_fields__:

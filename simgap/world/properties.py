@@ -69,7 +69,7 @@ def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
             table = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise InputError(str(path), "no such file", "identify's JSON or an actual.toml") from None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(str(path), f"not valid JSON ({error})") from None
         table = table.get("properties") if isinstance(table, dict) else None
         if not isinstance(table, dict):

@@ -173,6 +173,60 @@ def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
         assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_a_recording_that_stops_halfway_is_no_replay(tmp_path, capsys):
+    (tmp_path / "task.toml").write_text(TASK)
+    rows = (STACK / "trial_01.csv").read_text().splitlines()
+    (tmp_path / "half.csv").write_text("\n".join(rows[: len(rows) // 3]) + "\n")
+    hand = ["--task", str(tmp_path / "task.toml"), "--rig", str(STACK / "rig.toml")]
+    before = sorted(tmp_path.rglob("*"))
+    replay = ["--replay", str(tmp_path / "half.csv"), "--output", str(tmp_path / "made")]
+    assert main(["simulate", *hand, *replay]) == 2
+    assert "does not show the whole task" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("content", ["[1]", "3", "[" * 100_000, '{"pace": []}', '{"pace": {"a": 1}}'])
+def test_operator_settings_that_are_none(content, tmp_path):
+    from simgap.world.operator import read_operator
+
+    path = tmp_path / "operator.json"
+    path.write_text(content)
+    assert str(path) in told(read_operator, path)
+
+
+@pytest.mark.parametrize(
+    "content", ["[1]", "{}", '{"properties": 3}', "[" * 100_000, '{"properties": {"a": []}}']
+)
+def test_properties_that_are_none(content, tmp_path):
+    from hmmseg.io.task import parse_task
+    from simgap.world.properties import read_properties
+
+    path = tmp_path / "identified.json"
+    path.write_text(content)
+    task = parse_task({"objects": {"a": {"on": "ground"}}, "moves": [{"object": "a", "to": "ground"}]})
+    assert str(path) in told(read_properties, path, task)
+
+
+def unheard_of(path):
+    """An archive that says it needs version 20.3 of the format to be unpacked."""
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("format.npy", b"x")
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 6] = 203
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("make", [pickled, bare_pickle, zip_bomb, huge_claim, climbing, unheard_of])
+def test_a_hostile_model_is_refused(make, tmp_path, monkeypatch):
+    from hmmseg.sequence.model import load_model
+
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "t.npz"
+    make(path)
+    told(load_model, path, read_task_of(["a", "b"]))
+    assert [each.name for each in tmp_path.iterdir()] == ["t.npz"]
+
+
 def identify_command(folder, output, seed="3"):
     trials = [str(STACK / f"trial_0{k}.csv") for k in (1, 2)]
     return [sys.executable, "-m", "hmmseg_cli.main", "identify", *trials, "--task", str(folder / "task.toml"),

@@ -163,3 +163,9 @@ def test_new_never_hangs_and_never_writes_over(tmp_path):
             assert (done.returncode, sorted(os.listdir(tmp_path / "lab"))) == (0, ["rig.toml", "task.toml"])
     assert done.returncode == 2
     assert text == "lab/rig.toml: is there already and would be written over; expected another folder\n"
+
+
+def test_a_course_between_the_largest_numbers_is_drawn():
+    from hmmseg_cli.inspect import sparkline
+
+    assert len(sparkline((-1e308, 0.0, float("nan"), 1e308))) == 4

@@ -1,4 +1,4 @@
-"""Ctrl-C while results are put in place, or anywhere: whole or not there; two runs in one folder; one seed."""
+"""Ctrl-C while results are put in place, or anywhere: whole or not there; one seed, the same digits."""
 
 import json
 import os

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -44,6 +45,10 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
         (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
         (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
         (lambda rows: [], "standard input: is empty"),
+        (
+            lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
+            "row 6, column fy2: 1e+300 is no",
+        ),
     ],
 )
 def test_bad_input_gets_one_line(run, change, message):

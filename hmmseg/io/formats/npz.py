@@ -97,6 +97,16 @@ def _header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
     return np.lib.format.read_array_header_2_0(member)
 
 
+def unpack(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an archive by name, with the same checks."""
+    with zipfile.ZipFile(path) as archive:
+        names = [each.filename.removesuffix(".npy") for each in archive.infolist()]
+        for name in names:
+            _claimed(path, archive, name)
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in names}
+
+
 def _claimed(path: Path, archive: zipfile.ZipFile, name: str) -> int:
     """Bytes that a member's array has by its own header; InputError where the file has fewer, or too many."""
     info = archive.getinfo(f"{name}.npy")
