@@ -15,6 +15,8 @@ FIGURES = {
     "sweeps": ("sweep_plane", "sweep_lines", "sweep_coverage"),
     "calibrate": ("sbc", "calibration_worlds"),
     "bench": ("benchmarks",),
+    "bench-long": ("long_recordings",),
+    "sequences": ("sequences",),
     "bench-watch": ("watch_lag",),
     "blind-check": ("gap_reliability",),
     "real": ("hiro_gap", "way_eeg_gal", "xl330_signal", "xl330_before_after"),

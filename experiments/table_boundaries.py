@@ -16,8 +16,8 @@ Written by `make boundaries` (`experiments/calibration_boundaries.py` and `table
 `experiments/boundary_worlds.py`, the project's own simulator, single trials of two blocks restacked.
 Before: the same trials by commit 69677d2. Error is the median (and 95th percentile) of |found - true|;
 half width is of the 90 % intervals, which should cover 86 to 94 %. {trials} trials of 8 boundaries a row,
-so that a row's coverage is known to about 5 %. (The slipping grips of before opened wider, so that five of eight
-blocks were dropped; grips that lose their block for good are left out now.)
+so that a row's coverage is known to about 5 %. (The slipping grips of before opened wider, so that five of
+eight blocks were dropped; grips that lose their block for good are left out now.)
 
 | world | misfits before | now | error before [ms] | now | cover before | now | half width now [ms] |
 | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
