@@ -86,6 +86,8 @@ def test_ctrl_c_while_results_are_put_in_place(name, step, lab, monkeypatch, cap
     assert "Traceback" not in capsys.readouterr().err
 
 
+# A reader interrupted between opening a file and holding on to it leaves its closing to Python.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_ctrl_c_at_any_moment(name, lab, capsys):
     """In process, everything loaded: an alarm interrupts at moments drawn from a run's length."""
