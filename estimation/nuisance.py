@@ -17,10 +17,10 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial
 
-# chosen: a pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off
+# prior: a pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off
 # by as much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
 MOST_BENT = 0.5
-UNLIKE = 0.3  # chosen: by which share of what both pads have alike one may differ: foams of one make do
+UNLIKE = 0.3  # prior: by which share of what both pads have alike one may differ: foams of one make do
 
 
 @dataclass(frozen=True)

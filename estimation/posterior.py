@@ -31,8 +31,8 @@ from estimation.observations import CHANNELS
 
 NUM_CHANNELS = len(CHANNELS)
 STEP = 0.25  # numerics: of the table, in log r: cubic interpolation is then exact to some 1e-5
-FARTHEST = 9.0  # chosen: of any scale from its prior median, all logarithms
-REACH = (-18.0, 26.0)  # chosen: of the table about the prior median of log r; priors leave nothing beyond
+FARTHEST = 9.0  # limit: of any scale from its prior median, all logarithms
+REACH = (-18.0, 26.0)  # numerics: of the table about the prior median of log r; priors leave nothing beyond
 
 
 @dataclass(frozen=True)

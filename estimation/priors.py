@@ -13,14 +13,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # chosen: N, m, m
-PROPERTY_LOG_SD = {"weight": 1.5, "width": 1.0, "height": 1.0}  # chosen: a factor of 3 to 5 either way
+PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # prior: N, m, m
+PROPERTY_LOG_SD = {"weight": 1.5, "width": 1.0, "height": 1.0}  # prior: a factor of 3 to 5 either way
 
 CHANNEL = {"weight": 0, "width": 1, "height": 2}  # physics: by which each property is observed
-SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.02])  # chosen: share that differs from grip to grip
-# chosen: normal prior of log(share / its prior median): of heavier tails no sd would be left
+SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.02])  # prior: share that differs from grip to grip
+# prior: normal prior of log(share / its prior median): of heavier tails no sd would be left
 SCATTER_LOG_SD = 1.0
-COMMON = np.array([5e-4, 1e-3, 0.03])  # chosen: standard deviation of the share that all grips have alike
+COMMON = np.array([5e-4, 1e-3, 0.03])  # prior: standard deviation of the share that all grips have alike
 
 
 def property_priors(names: Iterable[tuple[str, str]]) -> tuple[np.ndarray, np.ndarray]:

@@ -16,9 +16,9 @@ from estimation import priors
 from estimation.mode import Mode
 from estimation.posterior import NUM_CHANNELS, Posterior
 
-TAIL = 5.0  # chosen: degrees of freedom for the noise: proposals need heavier tails than the posterior
+TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
 WIDEN = 1.1  # numerics: of the Laplace covariance, likewise
-# chosen: share of proposals whose scatter is a t about its prior's median, heavier than any posterior
+# numerics: share of proposals whose scatter is a t about its prior's median, heavier than any posterior
 FROM_PRIOR = 0.1
 STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its prior median)
 

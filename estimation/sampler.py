@@ -23,7 +23,7 @@ from estimation.proposal import Proposal, proposal
 if TYPE_CHECKING:
     import emcee
 
-INDEPENDENT = 0.9  # chosen: share of independence proposals
+INDEPENDENT = 0.9  # numerics: share of independence proposals
 WALKERS = 64  # numerics: of emcee
 BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000  # numerics
 MIN_LENGTH = 50  # cited: steps in units of the autocorrelation time, emcee's own rule

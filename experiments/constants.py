@@ -3,7 +3,8 @@
     python -m experiments.constants [--unstated]
 
 A constant is a number, or a tuple or dict of numbers, given to a name in capitals at the top of a module.
-Its kind is the first word of its comment (CONTRIBUTING.md): physics, numerics, cited, learned or chosen.
+Its kind is the first word of its comment (CONTRIBUTING.md): physics, numerics, cited, learned, prior, limit,
+look or chosen.
 `--unstated` lists those without one and ends with 1 if there are any.
 """
 
@@ -26,11 +27,14 @@ KINDS = {
     "numerics": "changes cost or accuracy of a computation, no result beyond that",
     "cited": "from the literature or a data sheet",
     "learned": "by a script, on data that it names",
-    "chosen": "by judgement",
+    "prior": "believed before a recording is seen, or the shape of its noise: a likelihood may overrule it",
+    "limit": "what input is taken at all; beyond it a line says so",
+    "look": "of pictures, tables, pages and the hand that plays: no answer depends on it",
+    "chosen": "by judgement: it decides between answers",
     "unstated": "its comment does not say",
 }
 NAME = re.compile(r"^_?[A-Z][A-Z0-9_]*$")
-STATED = re.compile(r"^(physics|numerics|cited|learned|chosen)\b[:;,]?\s*(.*)$", re.DOTALL)
+STATED = re.compile(r"^(physics|numerics|cited|learned|prior|limit|look|chosen)\b[:;,]?\s*(.*)$", re.DOTALL)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ UNITS = {
 }
 # Property of a block: the same, as the paper shows it.
 SHOWN = {"weight": (1.0, "N"), "width": (100.0, "cm"), "height": (100.0, "cm"), "friction": (1.0, "")}
-MOST = 6  # chosen: decimals shown
+MOST = 6  # look: decimals shown
 
 
 def shown_as(unit: str, share: bool = False) -> tuple[float, str]:

@@ -8,7 +8,7 @@ import io
 from rich.console import Console
 from rich.table import Table
 
-WIDTH = 120  # chosen: characters of a `repr`
+WIDTH = 120  # look: characters of a `repr`
 
 
 def as_text(table: Table) -> str:

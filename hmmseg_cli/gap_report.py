@@ -14,7 +14,7 @@ from simgap.report import finding
 from simgap.report.causes import plain_name
 
 Body = Mapping[str, Any]
-MOST = 8  # chosen: rows of a table
+MOST = 8  # look: rows of a table
 SHARES = (
     "gain",
     "scale",

@@ -19,9 +19,9 @@ from hmmseg.online.answer import Answer
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
 
-REFRESH = 0.1  # chosen: s; a terminal shows no more
+REFRESH = 0.1  # look: s; a terminal shows no more
 WIDTH = 60  # numerics: points of a signal
-SECONDS = 10.0  # chosen: that it spans
+SECONDS = 10.0  # look: that it spans
 BLOCKS = " ▁▂▃▄▅▆▇█"
 
 

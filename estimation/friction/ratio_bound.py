@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-CONCENTRATION = 1.0  # chosen: prior weight of G, in samples
-BINS_PER_SD = 3.0  # chosen: bins of G to the smallest noise
-MAX_BINS = 300  # chosen
-GLITCH = 0.01  # chosen: share of samples that say nothing: a bound must rest on more than one
+CONCENTRATION = 1.0  # prior: prior weight of G, in samples
+BINS_PER_SD = 3.0  # numerics: bins of G to the smallest noise
+MAX_BINS = 300  # numerics
+GLITCH = 0.01  # prior: share of samples that say nothing: a bound must rest on more than one
 BURN_IN, SWEEPS = 20, 48  # numerics
 CORROBORATING = 8  # chosen: samples of which surely not all are glitches
-REACH = 5.0  # chosen: standard deviations beyond which a sample cannot be the largest
+REACH = 5.0  # numerics: standard deviations beyond which a sample cannot be the largest
 
 
 def largest_ratio(

@@ -12,9 +12,9 @@ from estimation.actual import Actual
 from hmmseg.numbers import SHOWN
 from hmmseg.plot.style import BLUE, RED, canvas
 
-SIZE = 1.25  # chosen: in, a panel
-LEFT, RIGHT = 0.95, 0.3  # chosen: in, margins (below and above alike)
-WIDEST = 0.6  # chosen: share of a panel by which a measured value may widen its range
+SIZE = 1.25  # look: in, a panel
+LEFT, RIGHT = 0.95, 0.3  # look: in, margins (below and above alike)
+WIDEST = 0.6  # look: share of a panel by which a measured value may widen its range
 
 
 def draw_corner(

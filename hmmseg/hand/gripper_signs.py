@@ -10,8 +10,8 @@ from hmmseg.io.plausibility import REACH, Finding, all_changed, changed
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
-WIDEST = 1.0  # chosen: m; no parallel gripper opens further
-NARROW = 2e-4  # chosen: m
+WIDEST = 1.0  # limit: m; no parallel gripper opens further
+NARROW = 2e-4  # limit: m
 
 
 def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:

@@ -16,9 +16,9 @@ import numpy as np
 STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
 SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first touch
 ABRUPT = 0.5  # chosen: share of its speed that a closing loses from one step to the next at a hard touch
-SOFT = 0.1  # chosen: of what gives in a grip: its touch is known no better, as pads are no ideal springs
-GIVE = (1e-3, 1.5e-3)  # chosen: m, mean and sd: what pads and drive give in a grip, before anything is seen
-WRONG = 0.2  # chosen: how often one of the estimates of the touch is of something else
+SOFT = 0.1  # prior: of what gives in a grip: its touch is known no better, as pads are no ideal springs
+GIVE = (1e-3, 1.5e-3)  # prior: m, mean and sd: what pads and drive give in a grip, before anything is seen
+WRONG = 0.2  # prior: how often one of the estimates of the touch is of something else
 TAIL, NODES, GRID = (
     4.0,
     400,

@@ -17,12 +17,12 @@ from hmmseg.io.plausibility import Finding, all_changed, changed
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
-ALL = 0.95  # chosen: share of the samples that must agree
-MOST = 0.75  # chosen: the same where a hold goes on after its block has been put down
-LIFTED = 0.005  # chosen: [m]
+ALL = 0.95  # limit: share of the samples that must agree
+MOST = 0.75  # limit: the same where a hold goes on after its block has been put down
+LIFTED = 0.005  # limit: [m]
 CARTESIAN_STEMS = ("x{}", "y{}", "vx{}", "vy{}", "fx{}", "fy{}")
 JOINT_STEMS = ("q{}1", "q{}2", "dq{}1", "dq{}2", "fx{}", "fy{}")
-BRIEF = 5  # chosen: samples: a shorter touch holds nothing
+BRIEF = 5  # limit: samples: a shorter touch holds nothing
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
-TAIL = 4.0  # chosen: degrees of freedom of the Student-t weights, as in the emissions
+TAIL = 4.0  # prior: degrees of freedom of the Student-t weights, as in the emissions
 CLEAR = 5.0  # chosen: standard errors at which a parameter shows in free motion
 TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
 SAMPLES = 20  # chosen: of free motion, at least

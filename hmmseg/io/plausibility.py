@@ -18,13 +18,13 @@ from hmmseg.io.columns import Column
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
-SLOWEST = 2.0  # chosen: [Hz]; hands are recorded at 10 Hz at least
-REACH = 3.0  # chosen: [m]
-WEAKEST, STRONGEST = 0.02, 1000.0  # chosen: [N] of a grip
-STILL = 2e-4  # chosen: [m]: travel of a hand that moved nothing
+SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
+REACH = 3.0  # limit: [m]
+WEAKEST, STRONGEST = 0.02, 1000.0  # limit: [N] of a grip
+STILL = 2e-4  # limit: [m]: travel of a hand that moved nothing
 WINDING = 4 * np.pi  # [rad]
 YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9  # physics: [s] since 1970
-SAME = 0.15  # chosen: relative: a factor of 1000 or 57.3 is told apart from 1 by far more
+SAME = 0.15  # limit: relative: a factor of 1000 or 57.3 is told apart from 1 by far more
 
 
 @dataclass(frozen=True)

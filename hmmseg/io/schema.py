@@ -18,8 +18,8 @@ FinitePositive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False, s
 Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
 Deviation = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(min_length=1, max_length=500, strict=True)]
-MAX_TOML_BYTES = 1_000_000  # chosen: bytes; more is a damaged or hostile file
-DEEPEST = 32  # chosen: parts of a dotted key
+MAX_TOML_BYTES = 1_000_000  # limit: bytes; more is a damaged or hostile file
+DEEPEST = 32  # limit: parts of a dotted key
 SEPARATOR, JOINT = re.compile(r"[=,{}\[\]\n]"), re.compile(r"[\w\"'-]\s*\.(?=\s*[\w\"'-])")
 
 

@@ -18,7 +18,7 @@ from hmmseg.io.schema import read_toml
 
 GROUND = "ground"
 RESERVED = (GROUND, "finger1", "finger2")
-MAX_REPEAT = 1000  # chosen: rounds; more is a slip of the pen
+MAX_REPEAT = 1000  # limit: rounds; more is a slip of the pen
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from hmmseg.online.properties import UNITS
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter
 
-Z90, Z95 = 1.6448536269514722, 1.959963984540054  # chosen
+Z90, Z95 = 1.6448536269514722, 1.959963984540054  # physics
 
 
 @dataclass(frozen=True)

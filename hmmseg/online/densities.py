@@ -9,8 +9,8 @@ from hmmseg.segmentation.emissions import TAIL
 
 _HALF = (TAIL + 1) / 2
 _CONSTANT = math.lgamma(_HALF) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)
-_ROOT2 = math.sqrt(2.0)  # chosen
-_LEAST = -25.0  # chosen: of an edge, as in the emissions off line
+_ROOT2 = math.sqrt(2.0)  # numerics
+_LEAST = -25.0  # numerics: of an edge, as in the emissions off line
 
 
 @compiled

@@ -37,13 +37,13 @@ KINDS = {FREE: at.FREE_KIND, ON_GROUND: at.GROUND_KIND, SLIDING: at.SLIDING_KIND
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
 # hand at rest creeps, and pads' foam gives by tenths of a mm.
 VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
-PRIOR = 4.0  # chosen
+PRIOR = 4.0  # prior
 # chosen: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; and of no more weight than a
 # few nats.
 LEAST_SPANS = (0.1, 0.1, 0.03, 0.03)
 LEAST_FORCE = 50.0  # chosen: and of its forces, in sds of their noise
-ROUGH = 3.0  # chosen: net and shear force of a held block at first, in sds of the force noise
-UNBIASED = 10.0  # chosen: a sensor's bias before anything is known, in sds of its noise
+ROUGH = 3.0  # prior: net and shear force of a held block at first, in sds of the force noise
+UNBIASED = 10.0  # prior: a sensor's bias before anything is known, in sds of its noise
 
 
 @dataclass

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 # time at which the state was entered [s] and its variance, boundaries crossed so far, the
 # subtask that is not reached any more (-1: on the task) and since when [s].
 WEIGHT, STATE, ROUND, ENTRY, ENTRY_VARIANCE, CROSSED, MISSED, LEFT_AT = range(8)
-BIAS = 8  # chosen: of fx1, fy1, fx2, fy2, two numbers each
+BIAS = 8  # numerics: of fx1, fy1, fx2, fy2, two numbers each
 SCALES = BIAS + 8  # seven, two numbers each, in this order
 FORCE, CARRY, NET_X, SHEAR, VELOCITY, LEVEL_SCALE, WIDTH_SCALE = range(7)
 LEVEL = SCALES + 14  # height at which the block rests [m]
 ORIGIN = LEVEL + 2  # mean and variance of the level at the move's pickup
 RING = ORIGIN + 2  # mean and variance of the last boundaries
-NUM_RING = 8  # chosen
+NUM_RING = 8  # numerics
 OBJECTS = RING + 2 * NUM_RING  # weight [N] and width [m] of every block, four numbers each
 
 # Kinds of contact states, as the kernels number them.
@@ -31,7 +31,7 @@ FREE_KIND, GROUND_KIND, SLIDING_KIND, ABOVE_KIND = range(4)
 # something else than forces tells that nothing is held (0), or that something is (2; 1: nothing does).
 (T, FX1, FY1, FX2, FY2, VX, VY, AY, Y, D, SD_Y, SD_D, SD_VX, SD_VY, LAST_Y, LAST_D, LAST_FY, SD_FX, SD_FY,
  GRIPPED) = range(20)  # fmt: skip
-NUM_READ = 20  # chosen
+NUM_READ = 20  # numerics
 
 # Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
 SPAN_VX, SPAN_VY, SPAN_Y, SPAN_D, SPAN_FORCE, SPAN_PRESS = range(6)

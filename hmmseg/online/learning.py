@@ -34,7 +34,7 @@ from hmmseg.segmentation.emissions import TAIL
 
 MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
 MOST_SCALE = 200.0  # chosen: and a scale
-LEAST = 1e-12  # chosen: N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
+LEAST = 1e-12  # numerics: N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
 FLOOR = 0.09  # chosen: ... 0.3 of a sample's own noise
 
 

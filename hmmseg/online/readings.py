@@ -32,7 +32,7 @@ from hmmseg.segmentation.features import MAX_RATE, WINDOW
 
 SLOPE = 1.0 / MAX_RATE
 ROWS = 512  # numerics: rows looked back at, at most: 20 kHz over SLOPE
-NUM_MEANS = 8  # chosen: forces, vx, vy, y, d
+NUM_MEANS = 8  # numerics: forces, vx, vy, y, d
 HISTORY = 4 + NUM_MEANS  # numerics: of a row: time, reach that scales noise (2), values, net vertical mean
 
 

@@ -34,16 +34,16 @@ from hmmseg.online.learning import learn
 from hmmseg.online.scores import free, held, lifted, supported
 from hmmseg.segmentation.emissions import LOST
 
-LOG_DEPARTURE = math.log(1e-4)  # chosen: as in hmmseg.segmentation.departure, as are the next four
-BRIEF = 1e-8  # chosen
-SETTLING = 0.2  # chosen
-RINGING = 0.1  # chosen
+LOG_DEPARTURE = math.log(1e-4)  # prior: as in hmmseg.segmentation.departure, as are the next four
+BRIEF = 1e-8  # prior
+SETTLING = 0.2  # prior
+RINGING = 0.1  # prior
 WRONG_RISE = 3e-3  # chosen
-PACE = 1.0  # chosen: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
-NEGLIGIBLE = -28.0  # chosen: nats below the best at which a hypothesis is dropped
-SAME_STATE = 14  # chosen: hypotheses of one state that are kept apart, ...
-SAME_DEPARTED = 4  # chosen: ... and of one that is off the task
-_NUM_STAGES = 3  # chosen
+PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
+NEGLIGIBLE = -28.0  # numerics: nats below the best at which a hypothesis is dropped
+SAME_STATE = 14  # numerics: hypotheses of one state that are kept apart, ...
+SAME_DEPARTED = 4  # numerics: ... and of one that is off the task
+_NUM_STAGES = 3  # numerics
 
 
 @compiled

@@ -11,7 +11,7 @@ from hmmseg.plot.spans import Panel, stacked_panels
 from hmmseg.plot.style import canvas
 from hmmseg.segmentation.spans import Segmentation
 
-MOST = 12  # chosen: panels that stay legible on one page
+MOST = 12  # look: panels that stay legible on one page
 
 
 def draw_channels(trial: Trial, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from hmmseg.plot.style import INK, state_colours
 from hmmseg.segmentation.spans import Segmentation
 
-LABEL_SLANT = 40  # chosen: degrees
+LABEL_SLANT = 40  # look: degrees
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING
 
-WIDTH = 7.2  # chosen: in, a journal's double column
+WIDTH = 7.2  # look: in, a journal's double column
 DPI = 200  # numerics: of figures
 # Okabe and Ito's palette, told apart under the common colour vision deficiencies.
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (

@@ -23,15 +23,15 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 POINTS = 41  # numerics: nodes per sample interval
-BEND = 0.015  # chosen: bend that the cubic misses, as a share of interval x change of velocity
-UNSEEN = 0.15  # chosen: the same, as a share of the way that the velocities at both ends do not account for
-ONSET = 0.001  # chosen: s; a pad's force leads its compression by its viscosity, a few ms in foam
-LAUNCH = 0.1  # chosen: spread of the distance covered after a launch, over gain of speed x time
-MOTION, MOTIONS = (0.05, 1.0), 8  # chosen: s; duration of the motion that an impact ends: log-uniform
+BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
+UNSEEN = 0.15  # prior: the same, as a share of the way that the velocities at both ends do not account for
+ONSET = 0.001  # prior: s; a pad's force leads its compression by its viscosity, a few ms in foam
+LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
+MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 24  # numerics: nodes over the time at which that motion started
-SHAPE = 0.05  # chosen: how far its speed may be off the minimum-jerk profile, as a share of it
-STOP, STOPS = (0.002, 0.05), 10  # chosen: s; time constant of the stop after an impact: log-uniform
-UNIFORM = 0.02  # chosen: weight of a crossing anywhere in the interval, against what g leaves out
+SHAPE = 0.05  # prior: how far its speed may be off the minimum-jerk profile, as a share of it
+STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
+UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, against what g leaves out
 
 Kind = Literal["smooth", "impact", "launch"]
 

@@ -29,7 +29,7 @@ from hmmseg.segmentation.switching import SURE, Penetration, switch_probability
 
 LIKELY = 1e-3  # chosen: least probability of an interval within which the crossing is looked at
 SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another
-DISCREPANCY, KNOWN = 1e-5, 2.0  # chosen: m; usual discrepancy of foam, worth so many contacts
+DISCREPANCY, KNOWN = 1e-5, 2.0  # prior: m; usual discrepancy of foam, worth so many contacts
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Prior:
 
 
 ROUNDS = 20  # numerics: of expectation and maximisation
-SEEN = 4.0  # chosen: contacts that the prior of an abrupt end is worth
+SEEN = 4.0  # prior: contacts that the prior of an abrupt end is worth
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from hmmseg.segmentation.switching import SURE, Penetration
 
 HELD = 0.15  # chosen: s of a hold that locate the block next to a contact change; a hand drifts over more
 PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
-STIFFEST = 1e-7  # chosen: m/N
+STIFFEST = 1e-7  # numerics: m/N
 
 
 @dataclass(frozen=True)

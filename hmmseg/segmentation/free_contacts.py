@@ -22,7 +22,7 @@ from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
-STRAY = 1e-3  # chosen: share of resting samples that move: contacts settle in states of their own here
+STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
 SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
 APART = 10  # chosen: noise sds of the grip force between free and gripped

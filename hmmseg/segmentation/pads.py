@@ -27,20 +27,20 @@ from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, st
 
 # chosen: of a stated stiffness, where the rig does not say: foams of one make differ by as much
 STIFFNESS_SD = 0.3
-RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force sensor
-SOFT = 2e-4  # chosen: m/N; how far pads that are said to be rigid may give after all
-FORM, FORM_STRETCHES = 0.05, 4.0  # chosen: usual form error of foam, worth so many stretches
-SLOWEST = 0.1  # chosen: s; time constant of a force sensor's filter
+RIGID = 2e-5  # prior: m/N; a stiffer pad hides its compression from any force sensor
+SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after all
+FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
+SLOWEST = 0.1  # prior: s; time constant of a force sensor's filter
 # chosen: s; delays up to it are tried in steps of half a sample, then around the best of them ...
 LONGEST = 0.3
 FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics
-LEAD_SD = 0.003  # chosen: s; prior of a delay below what counts as one: foams lead by a few ms at most
+LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
 LATE = 0.01  # chosen: s; a longer delay is the sensor's
 DECISIVE = 15.0  # chosen: nats for a longer delay against none; its prior probability is about exp(-5)
 APART = 4.0  # chosen: sds beyond which a compliance contradicts the rig
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be asked
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
-LATE_SHARE = 0.1  # chosen: of a delay: a filter of another order, a shift that is partly a filter
+LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 ENOUGH = 24  # chosen: stretches that tell a delay
 
 

@@ -15,7 +15,7 @@ SIGNIFICANT = 5.0  # chosen: sds of force noise for a contact to be sure
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
 KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there
-DEPENDENT = 0.5  # chosen: share of the samples of a stretch that are evidence of their own
+DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own
 
 
 @dataclass(frozen=True)

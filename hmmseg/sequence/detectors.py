@@ -16,7 +16,7 @@ import numpy as np
 
 from hmmseg.sequence.emissions import DOF
 
-PRIOR_COUNT = 2.0  # chosen: weight of the channel's own pooled spread against that of each lag
+PRIOR_COUNT = 2.0  # prior: weight of the channel's own pooled spread against that of each lag
 LEAST_SPREAD = 0.05  # chosen: of a window's usual spread: labels are no better aligned than that
 
 

@@ -22,10 +22,10 @@ from hmmseg.sequence.readings import forbidding
 from hmmseg.sequence.transitions import Transitions
 
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
-HALVES = (0.0075, 0.02, 0.05)  # chosen: half a window, as a share of a trial's length
-WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # chosen
-STATE_WEIGHTS = (0.03, 0.2, 1.0)  # chosen
-FORGIVING = 1e-4  # chosen: least probability of a held-out label, so that one odd label does not decide
+HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
+WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # prior
+STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior
+FORGIVING = 1e-4  # prior: least probability of a held-out label, so that one odd label does not decide
 
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:

@@ -20,7 +20,7 @@ from hmmseg.sequence.labels import boundary_probabilities
 from hmmseg.sequence.model import SequenceModel, optional_states
 from hmmseg.sequence.places import gains, mixed, places
 
-SLOPE_DRAW = 0.75  # chosen: standard deviation of a boundary's shift, as a share of a slope's reach
+SLOPE_DRAW = 0.75  # prior: standard deviation of a boundary's shift, as a share of a slope's reach
 
 _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interval
 

@@ -12,7 +12,7 @@ import numpy as np
 from hmmseg.plot.style import BLUE, GREY, RED, canvas
 from simgap.robots.diagnose import RobotDiagnosis
 
-MOST = 12  # chosen: bars
+MOST = 12  # look: bars
 
 
 @dataclass(frozen=True)

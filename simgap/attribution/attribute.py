@@ -22,7 +22,7 @@ from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import LEAST, POSITIVE, alike, known, named_part
 
 ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
-LISTED = 1e-4  # chosen: probability below which a set is one of the others
+LISTED = 1e-4  # look: probability below which a set is one of the others
 
 
 def attribute(

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-STATED = 0.3  # chosen: sd of log variance about the stated one: noise stated to 15 %
-OFF = 0.1  # chosen: share of groups, beforehand, in which the model is off by itself
+STATED = 0.3  # prior: sd of log variance about the stated one: noise stated to 15 %
+OFF = 0.1  # prior: share of groups, beforehand, in which the model is off by itself
 NEAR, FAR = 13, 20  # numerics: points of the grid
 LARGEST = 1e6  # numerics: the most that a variance exceeds the stated one
 

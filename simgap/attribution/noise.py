@@ -9,7 +9,7 @@ from simgap.attribution.invariance import residual_left
 from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.attribution.problem import Rows
 
-STATED = (0.6, 1.7)  # chosen: bounds of a channel's noise over the stated one, in standard deviations
+STATED = (0.6, 1.7)  # prior: bounds of a channel's noise over the stated one, in standard deviations
 
 
 def channel_of(f: Forms) -> np.ndarray:

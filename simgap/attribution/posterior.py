@@ -19,7 +19,7 @@ from simgap.bounded import least
 
 STEPS = 30  # numerics: of an iteration, at most
 CLOSE = 0.02  # numerics: nats
-FREED = 0.9  # chosen: chance of a group to be off where an effect that acts gives it a variance of its own
+FREED = 0.9  # prior: chance of a group to be off where an effect that acts gives it a variance of its own
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from simgap.attribution.posterior import Forms, Model, fitted, mode, quadratic_f
 
 # numerics: steps by which neighbours of a set are screened, how many of them are fitted
 SCREEN, REFINED = 3, 5
-WINDOW = 12.0  # chosen: nats behind the best set within which a set is kept
+WINDOW = 12.0  # numerics: nats behind the best set within which a set is kept
 BEAM = 5  # numerics: sets of each size that are extended
-MOST = 6  # chosen: effects of a set at most
+MOST = 6  # numerics: effects of a set at most
 
 
 def sought(f: Forms, beam: int = BEAM) -> list[Model]:

@@ -74,7 +74,7 @@ class World(NamedTuple):
     events: Array
 
 
-GROSS = 100.0  # chosen: times the usual size: a fault so large has been seen on the bench
+GROSS = 100.0  # prior: times the usual size: a fault so large has been seen on the bench
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from simgap.effects.base import HAND, Effect, Parameter, Performance, World, flat, tips, with_force, with_load
 
-MIDDLE = (0.13, 0.02)  # chosen: m; about where the fingers work
+MIDDLE = (0.13, 0.02)  # prior: m; about where the fingers work
 
 
 def _anchor(values, xp):

@@ -9,7 +9,7 @@ import numpy as np
 from simgap.effects.base import READOUT, Effect, Parameter, gradient, tips
 from simgap.gap.trial_arrays import CHANNELS
 
-JITTERS = np.geomspace(5e-4, 0.03, 40)  # chosen: s
+JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 
 
 def _scatter(given, residual: np.ndarray):

@@ -8,8 +8,8 @@ import numpy as np
 from simgap.effects.base import FILTER, Effect, Parameter, Performance, World, flat, with_force
 from simgap.effects.filters import lowpass
 
-TIMES = (0.1, 0.4, 1.6, 6.4)  # chosen: s
-LONG = 64  # chosen: samples after which a click is forgotten but for little
+TIMES = (0.1, 0.4, 1.6, 6.4)  # prior: s
+LONG = 64  # numerics: samples after which a click is forgotten but for little
 NAMES = tuple(f"share_{time:g}" for time in TIMES)
 
 

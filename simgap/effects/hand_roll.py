@@ -9,8 +9,8 @@ import numpy as np
 from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance
 from simgap.gap.trial_arrays import CHANNELS
 
-SLOW = 2.0  # chosen: Hz; a hand with a block in it turns no faster (an arm's own modes lie above)
-ROLLS = np.geomspace(2e-4, 0.1, 40)  # chosen: rad
+SLOW = 2.0  # prior: Hz; a hand with a block in it turns no faster (an arm's own modes lie above)
+ROLLS = np.geomspace(2e-4, 0.1, 40)  # prior: rad
 
 
 def _scatter(given, residual: np.ndarray):

@@ -20,7 +20,7 @@ from simgap.effects.base import (
 )
 from simgap.effects.cable_force import MIDDLE
 
-USUAL = (0.03, 0.1, 0.5)  # chosen: m, m/s, m/s^2: what they work with
+USUAL = (0.03, 0.1, 0.5)  # prior: m, m/s, m/s^2: what they work with
 MOTIONS = ("x", "y", "vx", "vy", "ax", "ay")
 NAMES = tuple(f"{axis}_of_{motion}" for axis in ("fx", "fy") for motion in MOTIONS)
 

@@ -8,8 +8,8 @@ from simgap.effects.base import READOUT, Effect, Parameter
 from simgap.gap.trial_arrays import CHANNELS
 
 REPEATED = 0.5  # chosen: share of repeated values that only a lattice has
-WRITTEN = 1e-5  # chosen: N; how finely forces are written that were not rounded before
-SHARES = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}  # chosen: of one sensor's variance, in net forces
+WRITTEN = 1e-5  # prior: N; how finely forces are written that were not rounded before
+SHARES = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}  # prior: of one sensor's variance, in net forces
 
 
 def _scatter(given, residual: np.ndarray):

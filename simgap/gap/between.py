@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from simgap.effects.base import LATE, SMOOTH, World, gradient
 from simgap.effects.filters import faded, lowpass
 
-BETWEEN = 0.3  # chosen: of a bend, sd: a force read between samples
-CURVED = 0.5  # chosen: of the difference of two ways to take a slope, sd: how far it may be off
+BETWEEN = 0.3  # prior: of a bend, sd: a force read between samples
+CURVED = 0.5  # prior: of the difference of two ways to take a slope, sd: how far it may be off
 EVEN = 0.025  # chosen: N; changes from one sample to the next below this have no corner
 SHARP = 0.75  # chosen: by how much one side is flatter, as a share of both, beyond which a force has a corner
-EITHER = 0.6  # chosen: of a force's change, sd: how a force between two samples goes from one to the other
+EITHER = 0.6  # prior: of a force's change, sd: how a force between two samples goes from one to the other
 
 
 def net_forces(force: jax.Array) -> jax.Array:

@@ -17,8 +17,8 @@ from simgap.gap.trial_arrays import CHANNELS
 PROPERTIES = ("weight", "width", "height")
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 DRAWS = 2000  # numerics: of the posterior, for intervals
-LISTED = 8  # chosen: effects that are described
-TOLD = 0.5  # chosen: sd of the prior below which a property is told by the recordings
+LISTED = 8  # look: effects that are described
+TOLD = 0.5  # look: sd of the prior below which a property is told by the recordings
 
 
 def body(

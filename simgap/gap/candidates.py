@@ -14,8 +14,8 @@ from simgap.gap.evaluation import evaluated
 from simgap.gap.fit import STEPS, Fitted, Start, fit
 from simgap.gap.problem import Problem, columns_of, limits, slots
 
-SCREEN = 2  # chosen: steps before the best start of a form is chosen
-LEADERS = 3  # chosen: starts screened
+SCREEN = 2  # numerics: steps before the best start of a form is chosen
+LEADERS = 3  # numerics: starts screened
 PROMISING = 2.0  # chosen: nats that a linear step must gain for a form to be fitted
 
 

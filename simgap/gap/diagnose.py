@@ -38,7 +38,7 @@ from simgap.gap.wrist_gap import check_forced, of_wrist
 from simgap.report.finding import sentence
 from simgap.report.tables import tables
 
-STAGES = 12  # chosen: that `progress` is told of, at most
+STAGES = 12  # look: that `progress` is told of, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 Progress = Callable[[str], None]
 

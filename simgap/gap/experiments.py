@@ -27,7 +27,7 @@ from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.writing import task_table
 
-TRIALS = 2  # chosen: that are simulated: where contacts fall between samples is chance
+TRIALS = 2  # numerics: that are simulated: where contacts fall between samples is chance
 ENOUGH = 5.0  # chosen: nats: the interface's detection floor
 
 

@@ -12,8 +12,8 @@ from simgap.gap.trial_arrays import CHANNELS
 HELD = 0.1  # chosen: N; a grip below this holds nothing,
 # chosen: nor one below this share of its usual force: pads that let go slide by what shears they bear
 LOOSE = 0.35
-SLIDE = 2e-3  # chosen: m; how far a pad may slide from one sample to the next
-ANYWHERE = 0.05  # chosen: m; sd of where a grip takes its block
+SLIDE = 2e-3  # prior: m; how far a pad may slide from one sample to the next
+ANYWHERE = 0.05  # prior: m; sd of where a grip takes its block
 
 
 def firmness(grip: jax.Array, held: jax.Array, moves: jax.Array, loose: float = LOOSE) -> jax.Array:

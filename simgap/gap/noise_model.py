@@ -17,9 +17,9 @@ from simgap.gap.problem import Problem
 from simgap.gap.trial_arrays import CHANNELS, PHASES
 
 KINDS = (("x", "y", "distance", "offset"), ("vx", "vy"), ("fx", "fy", "grip", "shear"))
-LEVELS = np.linspace(0.6, 1.5, 37)  # chosen: noise over the stated one; beyond that it is an effect
-STATED = 0.3  # chosen: sd of log variance about the stated one, beforehand
-COLOURS = np.linspace(0.0, 0.4, 9)  # chosen: correlation from sample to sample; more is an effect
+LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; beyond that it is an effect
+STATED = 0.3  # prior: sd of log variance about the stated one, beforehand
+COLOURS = np.linspace(0.0, 0.4, 9)  # prior: correlation from sample to sample; more is an effect
 BANDS = 6  # numerics: of which medians are taken
 SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
 OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it

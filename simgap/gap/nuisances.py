@@ -18,10 +18,10 @@ from simgap.gap.marginal import Nuisances
 from simgap.gap.problem import Problem, free_of, neutral, slots
 from simgap.gap.trial_arrays import CHANNELS
 
-PAD = 5e-3  # chosen: m; half a pad's length: how hard it turns follows from that and its stiffness
-STANCES = (0.6, 1.0)  # chosen: shares of a block's width between its feet; what lies between is a mixture
-SWING = 2e-3  # chosen: rad; sd of the angle at which a lifted block hangs against how it stood
-LANDING = 4e-5  # chosen: m; sd of how far a pad slides in the shock of landing
+PAD = 5e-3  # prior: m; half a pad's length: how hard it turns follows from that and its stiffness
+STANCES = (0.6, 1.0)  # prior: shares of a block's width between its feet; what lies between is a mixture
+SWING = 2e-3  # prior: rad; sd of the angle at which a lifted block hangs against how it stood
+LANDING = 4e-5  # prior: m; sd of how far a pad slides in the shock of landing
 
 
 def with_nuisances(given: Problem) -> Problem:

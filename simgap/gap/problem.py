@@ -18,7 +18,7 @@ from simgap.gap.frame import Frame
 from simgap.gap.marginal import Nuisances
 from simgap.gap.whitening import Whitening, whitening
 
-FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # chosen: sd of a property that nothing else tells
+FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # prior: sd of a property that nothing else tells
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from simgap.gap.grips import firmness, in_grip, less_mean, recorded
 from simgap.gap.memory import driven, relaxed, sunk
 from simgap.gap.trial_arrays import CHANNELS
 
-TOUCH = 2e-5  # chosen: m; the corner of contact is rounded over this depth, below the joints' resolution
+TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # chosen: sds of the distance by which fingers must be nearer than the block is wide to touch it
 CLOSED = 0.8  # chosen: share of its usual force by which a grip has closed: until then it pushes the block
 

@@ -10,16 +10,16 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.features import noise_sd
 
-MISFIT = 0.03  # chosen: share of a force's change between samples that no model of 20 Hz samples can tell,
+MISFIT = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
-FADED, FADING = 0.1, 0.5  # chosen: the same of what is recorded in free motion, so many seconds from a grip
-SEEN = 2.0  # chosen: sds of a fourth difference below which it is noise
+FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
+SEEN = 2.0  # prior: sds of a fourth difference below which it is noise
 FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)  # numerics: weights of a fourth difference
 MEDIAN = 0.4549  # physics: of the square of a standard normal number
 JUMPS = 64  # numerics: moments between two samples that a mean is taken over
 MOVES = 3.0  # chosen: sds of a difference by which fingers move
-NUDGE = 1e-4  # chosen: m; fingers that push unequally move a resting block by about as much
+NUDGE = 1e-4  # prior: m; fingers that push unequally move a resting block by about as much
 
 
 def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, np.ndarray]:

@@ -35,9 +35,9 @@ from simgap.gap.wrist_gap import as_from_wrist, of_wrist
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 
-MOST = 8  # chosen: twins at most
+MOST = 8  # numerics: twins at most
 BATCH = 4  # numerics: twins that are simulated at once
-LEAST = 1e-3  # chosen: a property below that cannot be simulated [N, m]
+LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
 QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
 Progress = Callable[[str], None]
 

@@ -28,8 +28,8 @@ from simgap.generic.features import (
 FINE = 2048  # numerics: points of the mean course
 SMALLEST = 1e-6  # numerics: s; a shorter time constant is none
 KEPT = 4000  # numerics: spectra kept
-SMOOTH = 9  # chosen: coefficients over which a spectrum is smoothed
-LEAST = 4  # chosen: coefficients that a mean power is taken of
+SMOOTH = 9  # numerics: coefficients over which a spectrum is smoothed
+LEAST = 4  # numerics: coefficients that a mean power is taken of
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from simgap.generic.locate import both_variances
 
 STEP = 1e-3  # numerics: prior standard deviations, for derivatives by differences
 EVALUATIONS = 30  # numerics: of the residual, in one descent
-FURTHER = 4.0  # chosen: nats, as one effect is less likely than none
+FURTHER = 4.0  # prior: nats, as one effect is less likely than none
 FAR = 8.0  # numerics: prior standard deviations that no parameter leaves
 
 

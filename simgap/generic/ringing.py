@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 
-DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # chosen: where searches start
+DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
 HEAVIEST = 0.25  # chosen: damping beyond which a course is no ring
 FREQUENCIES = 80  # numerics: where searches start
 SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for

@@ -17,8 +17,8 @@ from hmmseg.io.trial import Trial
 from simgap.generic.effects import smoothed
 
 TASK = SequenceTask(("approach", "press", "hold"))
-DURATIONS = (1.5, 2.0, 1.2)  # chosen: s
-PACE = 0.05  # chosen: sd of a log duration
+DURATIONS = (1.5, 2.0, 1.2)  # prior: s
+PACE = 0.05  # prior: sd of a log duration
 Values = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value
 
 
@@ -41,7 +41,7 @@ PLANTED: dict[str, dict[str, float]] = {
     "structural_vibration": {"frequency": 7.5, "damping": 0.05, "gain": 0.3},
     "noise_level": {"value": 0.05},
     "timing": {"value": 1.3},
-}  # chosen
+}  # prior
 
 
 def ensemble(

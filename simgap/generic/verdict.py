@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import expit, logsumexp
 
-PRIOR = -4.0  # chosen: log prior of a candidate against none
+PRIOR = -4.0  # prior: log prior of a candidate against none
 SURPRISE = 2.0  # chosen: decades: what noise leaves once in a hundred may as well be noise
 WIDTH = 0.25  # chosen: of the share's logarithm, logistic
 

@@ -14,16 +14,16 @@ from simgap.effects.base import Effect, Performance
 from simgap.world.properties import Block, Blocks
 from simgap.world.scene import Surroundings, finite_stiffness
 
-# chosen: what each scene effect is set to where nothing says otherwise: strong enough to be felt. Chosen.
+# look: what each scene effect is set to where nothing says otherwise: strong enough to be felt. Chosen.
 STRONG = {
     "fingertip_compliance": {"normal_stiffness": 800.0, "shear_stiffness": 500.0},
     "grip_slip": {"mu": 0.12},
     "table_compliance": {"stiffness": 1500.0},
     "table_tilt": {"angle": 0.06},
 }
-OFTEN = 3.0  # chosen: prior standard deviations of a sensor's effect: strong enough to be seen
+OFTEN = 3.0  # look: prior standard deviations of a sensor's effect: strong enough to be seen
 UNFELT = ("clock_jitter", "force_drift")  # of when samples were taken, or of a recording as a whole
-LATE = {"force_lag": {"delay": 0.15}, "force_lowpass": {"time_constant": 0.15}}  # chosen
+LATE = {"force_lag": {"delay": 0.15}, "force_lowpass": {"time_constant": 0.15}}  # look
 
 
 def felt_effects() -> dict[str, Effect]:

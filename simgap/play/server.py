@@ -26,9 +26,9 @@ from simgap.play.felt import effect_values, felt_effects
 from simgap.play.session import Session
 
 HOST = "127.0.0.1"
-FRAME = 1 / 60  # chosen: s
-BEHIND = 50  # chosen: ms; a machine that cannot keep up lets the played time run slower
-LONGEST_MESSAGE = 4096  # chosen: bytes
+FRAME = 1 / 60  # look: s
+BEHIND = 50  # look: ms; a machine that cannot keep up lets the played time run slower
+LONGEST_MESSAGE = 4096  # limit: bytes
 
 
 class PlayServer:

@@ -17,14 +17,14 @@ from simgap.world.properties import Blocks
 from simgap.world.sensors import record
 from simgap.world.writing import scene_files, trial_csv
 
-RATE = 100.0  # chosen: Hz of the recording where the rig says none
-CLEARANCE = 0.012  # chosen: m that the open hand is wider than the widest block
-CLOSING = 0.1  # chosen: m/s at which the hand closes and opens
-FOLLOWING = 14.0  # chosen: 1/s: how quickly the command follows the mouse (critically damped)
-FASTEST = 0.4  # chosen: m/s
-LOWEST = 0.004  # chosen: m above the ground for the commanded fingertips
-GRIP = 3.0  # chosen: N
-LONGEST = 600.0  # chosen: s of a recording
+RATE = 100.0  # look: Hz of the recording where the rig says none
+CLEARANCE = 0.012  # look: m that the open hand is wider than the widest block
+CLOSING = 0.1  # look: m/s at which the hand closes and opens
+FOLLOWING = 14.0  # look: 1/s: how quickly the command follows the mouse (critically damped)
+FASTEST = 0.4  # look: m/s
+LOWEST = 0.004  # look: m above the ground for the commanded fingertips
+GRIP = 3.0  # look: N
+LONGEST = 600.0  # limit: s of a recording
 
 
 def default_rig() -> Rig:

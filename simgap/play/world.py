@@ -14,11 +14,11 @@ from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import Blocks
 from simgap.world.virtual_model import VirtualModel
 
-# chosen: a fingertip's mass [kg], spring [N/m] and damping (ratio): the middle of what operators are drawn
+# look: a fingertip's mass [kg], spring [N/m] and damping (ratio): the middle of what operators are drawn
 # with.
 MASS, STIFFNESS, RATIO = 0.14, 450.0, 0.9
 DAMPING = 2 * RATIO * np.sqrt(MASS * STIFFNESS)
-WINDOW = 600  # chosen: ms of motion that a sensor's effect looks back on
+WINDOW = 600  # look: ms of motion that a sensor's effect looks back on
 
 
 class PlayedWorld:

@@ -35,8 +35,8 @@ from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-REFITS = 3  # chosen
-STAGES = 14  # chosen: what a progress bar counts at most
+REFITS = 3  # numerics
+STAGES = 14  # look: what a progress bar counts at most
 
 Tell = Callable[[str], None]
 

@@ -17,7 +17,7 @@ from simgap.attribution.verdict import LEAST, MOST, WIDTH
 from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
 from simgap.robots.explained import Explained
 
-RIVALS = 8  # chosen: sets that are compared on held-out rows
+RIVALS = 8  # numerics: sets that are compared on held-out rows
 TWENTY = 20.0  # chosen: to one: odds from which on a rival is ruled out
 
 

@@ -22,7 +22,7 @@ from simgap.robots.phases import Phases
 from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
-LEADERS = 24  # chosen: candidates that a search goes on with
+LEADERS = 24  # numerics: candidates that a search goes on with
 STEPS = 8  # numerics: evaluations of a least-squares fit
 SETTLED = 2.0  # chosen: nats that a further round must gain
 

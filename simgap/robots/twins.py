@@ -20,7 +20,7 @@ from simgap.simulators.protocol import Job, run_all
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
 
-TWINS = 6  # chosen
+TWINS = 6  # numerics
 
 
 @dataclass(frozen=True)

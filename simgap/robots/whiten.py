@@ -29,8 +29,8 @@ from simgap.robots.linear import Linear
 from simgap.robots.windows import Window
 from simgap.simulators.protocol import RATE
 
-TAU = 0.1  # chosen: s: unmodelled torques last for tenths of a second
-BLOCK = 100  # chosen: samples of a channel that are whitened together, where no start ties channels
+TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
+BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
 CLOCK = "clock"  # a source whose s [s] is the sd of samples' times
 CONTACTS = "contacts"  # a source whose s is how many usual sizes every effect is off by in each contact
 TOUCHING = ", touching"  # a model is off by other amounts where bodies touch: a source of its own
-INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # chosen
+INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics
 
 
 def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: bool) -> dict[str, Source]:

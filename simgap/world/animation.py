@@ -21,8 +21,8 @@ from hmmseg.io.rig import Rig
 from hmmseg.plot.style import BLUE, GREY, INK, OTHER_COLOURS, STYLE
 from simgap.world.properties import Block
 
-FRAMES = 15.0  # chosen: a second, in real time
-SIZE, DPI = (9.0, 3.8), 90  # chosen: in
+FRAMES = 15.0  # look: a second, in real time
+SIZE, DPI = (9.0, 3.8), 90  # look: in
 PAD = (0.003, 0.008)  # numerics: m, drawn width and height of a fingertip
 SUFFIXES = (".gif", ".mp4")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-FADE = 2e-5  # chosen: m; depth over which damping fades in, so that an impact starts without a jump
+FADE = 2e-5  # numerics: m; depth over which damping fades in, so that an impact starts without a jump
 
 
 def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) -> Array:

@@ -22,7 +22,7 @@ from simgap.world.contact import friction, normal_force
 Scalar = Any  # a float or an Array of shape ()
 Scalars = tuple[Scalar, ...]
 
-EDGE = 1e-3  # chosen: m; a contact fades over this length where a face ends
+EDGE = 1e-3  # numerics: m; a contact fades over this length where a face ends
 
 
 class Physics(NamedTuple):

@@ -10,8 +10,8 @@ import numpy as np
 from hmmseg.io.task import GROUND, BlockTask, Move
 from simgap.world.properties import Blocks
 
-MIDDLE = 0.13  # chosen: m; the middle of the hand's workspace
-NUDGE = 0.005  # chosen: m; a slide where there is no room for more
+MIDDLE = 0.13  # look: m; the middle of the hand's workspace
+NUDGE = 0.005  # look: m; a slide where there is no room for more
 ORDERS = 12  # numerics: of the piles, tried to leave room for slides
 
 

@@ -25,9 +25,9 @@ from simgap.world.scene import finite_stiffness
 
 Range = tuple[float, float]
 TREMOR_BAND = (6.0, 12.0)  # cited: Hz
-WANDER_BAND = (0.1, 0.6)  # chosen: Hz
-HOVER = 0.008  # chosen: m; open fingers pass this far above the highest block
-NEAR = 0.0025  # chosen: m above touchdown, where a quick descent becomes a slow approach
+WANDER_BAND = (0.1, 0.6)  # prior: Hz
+HOVER = 0.008  # look: m; open fingers pass this far above the highest block
+NEAR = 0.0025  # look: m above touchdown, where a quick descent becomes a slow approach
 PACE = 5.0  # cited: s a move at least, the paper's (two moves in 10 s)
 
 

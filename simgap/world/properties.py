@@ -15,7 +15,7 @@ from estimation.actual import read_actual
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask
 
-DEFAULT_FRICTION = 1.2  # chosen: of foam on a block, where nothing says otherwise
+DEFAULT_FRICTION = 1.2  # prior: of foam on a block, where nothing says otherwise
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 
 

@@ -23,7 +23,7 @@ from simgap.world.virtual_model import Rollout, rollout, standing
 
 BUCKET = 4000  # numerics: control periods; padded to multiples, so that few programs are compiled
 LOADED = 5.0  # chosen: a finger is loaded above so many standard deviations of the force noise
-APART = 0.1  # chosen: m; where a block stands that the recording never locates
+APART = 0.1  # look: m; where a block stands that the recording never locates
 
 # physics: mean and difference coordinates (x, y, distance, offset) from tips (x1, y1, x2, y2), and back.
 TO_MEAN = np.array([[0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5], [-1, 0, 1, 0], [0, -1, 0, 1]])

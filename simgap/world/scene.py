@@ -13,7 +13,7 @@ from hmmseg.io.rig import Rig
 from simgap.world.dynamics import Physics
 from simgap.world.properties import Block
 
-RIGID_PAD = 1e5  # chosen: N/m in place of inf: 3 N of grip compress such a pad by 0.03 mm
+RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pad by 0.03 mm
 
 
 @dataclass(frozen=True)

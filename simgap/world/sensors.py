@@ -10,9 +10,9 @@ from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial
 
 DEFAULT_RATE = 20.0  # cited: Hz, the paper's
 # chosen: standard deviations of one sample where a rig leaves them to be learned
-# chosen: rad, m, rad/s, N
+# prior: rad, m, rad/s, N
 DEFAULT_NOISE = {"angle": 2e-4, "position": 3e-5, "velocity": 0.03, "force": 0.012}
-DEFAULT_CARTESIAN_VELOCITY = 0.004  # chosen: m/s
+DEFAULT_CARTESIAN_VELOCITY = 0.004  # prior: m/s
 
 
 def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig,

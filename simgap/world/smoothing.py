@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 REACHES = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # numerics: samples on a side
-TOLERANCE = 1.2  # chosen: standard deviation allowed over the sensors': a held finger still trembles
+TOLERANCE = 1.2  # prior: standard deviation allowed over the sensors': a held finger still trembles
 LEVEL = 0.1  # chosen: of the test that refutes a window
 AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must agree with the narrower ones
 

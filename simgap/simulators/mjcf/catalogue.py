@@ -20,8 +20,8 @@ from simgap.simulators.mjcf.setting import Setting, names_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
-SHARE = 0.03  # chosen: of the torques that a joint shows: the usual size of what a model lacks there
-SIZE = 0.1  # chosen: of a value that the model states, likewise
+SHARE = 0.03  # prior: of the torques that a joint shows: the usual size of what a model lacks there
+SIZE = 0.1  # prior: of a value that the model states, likewise
 GEOMS = 4  # chosen: pairs of touching geoms, those that touch most, whose contact is offered
 
 

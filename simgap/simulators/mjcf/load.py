@@ -213,7 +213,7 @@ def _unit(mujoco: Any, model: Any, column: Mapped) -> str:
     return {"position": "m", "velocity": "m/s", "force": "N", "torque": "N m"}[column.kind]
 
 
-LATITUDE = 0.2  # chosen: share of a joint's range by which a log may exceed it
+LATITUDE = 0.2  # limit: share of a joint's range by which a log may exceed it
 
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
