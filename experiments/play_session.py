@@ -77,6 +77,17 @@ class Page:
         self.call("Input.dispatchMouseEvent", type=kind, x=left, y=top, button=button,
                   buttons=int(self._pressed), clickCount=int(not moved))  # fmt: skip
 
+    def touch(self, kind: str, *places: tuple[float, float]) -> None:
+        """Touches at places of the scene [m]: `touchStart`, `touchMove`, or `touchEnd` without any."""
+        self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+        points = [self.value(f"toScreen({x}, {y})") for x, y in places]
+        self.call("Input.dispatchTouchEvent", type=kind,
+                  touchPoints=[{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)])  # fmt: skip
+
+    def choose(self, element: str, option: str) -> None:
+        """Choose an option of a list."""
+        self.value(f"$('{element}').value = '{option}'; $('{element}').dispatchEvent(new Event('change'))")
+
     def click(self, element: str) -> None:
         """Click the middle of an element."""
         box = self.value(

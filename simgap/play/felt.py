@@ -36,13 +36,18 @@ def felt_effects() -> dict[str, Effect]:
 
 
 def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Parameters of an effect as given, the rest strong enough to be felt; InputError for an unknown one."""
+    """Parameters of an effect as given; without any, strong enough to be felt, in its first form.
+
+    InputError for an unknown effect.
+    """
     known = felt_effects()
     if name not in known:
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
-    usual = STRONG.get(name) or LATE.get(name) or {
-        p.name: p.neutral if p.log or p.shape else OFTEN * p.sd for p in known[name].parameters
-    }  # fmt: skip
+    parameters, forms = known[name].parameters, known[name].forms
+    nothing = {p.name: p.neutral if p.log or p.shape else 0.0 for p in parameters}
+    first = forms[0] if forms else tuple(nothing)  # forms overlap: a gain of a finger beside that of both
+    strong = {p.name: OFTEN * p.sd for p in parameters if p.name in first and not (p.log or p.shape)}
+    usual = STRONG.get(name) or LATE.get(name) or nothing | ({} if given else strong)
     return dict(usual) | {key: float(value) for key, value in (given or {}).items() if np.isfinite(value)}
 
 

@@ -120,6 +120,13 @@ def test_scene_effects_change_the_scene():
     assert rig.fingertip.normal_stiffness == 800.0
 
 
+def test_an_effect_has_the_parameters_of_one_form_alone():
+    gain = {key: value for key, value in effect_values("force_gain").items() if value}
+    assert gain.keys() == {"gain"}
+    one = {key: value for key, value in effect_values("force_gain", {"fx1": 0.1}).items() if value}
+    assert one == {"fx1": 0.1}
+
+
 @pytest.mark.parametrize("name", sorted(felt_effects()))
 def test_every_offered_effect_can_be_felt(name):
     t = np.arange(400) * 1e-3
@@ -234,6 +241,51 @@ def test_a_mouse_in_a_real_browser_stacks_the_blocks(tmp_path):
     assert y1 == pytest.approx(PAPER_BLOCKS["block2"].height + PAPER_BLOCKS["block1"].height / 2, abs=3e-4)
     assert abs(x1 - x2) < 3e-3
     check_identified(tmp_path)
+
+
+@pytest.mark.slow
+def test_two_touches_in_a_real_browser_lift_a_block(tmp_path):
+    """Each finger follows its own touch, through its own spring; a squeeze by both lifts what is between."""
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    with served(tmp_path) as address, browser(address) as page:
+        page.until("scene && frame && frame.t > 0.3")
+        x, y = page.value("frame.worlds[0].blocks[0]")
+        wide, half = page.value("scene.home")[1], page.value("Object.values(scene.blocks)[0][0]") / 2
+        page.touch("touchStart", (x - half - 0.015, wide), (x + half + 0.015, wide))
+        page.wait(0.8, False)
+        left, right = page.value("frame.worlds[0].tips")
+        assert right[0] - left[0] > 2 * half + 0.015
+        for apart, height in ((0.015, y), (-0.008, y), (-0.008, y + 0.012)):
+            page.touch("touchMove", (x - half - apart, height), (x + half + apart, height))
+            page.wait(1.0, False)
+        assert (
+            page.value("frame.worlds[0].force[0][0]") > 1.0
+            and page.value("frame.worlds[0].force[1][0]") < -1.0
+        )
+        assert page.value("frame.worlds[0].blocks[0][1]") - y > 0.005
+
+
+@pytest.mark.slow
+def test_a_second_world_in_a_real_browser_is_seen_and_felt(tmp_path):
+    """An effect chosen in the page stands beside the nominal world, with the same hand in both."""
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    with served(tmp_path) as address, browser(address) as page:
+        page.until("scene && frame && frame.t > 0.3")
+        assert page.value("$('other').hidden") and page.value("frame.worlds.length") == 1
+        page.choose("effect", "force_gain")
+        page.until("Object.keys(scene.effects).length === 1 && frame.worlds.length === 2 && frame.t > 0.3")
+        assert not page.value("$('other').hidden") and page.value("$('other').width") > 200
+        x, y = page.value("frame.worlds[0].blocks[0]")
+        for kind in ("mouseMoved", "mousePressed"):
+            page.mouse(kind, x, y)
+            page.wait(1.2, False)
+        gain = page.value("scene.effects.force_gain.gain")
+        one, other = (world["force"][0][0] for world in page.value("frame.worlds"))
+        assert one > 1.0 and other / one == pytest.approx(1 + gain, rel=0.05)
+        page.choose("effect", "")
+        page.until("frame.worlds.length === 1 && $('other').hidden")
 
 
 def test_the_command_ends_with_its_terminal(tmp_path):
