@@ -13,7 +13,7 @@ import typer
 
 import hmmseg
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.trial import LARGEST
+from hmmseg.io.units import LARGEST, si_factor
 from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, SeedOption, TaskOption
 
 if TYPE_CHECKING:
@@ -109,7 +109,6 @@ class Rows:
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
         from hmmseg.io.columns import Column, source_of
-        from hmmseg.io.units import si_factor
 
         self._stream, self._number = stream, 1
         header = stream.readline().decode("utf-8-sig", "replace").strip()

@@ -16,13 +16,12 @@ from hmmseg.io.frames import frame_table
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.task import SequenceTask, Task
-from hmmseg.io.units import si_factor
+from hmmseg.io.units import LARGEST, si_factor
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
 CARTESIAN_OPTIONAL = ("vx1", "vy1", "vx2", "vy2")
 MIN_SAMPLES = 8  # limit: fewer show no task
-LARGEST = 1e9  # physics: m, N or rad; no hand's sensor reads as much, and squares of it are far from overflow
 MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
 

@@ -7,6 +7,8 @@ import re
 
 from hmmseg.errors import nearest
 
+LARGEST = 1e9  # physics: m, N or rad; no hand's sensor reads as much, and squares of it are far from overflow
+
 # name: (what it measures, its size in SI)
 UNITS: dict[str, tuple[str, float]] = {
     "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9),
