@@ -97,10 +97,10 @@ def _commonest(height: np.ndarray) -> float:
     return float(cells[counts.argmax()])
 
 
-def run(folder: Path, seed: int = 0) -> dict:
+def run(folder: Path) -> dict:
     """Lift-off and putting-down of every recording, from forces and from height."""
     handovers = [read_handover(path) for path in sorted(folder.iterdir()) if path.is_dir()]
-    results = segment_sequence([h.trial for h in handovers], TASK, seed=seed)
+    results = segment_sequence([h.trial for h in handovers], TASK)
     rows = []
     for handover, result in zip(handovers, results, strict=True):
         start = {span.subtask: span for span in result.spans}
