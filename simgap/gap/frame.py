@@ -25,8 +25,7 @@ class Arrays(NamedTuple):
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): its sensor noise
     in units of the channel; `kind` (T, N): 2 * phase, + 1 beside a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
-    `sample` (T, N, C): noise of one sample of a channel itself; `give` (2, 2) [m/N]: the nominal pads' normal
-    and shear compliance of both fingers.
+    `sample` (T, N, C): noise of one sample of a channel itself.
     """
 
     there: np.ndarray
@@ -38,7 +37,6 @@ class Arrays(NamedTuple):
     rises: np.ndarray
     phase: np.ndarray
     sample: np.ndarray
-    give: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,6 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         rises,
         stack["phase"],
         stack["sample"],
-        np.repeat([[1 / rig.fingertip.normal_stiffness], [1 / rig.fingertip.shear_stiffness]], 2, axis=1),
     )
     lengths = tuple(r["t"].size for r in rows)
     return Frame(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from hmmseg.contact.equations import Pads, block_offset, block_width, block_x, block_y, support_load
 from simgap.effects.base import LATE, RINGING, SMOOTH, World, gradient, tips
@@ -98,7 +97,7 @@ def residuals(
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     speeds = _compact(mean_v) - gradient(world.t, mean_p)
-    geometry = jnp.stack([x, y, distance * held, offset], -1) * _as_nominal(world, arrays)
+    geometry = jnp.stack([x, y, distance * held, offset], -1)
     # In the units of what was recorded: an effect must not gain by scaling the noise down.
     size = jnp.mean(world.link)
     loose = jnp.stack([jnp.ones_like(x), loose_y, jnp.ones_like(x), loose_offset], -1)
@@ -107,29 +106,6 @@ def residuals(
         jnp.concatenate([geometry / size, speeds / size, forces], -1),
         jnp.concatenate([factor, jnp.ones_like(speeds), 1 + either / jnp.square(noise[..., 6:])], -1),
     )
-
-
-def _as_nominal(world: World, arrays: Arrays) -> jax.Array:
-    """The nominal noise (T, N, 4) of x, y, distance and offset over what their residuals' noise is here.
-
-    A force reaches them through the pads' give, and brings its noise along: stiffer pads, or forces scaled
-    down, would pass for an explanation by leaving less of it (errors in variables: in the functional model
-    residuals count by their own variance, and no determinant is added: Fuller, Measurement Error Models,
-    1987, ch. 2). x is told to no such precision.
-    """
-
-    def ratio(place: str, net: str, own: jax.Array, usual: jax.Array | np.ndarray) -> jax.Array:
-        # Of both fingers' difference; their mean has a quarter of each, so that the ratio is the same.
-        position = jnp.square(arrays.sample[..., CHANNELS.index(place)])
-        force = 2 * jnp.square(arrays.sample[..., CHANNELS.index("shear")])
-        loud = jnp.square(world.loudness[..., ("fx", "fy", "grip", "shear").index(net)])
-        give, nominal = jnp.square(own).sum(), jnp.square(usual).sum()
-        return jnp.sqrt((position + nominal * force) / (position + give * force / loud))
-
-    normal, shear = arrays.give
-    along = ratio("distance", "grip", world.give_normal, normal)
-    height, offset = (ratio("offset", net, world.give_shear, shear) for net in ("fy", "shear"))
-    return jnp.stack([jnp.ones_like(along), height, along, offset], -1)
 
 
 def _doubt(world: World, firm: jax.Array) -> jax.Array:
