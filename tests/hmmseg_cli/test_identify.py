@@ -142,6 +142,10 @@ def test_demo_runs_on_the_packages_own_recordings(tmp_path, monkeypatch):
     assert {"corner.png", "report.html"} <= {p.name for p in (tmp_path / "demo").iterdir()}
     for block in found["actual"].values():
         assert all(abs(entry["relative_deviation"]) < 0.02 for entry in block.values())
+    pads = found["diagnosis"]["effects"]["fingertip_compliance"]["parameters"]
+    for name, true in (("normal_stiffness", 4000.0), ("shear_stiffness", 2500.0)):
+        low, high = pads[name]["interval_90"]
+        assert low < true < high and high - low < 0.15 * true, name  # what their rig.toml states
 
 
 @pytest.mark.parametrize(
