@@ -18,14 +18,14 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
-UNSTATED = 0.8  # prior: prior sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
+UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
 CLOSED = 0.15  # chosen: of the grip's own force: below it, one finger may not touch yet
 MIN_SAMPLES = 6  # numerics
 TAIL = 4.0  # prior: of the residuals, Student-t, as everywhere (hmmseg.segmentation.emissions)
-# chosen: standard deviation of one slope beyond its sampling, and of all alike, as forces and positions are
+# prior: standard deviation of one slope beyond its sampling, and of all alike, as forces and positions are
 # read apart in time: measured on a robot arm's recordings whose pads are known springs (0.04 and 0.08 off).
 SLOPE_SD = 0.1
-SURPRISING = 4.0  # prior: standard errors of what the rig admits; as with forces in free motion
+SURPRISING = 4.0  # chosen: standard errors of what the rig admits; as with forces in free motion
 
 
 @dataclass(frozen=True)

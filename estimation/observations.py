@@ -30,7 +30,7 @@ from hmmseg.segmentation.emissions import TAIL
 from hmmseg.segmentation.features import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
-MAX_RATE = 50.0  # numerics: Hz; noise of finer samples is averaged before it is weighed
+MAX_RATE = 50.0  # chosen: Hz; noise of finer samples is averaged before it is weighed
 NUM_ALIGNMENTS = 16  # numerics
 MIN_STRETCH = 0.5  # chosen
 LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-CONCENTRATION = 1.0  # prior: prior weight of G, in samples
+CONCENTRATION = 1.0  # prior: weight of G, in samples
 BINS_PER_SD = 3.0  # numerics: bins of G to the smallest noise
 MAX_BINS = 300  # numerics
 GLITCH = 0.01  # prior: share of samples that say nothing: a bound must rest on more than one

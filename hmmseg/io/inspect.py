@@ -17,7 +17,7 @@ from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.units import unit_in_name
 
 BUCKETS = 24  # numerics: of a small plot
-GAP = 3.0  # limit: usual sample periods
+GAP = 3.0  # chosen: usual sample periods
 
 
 @dataclass(frozen=True)

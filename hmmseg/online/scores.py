@@ -56,11 +56,11 @@ from hmmseg.online.layout import (
 )
 from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TOUCHING
 
-STILL = 0.2  # prior: prior share of samples at which a hand that may move stands still,
+STILL = 0.2  # prior: share of samples at which a hand that may move stands still,
 SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # prior: ... times this while a lift begins: slow, but a motion
-ALIKE = 0.5  # prior: prior probability that a block not met yet is like one that was
+ALIKE = 0.5  # prior: probability that a block not met yet is like one that was
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
 _LOG_TOUCHED, _LOG_TOUCHING = math.log1p(-TOUCHING), math.log(TOUCHING)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)

@@ -18,7 +18,7 @@ from hmmseg.online.wrist import Wrist, checked
 
 LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points over the lag to which a late row returns
-GAP = 3.0  # limit: usual intervals between rows that make a gap
+GAP = 3.0  # chosen: usual intervals between rows that make a gap
 USUAL = 0.02  # chosen: how fast the usual interval follows
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",

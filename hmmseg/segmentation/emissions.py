@@ -30,9 +30,9 @@ from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
 TAIL = 4.0  # cited: degrees of freedom of the Student-t residuals
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's (foam giving late)
-STILL = 0.1  # prior: prior share of a carry's samples at which the block is held still
+STILL = 0.1  # prior: share of a carry's samples at which the block is held still
 LOST = 1e-3  # chosen: share of a carry's samples at which a grip that slips has lost the block for a moment
-ONE_FINGER = 0.02  # prior: prior share of free samples at which one finger alone touches
+ONE_FINGER = 0.02  # prior: share of free samples at which one finger alone touches
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.emissions import Features
 
-MAX_RATE = 40.0  # numerics: Hz; faster recordings are read at this rate, fast enough for a hand
+MAX_RATE = 40.0  # chosen: Hz; faster recordings are read at this rate, fast enough for a hand
 WINDOW = 6e-3  # chosen: s over which such a reading is averaged; a contact changes no faster
 
 

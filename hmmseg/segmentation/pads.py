@@ -25,9 +25,9 @@ from hmmseg.io.rig import Rig
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, stretches
 
-# chosen: of a stated stiffness, where the rig does not say: foams of one make differ by as much
+# prior: of a stated stiffness, where the rig does not say: foams of one make differ by as much
 STIFFNESS_SD = 0.3
-RIGID = 2e-5  # prior: m/N; a stiffer pad hides its compression from any force sensor
+RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force sensor
 SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after all
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
 SLOWEST = 0.1  # prior: s; time constant of a force sensor's filter

@@ -19,7 +19,7 @@ from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import contact_changes
 
 Spans = Sequence[tuple[float, float]]
-LOCAL_RATE = 100.0  # numerics: Hz; contacts are located at up to this rate, at which readings share no noise
+LOCAL_RATE = 100.0  # chosen: Hz; contacts are located at up to this rate, at which readings share no noise
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-# chosen: share of samples at which one sensor tells another story than the model (ringing, a block
+# prior: share of samples at which one sensor tells another story than the model (ringing, a block
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
-SURE = 5.0  # prior: sds of noise for a contact to be sure
+SURE = 5.0  # chosen: sds of noise for a contact to be sure
 TAIL = 4.0  # prior: Student-t residuals, as in the emissions
 
 

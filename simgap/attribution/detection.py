@@ -16,10 +16,10 @@ from simgap.attribution.background import Background
 from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.attribution.search import sought
 
-# chosen: shares of groups off beside the usual one: a gap may be in one place alone
+# prior: shares of groups off beside the usual one: a gap may be in one place alone
 RARE = (0.002, 0.01, 0.03)
 ENOUGH = 4  # cited: twins as extreme after which a p-value is clear (Besag & Clifford's h)
-FEW, SURE = 4, 1e-6  # prior: twins after which so small a chance is clear, if none is as extreme
+FEW, SURE = 4, 1e-6  # chosen: twins after which so small a chance is clear, if none is as extreme
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from simgap.gap.wrist_gap import absent
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
 PHASES = ("free", "pickup", "carry", "place", "slide")
-MAX_RATE = 30.0  # numerics: Hz; finer samples are averaged first
+MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
 TOUCHING = 5.0  # chosen: sds of a force by which a touch shows
 # chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
 EITHER_SIDE = 0.02

@@ -14,7 +14,7 @@ from simgap.effects.base import Effect, Performance
 from simgap.world.properties import Block, Blocks
 from simgap.world.scene import Surroundings, finite_stiffness
 
-# look: what each scene effect is set to where nothing says otherwise: strong enough to be felt. Chosen.
+# look: what each scene effect is set to where nothing says otherwise: strong enough to be felt
 STRONG = {
     "fingertip_compliance": {"normal_stiffness": 800.0, "shear_stiffness": 500.0},
     "grip_slip": {"mu": 0.12},

@@ -29,10 +29,10 @@ WHEN = {
     "place": "while you press {0} down",
     "release": "after you let go of {0}",
 }
-SLOW = 1.5  # look: Hz: below it a residual is an offset for the eye
+SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
 TINY = 1e-16  # numerics
-MOSTLY = 0.5  # look: a remainder above it is the larger part of the gap
+MOSTLY = 0.5  # chosen: a remainder above it is the larger part of the gap
 
 
 def p_text(p: float) -> str:

@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 
 from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy, Source, total
 
-# chosen: sd of a window's log multiplier: the model is off by e (sd) from window to window
+# prior: sd of a window's log multiplier: the model is off by e (sd) from window to window
 SPREAD = 1.0
 GRID = tuple(range(-6, 17, 2))  # numerics: log multipliers
-WORTH = 3.0  # prior: nats that a discrepancy must gain to be there at all
+WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 FREEDOM = 4.0  # prior: of Student's t: heavy tails, finite variance
 ENOUGH = 40  # learned: windows from which discrepancies are learned
 

@@ -12,7 +12,7 @@ from simgap.robots.windows import Window
 from simgap.simulators.protocol import Channels
 from simgap.simulators.recording import Recording
 
-RATE_LIMIT = 100.0  # numerics: Hz: residuals are means over neighbours down to this rate
+RATE_LIMIT = 100.0  # chosen: Hz: residuals are means over neighbours down to this rate
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.table import Table
 
-GAP = 3.0  # limit: usual periods
+GAP = 3.0  # chosen: usual periods
 MAX_ENTRIES = 64  # numerics: of an array in a message: images and clouds are no channels
 MAX_MESSAGES = 20_000_000  # limit: more is a damaged or hostile file
 
