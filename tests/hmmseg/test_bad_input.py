@@ -17,6 +17,7 @@ import pytest
 from estimation.actual import read_actual
 from experiments.fuzz import run
 from hmmseg.errors import InputError
+from hmmseg.example import example_folder
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
@@ -33,17 +34,7 @@ READERS = {
     "actual": lambda path: read_actual(path, ("a", "b")),
 }
 STACK = Path(__file__).parents[1] / "data/stack"
-TASK = """[objects.block1]
-on = "block2"
-[objects.block2]
-on = "ground"
-[[moves]]
-object = "block1"
-to = "ground"
-[[moves]]
-object = "block2"
-to = "block1"
-"""
+TASK = (example_folder() / "task.toml").read_text(encoding="utf-8")
 
 
 def told(call, *arguments):

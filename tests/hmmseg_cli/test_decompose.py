@@ -6,20 +6,10 @@ import json
 
 import pytest
 
+from hmmseg.example import example_folder
 from hmmseg_cli.main import main
 
-PAPER = """
-[objects.block1]
-on = "block2"
-[objects.block2]
-on = "ground"
-[[moves]]
-object = "block1"
-to = "ground"
-[[moves]]
-object = "block2"
-to = "block1"
-"""
+PAPER = (example_folder() / "task.toml").read_text(encoding="utf-8")
 
 
 @pytest.fixture

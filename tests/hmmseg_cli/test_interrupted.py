@@ -9,20 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmmseg.example import example_folder
 from hmmseg_cli.main import main
 
 STACK = Path(__file__).parents[1] / "data/stack"
-TASK = """[objects.block1]
-on = "block2"
-[objects.block2]
-on = "ground"
-[[moves]]
-object = "block1"
-to = "ground"
-[[moves]]
-object = "block2"
-to = "block1"
-"""
+TASK = (example_folder() / "task.toml").read_text(encoding="utf-8")
 PROPERTIES = {
     "objects": {name: {"weight": 0.4, "width": 0.02, "height": 0.02} for name in ("block1", "block2")}
 }
