@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.features import noise_sd
 
-MISFIT = 0.03  # chosen: share of a force's change between samples that no model of 20 Hz samples can tell,
+MISFIT = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
-FADED, FADING = 0.1, 0.5  # chosen: the same of what is recorded in free motion, so many seconds from a grip
-# chosen: share of a speed's fourth difference by which the rule for differences of positions is off
-BENT = 0.025
-SEEN = 2.0  # chosen: sds of that difference below which it is noise
+FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
+SEEN = 2.0  # prior: sds of a fourth difference below which it is noise
+FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)  # numerics: weights of a fourth difference
+MEDIAN = 0.4549  # physics: of the square of a standard normal number
+JUMPS = 64  # numerics: moments between two samples that a mean is taken over
 MOVES = 3.0  # chosen: sds of a difference by which fingers move
-NUDGE = 1e-4  # chosen: m; fingers that push unequally move a resting block by about as much
+NUDGE = 1e-4  # prior: m; fingers that push unequally move a resting block by about as much
 
 
 def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, np.ndarray]:
@@ -49,9 +52,11 @@ def channel_noise(one: dict[str, np.ndarray]) -> np.ndarray:
                      root2 * f, root2 * f, f / root2, f / root2], 1)  # fmt: skip
 
 
-def residual_noise(s: Signals, one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndarray:
+def residual_noise(
+    s: Signals, one: dict[str, np.ndarray], rig: Rig, step: float, group: int = 1
+) -> np.ndarray:
     """Noise (N, C) of each channel's residual: positions with the pads' yielding taken out, velocities less
-    differences of positions `step` s apart.
+    differences of positions `step` s apart, all of them means over `group` samples.
 
     Where the speed changes within a sample, as that of a pressed fingertip that is let go, no rule gives it.
     """
@@ -66,9 +71,8 @@ def residual_noise(s: Signals, one: dict[str, np.ndarray], rig: Rig, step: float
     ]  # fmt: skip
     out = np.stack(columns, 1)
     out[:, 0] = np.hypot(out[:, 0], _moving((s.x1 + s.x2) / 2, x / root2))
-    for channel, fingers, noise in ((4, (s.vx1, s.vx2), vx), (5, (s.vy1, s.vy2), vy)):
-        unresolved = sum(_unresolved(speed, noise) for speed in fingers) / 2
-        out[:, channel] = np.hypot(out[:, channel], unresolved)
+    for channel, place, noise in ((4, (s.x1 + s.x2) / 2, x), (5, (s.y1 + s.y2) / 2, y)):
+        out[:, channel] = np.hypot(out[:, channel], _unresolved(place, noise / root2, step, group))
     return out
 
 
@@ -81,12 +85,40 @@ def _moving(place: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.maximum(np.maximum(step[:-1], step[1:]) - MOVES * np.sqrt(2.0) * noise, 0.0)
 
 
-def _unresolved(speed: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """How far (N,) a fingertip's speed is off from differences of positions, by its fourth difference."""
-    bend = np.zeros_like(speed)
-    bend[2:-2] = np.abs(np.convolve(speed, (1, -4, 6, -4, 1), "valid"))
-    usual = SEEN * np.sqrt(70.0) * noise  # 70: the squares of these weights
-    return BENT * np.maximum(np.nan_to_num(bend) - usual, 0.0)
+def _unresolved(place: np.ndarray, noise: np.ndarray, step: float, group: int) -> np.ndarray:
+    """How far (N,) the rule for speeds is off where they jump between samples, rms over when they do.
+
+    The jump shows in the fourth difference of the positions, which are known far better than speeds: how
+    loud those are makes it no smaller. What irregular sample times do wherever a finger moves is no jump.
+    """
+    bend, speed, norm = np.zeros_like(place), np.zeros_like(place), np.linalg.norm(FOURTH)
+    place = np.nan_to_num(place)
+    bend[2:-2] = np.abs(np.convolve(place, FOURTH, "valid"))
+    speed[1:-1] = np.abs(place[2:] - place[:-2]) / (2 * step)
+    near = np.maximum(np.maximum(bend, np.roll(bend, 1)), np.roll(bend, -1))
+    moving = speed > np.sqrt(np.mean(speed**2))
+    late = 0.0
+    if moving.any():
+        seen = (bend**2 / (MEDIAN * norm**2) - noise**2)[moving]
+        late = max(float(np.median(seen / speed[moving] ** 2)), 0.0)  # s^2, variance of the sample times
+    usual = SEEN * norm * np.sqrt(noise**2 + late * speed**2)
+    return _of_a_jump(group) / step * np.sqrt(np.maximum(near**2 - usual**2, 0.0))
+
+
+@cache
+def _of_a_jump(group: int) -> float:
+    """What the rule (1, 4, 1) / 6 for speeds leaves where one jumps, over the fourth difference of positions.
+
+    In the mean square over when it jumps between two samples, each a mean over `group` finer ones.
+    """
+    when = (np.arange(JUMPS) + 0.5) / JUMPS
+    t = (np.arange(15 * group) - 7 * group + 0.5) / group - when[:, None]
+    place, speed = (z.reshape(JUMPS, 15, group).mean(2) for z in (np.maximum(t, 0.0), 1.0 * (t > 0)))
+    rule = (speed[:, :-2] + 4 * speed[:, 1:-1] + speed[:, 2:]) / 6 - (place[:, 2:] - place[:, :-2]) / 2
+    bend = np.abs(np.stack([np.convolve(row, FOURTH, "valid") for row in place]))
+    bend = np.pad(bend, ((0, 0), (2, 2)))
+    near = np.maximum(np.maximum(bend[:, :-2], bend[:, 2:]), bend[:, 1:-1])
+    return float(np.sqrt(np.square(rule).sum() / np.square(near).sum()))
 
 
 def misfit(

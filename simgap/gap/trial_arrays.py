@@ -68,7 +68,7 @@ def trial_arrays(
     there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, rig, group)
-    sd = residual_noise(signals, sample, rig, step)
+    sd = residual_noise(signals, sample, rig, step, group)
     sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, edge & (phase == 2), boundaries))
     if trial.inertia is not None:
         sd[:, 6:8] = np.hypot(sd[:, 6:8], trial.inertia)

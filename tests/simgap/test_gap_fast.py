@@ -71,11 +71,23 @@ def test_five_samples_give_slopes_to_fourth_order():
 
 
 def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
-    rng = np.random.default_rng(0)
-    noise = 0.002 * rng.standard_normal(4000)
-    sd = np.asarray(0.002)
-    assert (_unresolved(noise, sd) > 0).mean() < 0.06
-    speed = np.where(np.arange(40) < 20, 0.0, 0.2)
-    doubt = _unresolved(speed, sd)
-    assert doubt[19] > 0.01 and doubt[20] > 0.01 and not doubt[:17].any() and not doubt[23:].any()
-    assert (_unresolved(np.full(40, np.nan), sd) == 0).all()
+    rng, step = np.random.default_rng(0), 0.05
+    sd = np.full(4000, 3e-5)
+    assert (_unresolved(sd * rng.standard_normal(4000), sd, step, 1) > 0).mean() < 0.14  # largest of three
+    t = step * np.arange(40)
+    doubt = _unresolved(0.2 * np.maximum(t - 0.975, 0.0), sd[:40], step, 1)
+    assert doubt[19] > 0.005 and doubt[20] > 0.005 and not doubt[:16].any() and not doubt[24:].any()
+    irregular = step * np.arange(400) + 0.004 * rng.standard_normal(400)
+    assert (_unresolved(0.1 * np.sin(irregular), sd[:400], step, 1) > 0).mean() < 0.25
+    assert (_unresolved(np.full(40, np.nan), sd[:40], step, 1) == 0).all()
+
+
+def test_the_doubt_of_a_jump_is_as_large_as_the_rule_is_off():
+    step, found = 0.05, []
+    for when in np.linspace(0.95, 1.0, 21):
+        t = step * np.arange(40)
+        place, speed = np.maximum(t - when, 0.0), 1.0 * (t > when)
+        rule = (speed[:-2] + 4 * speed[1:-1] + speed[2:]) / 6 - (place[2:] - place[:-2]) / (2 * step)
+        found.append((np.sum(rule**2), np.sum(_unresolved(place, np.full(40, 1e-9), step, 1) ** 2)))
+    off, doubt = np.sqrt(np.mean(found, axis=0))
+    assert doubt == pytest.approx(off, rel=0.15)
