@@ -152,5 +152,5 @@ fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, i
 identified: $(INSTALLED)  ## properties and boundaries in labs drawn anew (build/drawn) and in folders of RECORDINGS
 	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 830001 --fastest 200 --out build/drawn
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --keep
-	$(BIN)/python -m experiments.identified build/drawn --pooled 1 --keep
+	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --pooled 1 --keep
 	$(BIN)/python -m experiments.write_tables
