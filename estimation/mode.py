@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from estimation.posterior import NUM_CHANNELS, Posterior
+from estimation.density import NUM_CHANNELS, Tables, log_density, padded
+from estimation.posterior import Posterior
+from hmmseg.jaxconfig import double_precision
 
+TOLERANCE, MAX_STEPS = 1e-6, 256  # numerics: relative and absolute, of scales and density
+PADDING = 8  # numerics: of deviations, rounded up to a multiple of it so that few programs are compiled
 STEP = 1e-3  # numerics: of the scales, all logarithms, for derivatives by central differences
-# numerics: of log(share / its prior median): a large share is a mode of its own
-STARTS = np.arange(-1.0, 9.0, 1.0)
+STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a large share is a mode of its own
 
 
 @dataclass(frozen=True)
@@ -27,32 +33,45 @@ class Mode:
     converged: bool
 
 
+@double_precision
 def find_mode(post: Posterior) -> Mode:
-    """Mode by BFGS from the best of a few shares a channel, with derivatives by central differences."""
-    from scipy.optimize import minimize  # slow to import
-
-    size = 6
-    steps = STEP * np.eye(size)
-
-    def loss(x: np.ndarray) -> float:
-        return -float(post.log_prob(x[None])[0])
+    """Mode by optimistix's BFGS from the best of a few shares a channel; curvature by central differences."""
+    steps = STEP * np.eye(2 * NUM_CHANNELS)
 
     def gradient(x: np.ndarray) -> np.ndarray:
-        both = post.log_prob(np.concatenate([x + steps, x - steps]))
-        return -(both[:size] - both[size:]) / (2 * STEP)
+        up, down = np.split(post.log_prob(np.concatenate([x + steps, x - steps])), 2)
+        return -(up - down) / (2 * STEP)
 
-    found = minimize(loss, _start(post), jac=gradient, method="BFGS", options={"gtol": 1e-4})
-    hessian = np.array([(gradient(found.x + h) - gradient(found.x - h)) / (2 * STEP) for h in steps])
+    found = np.array(_climb()(start_of(post), padded(post.tables, PADDING)))
+    hessian = np.array([(gradient(found + h) - gradient(found - h)) / (2 * STEP) for h in steps])
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     covariance = (vectors / np.maximum(values, 0.1)) @ vectors.T
-    mean, chol = post.given(found.x[None])
+    mean, chol = post.given(found[None])
     num = len(post.design.unknowns)
-    spread = np.linalg.inv(chol[0])[:, :num]
-    slope = float(np.abs(gradient(found.x)).max())
-    return Mode(found.x, covariance, post.reference + mean[0, :num], spread.T @ spread, slope < 1e-2)
+    factor = np.linalg.inv(chol[0])[:, :num]
+    slope = float(np.abs(gradient(found)).max())
+    return Mode(found, covariance, post.reference + mean[0, :num], factor.T @ factor, slope < 1e-2)
 
 
-def _start(post: Posterior) -> np.ndarray:
+@lru_cache
+def _climb() -> Callable[[np.ndarray, Tables], Any]:
+    """From a start (6,) to the density's next maximum (6,); one compiled program for each padded size."""
+    import jax  # these are slow to import
+    import jax.numpy as jnp
+    import optimistix
+
+    solver = optimistix.BFGS(rtol=TOLERANCE, atol=TOLERANCE)
+
+    def loss(theta: Any, tables: Tables) -> Any:
+        return -log_density(theta[None], tables, jnp)[0]
+
+    def climb(start: Any, tables: Tables) -> Any:
+        return optimistix.minimise(loss, solver, start, tables, max_steps=MAX_STEPS, throw=False).value
+
+    return jax.jit(climb)
+
+
+def start_of(post: Posterior) -> np.ndarray:
     """Scales (6,) from which to climb: each channel's share the best of STARTS, one after the other."""
     best = np.zeros(2 * NUM_CHANNELS)
     for c in range(NUM_CHANNELS):

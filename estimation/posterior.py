@@ -11,11 +11,9 @@ model error that all grips have alike,
 
 (What all grips have alike no repeat can show. It is at least what the prior says and at least as
 large as what differs between them. A slope shows the same shares as its grip's mean, but a grip that
-does not follow its equation is no reliable witness of it.) An unknown q belongs to one channel, so it is
-eliminated there: what remains of a channel is a small quadratic form in (z, e_c, f_c) that depends on
-r_c = (k_c / s_c)^2 alone, once 1 / s_c^2 is taken out. It is tabulated over r_c, and log_prob takes the
-same time whatever the number of blocks, grips and trials. Unknowns have a flat prior in here; their own
-is put in when they are drawn (`estimation.sampler`).
+does not follow its equation is no reliable witness of it.) The density of the scales is in
+`estimation.density`. Unknowns have a flat prior in here; their own is put in when they are drawn
+(`estimation.sampler`).
 """
 
 from __future__ import annotations
@@ -26,13 +24,10 @@ from functools import cached_property
 import numpy as np
 
 from estimation import priors
+from estimation.density import NUM_CHANNELS, NUM_SHARES, REACH, STEP, Tables, log_density
 from estimation.design import Design
-from estimation.observations import CHANNELS
 
-NUM_CHANNELS = len(CHANNELS)
-STEP = 0.25  # numerics: of the table, in log r: cubic interpolation is then exact to some 1e-5
-FARTHEST = 9.0  # limit: of any scale from its prior median, all logarithms
-REACH = (-18.0, 26.0)  # numerics: of the table about the prior median of log r; priors leave nothing beyond
+BATCH = 256  # numerics: densities at once, to keep memory small
 
 
 @dataclass(frozen=True)
@@ -68,8 +63,9 @@ class Posterior:
         return free.T @ (d.free_mean / d.free_variance).ravel()
 
     @cached_property
-    def _tables(self) -> list[_Table]:
-        return [_tabulate(self, c) for c in range(NUM_CHANNELS)]
+    def tables(self) -> Tables:
+        """What the density of the scales is worked out from."""
+        return _tabulate(self)
 
     def channel_rows(self, c: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of one channel: rows A (n, Q_c), rows [J, levers] (n, N + 2), residuals (n,), which Q_c."""
@@ -83,45 +79,20 @@ class Posterior:
         """Share (..., 3) of model error that differs from grip to grip."""
         return priors.SCATTER_MEDIAN * np.exp(theta[..., NUM_CHANNELS:])
 
+    @property
+    def least_variance(self) -> np.ndarray:
+        """Prior variances (6,) of the shares e and f that all grips have alike, where grips do not differ."""
+        return np.concatenate([priors.COMMON**2, self.design.slope_sd**2])
+
     def common(self, theta: np.ndarray) -> np.ndarray:
         """Prior variances (..., 6) of the shares e and f that all grips have alike."""
         own = self.shares(theta) ** 2
-        return np.concatenate([priors.COMMON**2 + own, self.design.slope_sd**2 + own], axis=-1)
-
-    def log_prior(self, theta: np.ndarray) -> np.ndarray:
-        """Log prior (W,) of scales (W, 6), up to a constant."""
-        out = -0.5 * ((theta[:, :NUM_CHANNELS] / self.scale_sd) ** 2).sum(axis=1)
-        return out - 0.5 * ((theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD) ** 2).sum(axis=1)
+        return self.least_variance + np.concatenate([own, own], axis=-1)
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
-        """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant.
-
-        -inf beyond FARTHEST, where priors leave nothing and digits would run out.
-        """
-        near = (np.abs(theta) <= FARTHEST).all(axis=1)
-        theta = np.clip(theta, -FARTHEST, FARTHEST)
-        num = len(self.design.nuisances)
-        size, log_s = num + 2 * NUM_CHANNELS, theta[:, :NUM_CHANNELS]
-        common = self.common(theta)
-        precision, gradient = np.zeros((len(theta), size, size)), np.zeros((len(theta), size))
-        precision[:, :num, :num], gradient[:, :num] = self.hand_precision, self.hand_gradient
-        out = self.log_prior(theta) - 0.5 * np.log(common).sum(axis=1)
-        for c, table in enumerate(self._tables):
-            for k in (c, NUM_CHANNELS + c):
-                precision[:, num + k, num + k] += 1 / common[:, k]
-            if not table.count:
-                continue
-            log_r = 2 * (theta[:, NUM_CHANNELS + c] - log_s[:, c])
-            weight = np.exp(-2 * log_s[:, c])
-            squares, log_det, quadratic, linear = table.at(log_r)
-            mine = [*range(num), num + c, num + NUM_CHANNELS + c]
-            precision[:, np.ix_(mine, mine)[0], np.ix_(mine, mine)[1]] += weight[:, None, None] * quadratic
-            gradient[:, mine] += weight[:, None] * linear
-            out -= 0.5 * (2 * table.count * log_s[:, c] + log_det + weight * squares)
-        chol = np.linalg.cholesky(precision)
-        white = np.linalg.solve(chol, gradient[..., None])[..., 0]
-        out += 0.5 * (white**2).sum(axis=1) - np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
-        return np.where(near, out, -np.inf)
+        """Log posterior density (W,) of scales (W, 6), all else integrated out (`density.log_density`)."""
+        parts = [log_density(theta[k : k + BATCH], self.tables) for k in range(0, len(theta), BATCH)]
+        return np.concatenate(parts)
 
     def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (W, Q + N + 6) and Cholesky factor of the precision of (q, z, e, f) given scales (W, 6).
@@ -190,47 +161,40 @@ def independent(design: Design) -> tuple[Design, np.ndarray]:
     return replace(d, **out), levers
 
 
-@dataclass(frozen=True)
-class _Table:
-    """One channel's unknowns eliminated, on a grid of log r: rows (G, 2 + (N + 2)^2 + (N + 2)).
+def _tabulate(post: Posterior) -> Tables:
+    num, grid = len(post.design.nuisances), np.exp(np.arange(REACH[0], REACH[1] + STEP, STEP))
+    size = 1 + NUM_SHARES + num
+    forms, log_det = np.zeros((NUM_CHANNELS, grid.size, size, size)), np.zeros((NUM_CHANNELS, grid.size))
+    count, hand = np.zeros(NUM_CHANNELS), np.zeros((size, size))
+    hand[1 + NUM_SHARES :, 1 + NUM_SHARES :] = post.hand_precision
+    hand[0, 1 + NUM_SHARES :] = hand[1 + NUM_SHARES :, 0] = post.hand_gradient
+    for c in range(NUM_CHANNELS):
+        rows, shared, residual, which = post.channel_rows(c)
+        if not len(rows):
+            continue
+        count[c] = len(rows) - which.size
+        place = np.array([0, 1 + c, 1 + NUM_CHANNELS + c, *range(1 + NUM_SHARES, size)])
+        every = np.concatenate([rows, residual[:, None], shared[:, num:], shared[:, :num]], axis=1)
+        left, log_det[c] = _eliminated(post, c, every, which.size, grid)
+        forms[c][:, place[:, None], place] = left
+    return Tables(forms, log_det, count, hand, post.least_variance, post.scale_sd)
 
-    `count`: observations less unknowns. Columns: sum of squares, log determinants, quadratic form
-    and linear term in (z, e, f), all for s = 1.
+
+def _eliminated(
+    post: Posterior, c: int, every: np.ndarray, num_q: int, grid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of one channel's rows (n, M) the quadratic forms (G, M - Q, M - Q) left, log determinants (G,).
+
+    The first Q columns, those of unknowns, are eliminated; s = 1, and k^2 in units of its prior median's
+    square is the grid (G,).
     """
-
-    count: int
-    values: np.ndarray
-
-    def at(self, log_r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The columns at log r (W,), relative to the prior median, by Catmull and Rom's cubic."""
-        place = np.clip((log_r - REACH[0]) / STEP, 1.0, len(self.values) - 3.001)
-        index = place.astype(int)
-        t = place - index
-        weights = 0.5 * np.stack([
-            t * (t * (2 - t) - 1), t**2 * (3 * t - 5) + 2, t * (t * (4 - 3 * t) + 1), t**2 * (t - 1)
-        ])  # fmt: skip
-        found = np.einsum("kw,kwf->wf", weights, self.values[index + np.arange(-1, 3)[:, None]])
-        size = int(np.sqrt(found.shape[1] - 1.75) - 0.5)
-        return found[:, 0], found[:, 1], found[:, 2:-size].reshape(-1, size, size), found[:, -size:]
-
-
-def _tabulate(post: Posterior, c: int) -> _Table:
-    rows, shared, residual, _ = post.channel_rows(c)
-    if not len(rows):
-        return _Table(0, np.zeros((0, 0)))
     mine = post.rows.channel == c
     unit2 = (priors.SCATTER_MEDIAN[c] * post.rows.unit[mine]) ** 2
-    grid = np.exp(np.arange(REACH[0], REACH[1] + STEP, STEP))
     variance = post.rows.variance[mine] + grid[:, None] * unit2  # G, n
-    every = np.concatenate([rows, shared, residual[:, None]], axis=1)
-    size = every.shape[1]
-    outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), size**2)
-    normal = (1 / variance @ outer).reshape(len(grid), size, size)
-    num_q = rows.shape[1]
+    outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), -1)
+    normal = (1 / variance @ outer).reshape(len(grid), every.shape[1], every.shape[1])
     chol = np.linalg.cholesky(normal[:, :num_q, :num_q])
     cross = np.linalg.solve(chol, normal[:, :num_q, num_q:])
-    rest = normal[:, num_q:, num_q:] - np.swapaxes(cross, 1, 2) @ cross
-    log_det = np.log(variance).sum(axis=1) + 2 * np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
-    quadratic = rest[:, :-1, :-1].reshape(len(grid), -1)
-    values = np.concatenate([rest[:, -1:, -1], log_det[:, None], quadratic, rest[:, :-1, -1]], axis=1)
-    return _Table(len(rows) - num_q, values)
+    left = normal[:, num_q:, num_q:] - np.swapaxes(cross, 1, 2) @ cross
+    halved = np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
+    return left, np.log(variance).sum(axis=1) + 2 * halved

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import priors
+from estimation.density import NUM_CHANNELS
 from estimation.observations import CHANNELS
-from estimation.posterior import NUM_CHANNELS, Posterior
+from estimation.posterior import Posterior
 from estimation.sampler import Draws
 
 NUM_REPLICATES = 400  # numerics

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.special import gammaln
 
 from estimation import priors
+from estimation.density import NUM_CHANNELS
 from estimation.mode import Mode
-from estimation.posterior import NUM_CHANNELS, Posterior
+from estimation.posterior import Posterior
 
 TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
 WIDEN = 1.1  # numerics: of the Laplace covariance, likewise

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import emcee
 import numpy as np
 
-from estimation import priors
+from estimation.density import log_density
 from estimation.mode import find_mode
-from estimation.posterior import NUM_CHANNELS, REACH, STEP, Posterior, posterior
+from estimation.posterior import Posterior, posterior
 from estimation.proposal import proposal
 from estimation.sampler import BURN_IN, WALKERS, draw_unknowns, effective_sample_size, sample
 from experiments.saving import save
@@ -39,51 +39,14 @@ def task_posterior(blocks: int, trials: int, number: int = 0) -> Posterior:
     return posterior(drawn(design_of(blocks, trials, rng), rng)[0])
 
 
-def log_prob_of(post: Posterior) -> Callable:
-    """`post.log_prob` of one row of scales (6,) in JAX."""
-    import jax.numpy as jnp
-
-    num, size = len(post.design.nuisances), len(post.design.nuisances) + 2 * NUM_CHANNELS
-    tables = [(t.count, jnp.asarray(t.values)) for t in post._tables]
-    hand = jnp.zeros((size, size)).at[:num, :num].set(post.hand_precision)
-    pull = jnp.zeros(size).at[:num].set(post.hand_gradient)
-
-    def of(theta):
-        log_s, log_k = theta[:NUM_CHANNELS], theta[NUM_CHANNELS:]
-        own = (priors.SCATTER_MEDIAN * jnp.exp(log_k)) ** 2
-        common = jnp.concatenate([priors.COMMON**2 + own, post.design.slope_sd**2 + own])
-        precision, gradient = hand + jnp.diag(jnp.concatenate([jnp.zeros(num), 1 / common])), pull
-        out = -0.5 * ((log_s / post.scale_sd) ** 2).sum() - 0.5 * jnp.log(common).sum()
-        out -= 0.5 * ((log_k / priors.SCATTER_LOG_SD) ** 2).sum()
-        for c, (count, values) in enumerate(tables):
-            if not count:
-                continue
-            place = jnp.clip((2 * (log_k[c] - log_s[c]) - REACH[0]) / STEP, 1.0, len(values) - 3.001)
-            index = place.astype(int)
-            t = place - index
-            weights = 0.5 * jnp.stack([t * (t * (2 - t) - 1), t**2 * (3 * t - 5) + 2,
-                                       t * (t * (4 - 3 * t) + 1), t**2 * (t - 1)])  # fmt: skip
-            found = weights @ values[index + jnp.arange(-1, 3)]
-            weight = jnp.exp(-2 * log_s[c])
-            mine = jnp.array([*range(num), num + c, num + NUM_CHANNELS + c])
-            quadratic = found[2 : -len(mine)].reshape(len(mine), len(mine))
-            precision = precision.at[mine[:, None], mine].add(weight * quadratic)
-            gradient = gradient.at[mine].add(weight * found[-len(mine) :])
-            out -= 0.5 * (2 * count * log_s[c] + found[1] + weight * found[0])
-        chol = jnp.linalg.cholesky(precision)
-        white = jnp.linalg.solve(chol, gradient)
-        return out + 0.5 * (white**2).sum() - jnp.log(jnp.diag(chol)).sum()
-
-    return of
-
-
 def nuts(post: Posterior, seed: int = 0) -> tuple[np.ndarray, float]:
     """Chains (CHAINS, KEPT, 6) of the scales and the processor time of sampling, compiled before [s]."""
     import jax
+    import jax.numpy as jnp
     from numpyro.infer import MCMC, NUTS
 
-    density = log_prob_of(post)
-    kernel = NUTS(potential_fn=lambda x: -density(x), target_accept_prob=0.9)
+    tables = jax.tree.map(jnp.asarray, post.tables)
+    kernel = NUTS(potential_fn=lambda x: -log_density(x[None], tables, jnp)[0], target_accept_prob=0.9)
     mode = find_mode(post).scales
     start = mode + 0.1 * np.random.default_rng(seed).normal(size=(CHAINS, mode.size))
     mcmc = MCMC(kernel, num_warmup=WARM_UP, num_samples=KEPT, num_chains=CHAINS, chain_method="sequential",

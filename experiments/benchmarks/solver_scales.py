@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+STEPS = 1e-3 * np.eye(6)  # of the scales, for differences
 # What a run gives: the cost of each solution, and the solutions.
 Solve = Callable[[], tuple[list[float], list[np.ndarray]]]
 
@@ -35,103 +35,44 @@ def scales_problem(folder: Path):
     return posterior(build(trials, weighed, noise, aligned.task, rig))
 
 
-def scales_scipy(folder: Path) -> Solve:
-    """BFGS by SciPy, as `identify` has it."""
+def scales_optimistix(folder: Path) -> Solve:
+    """BFGS by optimistix, as `identify` has it."""
     post = scales_problem(folder)
     post.log_prob(np.zeros((1, 6)))  # its tables are part of the problem
 
-    def solve() -> tuple[list[float], list[np.ndarray]]:
+    def climb() -> np.ndarray:
         from estimation.mode import find_mode
 
-        mode = find_mode(post)
-        return [-float(post.log_prob(mode.scales[None])[0])], [mode.scales]
+        return find_mode(post).scales
 
-    return solve
+    return _solve(post, climb)
 
 
-def scales_optimistix(folder: Path) -> Solve:
-    """BFGS by optimistix from the same start, the objective written again in JAX."""
-    from estimation.mode import _start
-
+def scales_scipy(folder: Path) -> Solve:
+    """BFGS by SciPy from the same start, with derivatives and curvature by central differences."""
     post = scales_problem(folder)
-    start = _start(post)
+    post.log_prob(np.zeros((1, 6)))
 
-    @lru_cache
-    def program():
-        import equinox
-        import jax
-        import optimistix
+    def gradient(x: np.ndarray) -> np.ndarray:
+        up, down = np.split(post.log_prob(np.concatenate([x + STEPS, x - STEPS])), 2)
+        return -(up - down) / (2 * STEPS[0, 0])
 
-        cost, solver = jax_objective(post), optimistix.BFGS(rtol=1e-6, atol=1e-6)
+    def climb() -> np.ndarray:
+        from scipy.optimize import minimize
 
-        @equinox.filter_jit
-        def run(x, data):
-            found = optimistix.minimise(cost, solver, x, data, throw=False).value
-            return found, jax.hessian(cost)(found, data)  # find_mode has it too
+        from estimation.mode import start_of
 
-        return run
+        found = minimize(lambda x: -float(post.log_prob(x[None])[0]), start_of(post), jac=gradient,
+                         method="BFGS", options={"gtol": 1e-4}).x  # fmt: skip
+        assert np.isfinite([gradient(found + h) - gradient(found - h) for h in STEPS]).all()
+        return found
 
+    return _solve(post, climb)
+
+
+def _solve(post, climb: Callable[[], np.ndarray]) -> Solve:
     def solve() -> tuple[list[float], list[np.ndarray]]:
-        import jax.numpy as jnp
-
-        found, hessian = program()(jnp.asarray(start), jax_tables(post))
-        assert np.isfinite(np.asarray(hessian)).all()
-        x = np.asarray(found)
-        return [-float(post.log_prob(x[None])[0])], [x]
+        found = climb()
+        return [-float(post.log_prob(found[None])[0])], [found]
 
     return solve
-
-
-def jax_tables(post):
-    """Arrays that the JAX objective takes: of each channel its count, table and places in the hand."""
-    import jax.numpy as jnp
-
-    tables = tuple(jnp.asarray(t.values) for t in post._tables)
-    return tables, *(jnp.asarray(z) for z in (post.hand_precision, post.hand_gradient, post.scale_sd))
-
-
-def jax_objective(post):
-    """Minus `post.log_prob` of scales (6,), in JAX."""
-    import jax.numpy as jnp
-    from jax.scipy.linalg import solve_triangular
-
-    from estimation import priors
-    from estimation.posterior import NUM_CHANNELS, REACH, STEP
-
-    num, counts = len(post.design.nuisances), [t.count for t in post._tables]
-    size = num + 2 * NUM_CHANNELS
-
-    def cost(theta, data):
-        tables, hand_precision, hand_gradient, scale_sd = data
-        log_s = theta[:NUM_CHANNELS]
-        own = (jnp.asarray(priors.SCATTER_MEDIAN) * jnp.exp(theta[NUM_CHANNELS:])) ** 2
-        common = jnp.concatenate(
-            [jnp.asarray(priors.COMMON) ** 2 + own, jnp.asarray(post.design.slope_sd) ** 2 + own]
-        )
-        precision = jnp.zeros((size, size)).at[:num, :num].set(hand_precision)
-        precision = precision + jnp.diag(jnp.concatenate([jnp.zeros(num), 1 / common]))
-        gradient = jnp.zeros(size).at[:num].set(hand_gradient)
-        out = -0.5 * jnp.sum((log_s / scale_sd) ** 2) - 0.5 * jnp.sum(jnp.log(common))
-        out -= 0.5 * jnp.sum((theta[NUM_CHANNELS:] / jnp.asarray(priors.SCATTER_LOG_SD)) ** 2)
-        for c, (count, values) in enumerate(zip(counts, tables, strict=True)):
-            if not count:
-                continue
-            log_r = 2 * (theta[NUM_CHANNELS + c] - log_s[c])
-            place = jnp.clip((log_r - REACH[0]) / STEP, 1, len(values) - 3.001)
-            index = jnp.floor(place).astype(int)
-            t = place - index
-            weights = 0.5 * jnp.stack([
-                t * (t * (2 - t) - 1), t**2 * (3 * t - 5) + 2, t * (t * (4 - 3 * t) + 1), t**2 * (t - 1)
-            ])  # fmt: skip
-            row = weights @ values[index + jnp.arange(-1, 3)]
-            mine = np.array([*range(num), num + c, num + NUM_CHANNELS + c])
-            quadratic, linear = row[2 : -mine.size].reshape(mine.size, mine.size), row[-mine.size :]
-            weight = jnp.exp(-2 * log_s[c])
-            precision = precision.at[np.ix_(mine, mine)].add(weight * quadratic)
-            gradient = gradient.at[mine].add(weight * linear)
-            out -= 0.5 * (2 * count * log_s[c] + row[1] + weight * row[0])
-        chol = jnp.linalg.cholesky(precision)
-        white = solve_triangular(chol, gradient, lower=True)
-        return -(out + 0.5 * white @ white - jnp.log(jnp.diagonal(chol)).sum())
-
-    return cost

@@ -1,10 +1,14 @@
 """The mode of the scales is a mode, and finds the scatter that was planted."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from estimation_scene import SD, UNIT, drawn, make_design
+from scipy.optimize import minimize
 
 from estimation import priors
+from estimation.density import log_density, padded
 from estimation.mode import find_mode
 from estimation.posterior import posterior
 
@@ -23,6 +27,40 @@ def test_the_mode_is_stationary_and_its_covariance_the_inverse_curvature():
     np.testing.assert_allclose(slope, 0.0, atol=2e-2)
     curvature = [[(at(a, b) - at(a, -b) - at(-a, b) + at(-a, -b)) / (4 * h * h) for b in eye] for a in eye]
     np.testing.assert_allclose(-np.array(curvature) @ mode.covariance, np.eye(6), atol=0.02)
+
+
+@pytest.mark.parametrize("deviations", [0, 2])
+def test_scipy_finds_the_same_mode(deviations):
+    post = posterior(drawn(make_design(deviations=deviations), 5)[0])
+    mode = find_mode(post)
+    found = minimize(lambda x: -post.log_prob(x[None])[0], np.zeros(6), method="BFGS", options={"gtol": 1e-5})
+    np.testing.assert_allclose(mode.scales, found.x, atol=2e-4)
+
+
+def test_padding_changes_no_density():
+    post = posterior(drawn(make_design(deviations=2), 6)[0])
+    theta = np.random.default_rng(0).normal(size=(5, 6))
+    more = padded(post.tables, 8)
+    assert len(more.hand) == len(post.tables.hand) + 6
+    np.testing.assert_allclose(log_density(theta, more), post.log_prob(theta), rtol=1e-12)
+
+
+def test_jax_and_numpy_agree_on_the_density():
+    post = posterior(drawn(make_design(deviations=2), 7)[0])
+    theta = 3 * np.random.default_rng(0).normal(size=(200, 6))
+    found = log_density(jnp.asarray(theta), jax.tree.map(jnp.asarray, post.tables), jnp)
+    np.testing.assert_allclose(found, post.log_prob(theta), rtol=1e-10)
+    assert 0 < np.isinf(found).sum() < 20  # beyond the farthest as well
+
+
+def test_the_mode_is_found_in_a_process_of_single_precision():
+    post = posterior(drawn(make_design(deviations=2), 8)[0])
+    double = find_mode(post)
+    with jax.enable_x64(False):
+        single = find_mode(post)
+        assert jnp.zeros(1).dtype == np.float32  # as it was
+    np.testing.assert_array_equal(single.scales, double.scales)
+    assert single.converged
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2])

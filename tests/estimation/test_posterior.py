@@ -8,7 +8,8 @@ from estimation_scene import TRUE, drawn, make_design
 
 from estimation import priors
 from estimation.compliance import SLOPE_SD
-from estimation.posterior import REACH, STEP, posterior
+from estimation.density import REACH, STEP, log_prior
+from estimation.posterior import posterior
 
 FLAT = 1e3  # sd of a prior that is flat against a width of micrometres, but not so flat that digits go
 
@@ -57,7 +58,7 @@ def test_log_prob_is_the_density_of_all_observations(deviations):
     for row in theta:
         every, prior, noise, data = dense(design, row, post.reference)
         expected.append(log_normal(data, every @ prior @ every.T + np.diag(noise)))
-    expected = np.array(expected) + post.log_prior(theta)
+    expected = np.array(expected) + log_prior(theta, post.scale_sd)
     difference = post.log_prob(theta) - expected
     np.testing.assert_allclose(difference - difference[0], 0.0, atol=2e-3)
     assert np.ptp(expected) > 5.0  # the constant is not all there is
@@ -83,28 +84,26 @@ def test_the_conditional_gaussian_is_that_of_the_joint_one(deviations):
 
 
 def test_the_table_stands_for_the_sums_over_observations():
-    """Interpolated at the grid's own points and between them, against elimination done directly."""
+    """Each channel's form and determinant at the grid's points, against elimination done directly."""
     design, *_ = drawn(make_design(deviations=2), 3)
     post = posterior(design)
     for c in range(3):
         rows, shared, residual, _ = post.channel_rows(c)
         mine = design.channel == c
         unit2 = (priors.SCATTER_MEDIAN[c] * design.unit[mine]) ** 2
-        for log_r in (-3.0, 0.1, 2.61, REACH[0] + 4 * STEP + 0.1):
-            weight = 1 / (design.variance[mine] + np.exp(log_r) * unit2)
+        place = np.array([7, 8, 1 + c, 4 + c, 0])  # of deviations, shares and the residual among (1, e, f, z)
+        for index in (4, 60, 81):
+            weight = 1 / (design.variance[mine] + np.exp(REACH[0] + index * STEP) * unit2)
             normal = (rows.T * weight) @ rows
-            cross = (rows.T * weight) @ np.column_stack([shared, residual])
             every = np.column_stack([shared, residual])
-            rest = (every.T * weight) @ every - cross.T @ np.linalg.solve(normal, cross)
-            squares, log_det, quadratic, linear = post._tables[c].at(np.array([log_r]))
-            assert squares[0] == pytest.approx(rest[-1, -1], rel=1e-4)
-            assert log_det[0] == pytest.approx(np.linalg.slogdet(normal)[1] - np.log(weight).sum(), rel=1e-5)
-            np.testing.assert_allclose(
-                quadratic[0], rest[:-1, :-1], rtol=1e-4, atol=1e-4 * rest[:-1, :-1].max()
-            )
-            np.testing.assert_allclose(
-                linear[0], rest[:-1, -1], rtol=1e-3, atol=1e-4 * np.abs(rest[:-1, -1]).max()
-            )
+            cross = (rows.T * weight) @ every
+            left = (every.T * weight) @ every - cross.T @ np.linalg.solve(normal, cross)
+            expected = np.zeros((9, 9))
+            expected[place[:, None], place] = left
+            found = post.tables.forms[c, index]
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(left).max())
+            log_det = np.linalg.slogdet(normal)[1] - np.log(weight).sum()
+            assert post.tables.log_det[c, index] == pytest.approx(log_det, rel=1e-9)
 
 
 def test_a_channel_without_observations_keeps_its_prior():
@@ -213,7 +212,7 @@ def test_means_and_slopes_share_a_grips_own_error():
         both[num:, :num] = both[:num, num:].T
         data = np.concatenate([design.mean - design.coefficients @ post.reference, design.free_mean.ravel()])
         expected.append(log_normal(data, both))
-    difference = post.log_prob(theta) - np.array(expected) - post.log_prior(theta)
+    difference = post.log_prob(theta) - np.array(expected) - log_prior(theta, post.scale_sd)
     np.testing.assert_allclose(difference - difference[0], 0.0, atol=5e-3)
     assert np.ptp(expected) > 5.0
 
