@@ -9,7 +9,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_y, hanging
 from hmmseg.hand.rates import one_sided
-from hmmseg.hand.signals import Signals
+from hmmseg.hand.signals import Signals, central_differences
 from hmmseg.segmentation.changes import Change, Prior, cut
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
@@ -80,7 +80,7 @@ class Contacts:
         return self._timely(Penetration(
             self.signals.t, self.compression[i], inward - face, rate, sd, sd,
             sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
-            self.sensing.normal.value < RIGID,
+            self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
         ), making)  # fmt: skip
 
     def _pushed(self, i: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,9 +112,11 @@ class Contacts:
         """The contact as its change would be seen without the forces' small delay, or lead.
 
         A touch begins where the compression does, and so do both changes for a sensor that is late.
-        Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly.
+        Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly. How fast a
+        stiff pad is pressed only its force tells: what its finger moves, it moves with the block.
         """
-        moved = self.sensing.delay * np.nan_to_num(c.rate).mean(axis=0)
+        rate = central_differences(c.t, c.pressed)[0] if c.hidden else c.rate.mean(axis=0)
+        moved = self.sensing.delay * np.nan_to_num(rate)
         if not making and self.sensing.delay < 0:
             return replace(c, place=c.place - moved)
         sure = c.pressed > SURE * c.sd_apart
@@ -141,15 +143,16 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     rates, sinking, sd_vx, sd_vy = _rates(s, inward, sd_x, sd_y)
     force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
 
-    pads = shown(sensing.pads)
+    pads, toe = shown(sensing.pads), sensing.normal.toe
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
     return Contacts(
-        signals=s, sensing=sensing, compression=normal * np.array([[pads.normal1], [pads.normal2]]),
+        signals=s, sensing=sensing,
+        compression=normal * np.array([[pads.normal1], [pads.normal2]]) + toe.give(2 * normal) / 2,
         inward=inward, inward_rate=rates, sinking=sinking, deflection=-block_y(0.0, fy1, fy2, pads),
         weight=parameters.weight,
         sd={
-            "compression": force * float(pads.normal1),
+            "compression": force * (float(pads.normal1) + toe.slope),
             "inward": sd_x,
             "inward_rate": sd_vx,
             "y": float(np.hypot(sd_y / root2, level)),

@@ -24,6 +24,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, stretches
+from hmmseg.segmentation.toe import NONE, Toe, find
 
 # prior: of a stated stiffness, where the rig does not say: foams of one make differ by as much
 STIFFNESS_SD = 0.3
@@ -46,11 +47,15 @@ ENOUGH = 24  # chosen: stretches that tell a delay
 
 @dataclass(frozen=True)
 class Compliance:
-    """Compliance [m/N], its standard deviation, and the share by which one contact may differ from it."""
+    """Compliance [m/N], its standard deviation, and the share by which one contact may differ from it.
+
+    `toe` is what contacts give beside it when they are hardly pressed.
+    """
 
     value: float
     sd: float
     form: float
+    toe: Toe = NONE
 
 
 @dataclass(frozen=True)
@@ -129,21 +134,30 @@ def sense(
     nominal = pads_of(rig)
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
-    kinds = (grips, loads)
+    delay, sd, late, filtered = _delay((grips, loads), priors, again)
+    toe = NONE
+    if not (late or again):  # forces that were late, or a wrist's, show no law so finely
+        toe = find([(*_read(s, delay, filtered), s.sd) for s in grips])
+        if toe is not NONE:  # what bends looks like what is late
+            grips = [replace(s, toe=toe) for s in grips]
+            delay, sd, late, filtered = _delay((grips, loads), priors, again=True)
 
-    def found(delay: float, filtered: bool) -> list[Compliance]:
-        key = {"constant" if filtered else "shift": delay}
-        # A contact's two ends say most, and may differ: by less than a sample neither is left out.
-        reach = abs(delay) if abs(delay) < LATE else 0.0
-        return [_compliance([(*reading(s, **key, reach=reach), s.sd) for s in own], prior)
+    def found() -> list[Compliance]:
+        return [_compliance([(*_read(s, delay, filtered), s.sd) for s in own], prior)
                 for own, prior in zip((grips, loads), priors, strict=True)]  # fmt: skip
 
-    delay, sd, late, filtered = _delay(kinds, priors, again)
-    normal, shear = found(delay, filtered)
+    normal, shear = found()
     if late and normal.value < priors[0][0] / IMPLAUSIBLE:  # noise that a delay happens to smooth away
-        delay, sd, late, filtered = _delay(kinds, priors, again=True)
-        normal, shear = found(delay, filtered)
+        delay, sd, late, filtered = _delay((grips, loads), priors, again=True)
+        normal, shear = found()
+    normal = replace(normal, toe=toe)
     return Sensing(normal, shear, delay, float(np.hypot(sd, LATE_SHARE * delay * late)), late, filtered)
+
+
+def _read(s: Stretch, delay: float, filtered: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Loads and values at a delay; of its two ends, which say most, less than a sample leaves neither out."""
+    reach = abs(delay) if abs(delay) < LATE else 0.0
+    return reading(s, **{"constant" if filtered else "shift": delay}, reach=reach)
 
 
 def _prior(compliance: float, stated: float) -> tuple[float, float]:

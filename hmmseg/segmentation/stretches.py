@@ -10,12 +10,12 @@ import numpy as np
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.toe import DEPENDENT, NONE, Toe
 
 SIGNIFICANT = 5.0  # chosen: sds of force noise for a contact to be sure
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
 KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there
-DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Stretch:
     """Samples (N,) at rest: times t [s] and loads [N] in contact; value at any time.
 
     `before` [N] are the loads `step` [s] earlier. `place` (M,) is the value at `clock` (M,) [s],
-    `sd` [m] its noise. Loads above `sure` [N] are of contact.
+    `sd` [m] its noise. Loads above `sure` [N] are of contact. A contact with a `toe` is read as if straight.
     """
 
     t: np.ndarray
@@ -34,6 +34,7 @@ class Stretch:
     place: np.ndarray
     sd: float
     sure: float
+    toe: Toe = NONE
 
 
 def stretches(
@@ -96,7 +97,8 @@ def reading(
     clock = s.clock[within]
     steep = (load[1] - load[0]) / (t[1] - t[0]), (load[-1] - load[-2]) / (t[-1] - t[-2])
     beyond = np.minimum(clock - t[0], 0.0) * steep[0] + np.maximum(clock - t[-1], 0.0) * steep[1]
-    return np.interp(clock, t, load) + beyond, s.place[within]
+    loads = np.interp(clock, t, load) + beyond
+    return loads, s.place[within] + s.toe.give(loads)
 
 
 def fitted(

@@ -69,3 +69,18 @@ def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets():
     moved, _ = table._pushed(1, held)
     np.testing.assert_allclose(moved[: n // 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(moved[n // 2 :], step, atol=1e-9)
+
+
+def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():
+    folder = example_folder()
+    rig = Rig.read(folder / "rig.toml")
+    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
+    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
+    late = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(1e-5, 1e-6, 0.0), 5e-3, 1e-3)
+    n = signals.t.size
+    shaking = 5e-3 * np.random.default_rng(0).standard_normal(n)
+    still = replace(signals, vy1=shaking, vy2=shaking, fy1=np.zeros(n), fy2=np.zeros(n))
+    table = contacts(still, late, replace(aligned.fit.parameters, bias=np.zeros(4)))
+    load = table._load(aligned.subtasks[1], np.ones(n, bool), making=False)
+    np.testing.assert_allclose(load.pressed, load.pressed[0], rtol=1e-9)
+    assert load.hidden and load.pressed[0] > 0
