@@ -15,10 +15,10 @@ import numpy as np
 from rich.progress import track
 from scipy.stats import beta
 
+from experiments.generic_ensembles import PLANTED, TASK, ensemble
 from experiments.saving import save
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.diagnose import detect, diagnosed
-from simgap.generic.synthetic import PLANTED, TASK, ensemble
 
 RESULTS = Path(__file__).resolve().parent / "results" / "gap_generic.json"
 TRIALS = 6

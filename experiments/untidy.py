@@ -16,7 +16,6 @@ from simgap.world.performance import CONTROL_PERIOD
 
 Alter = Callable[[Plan, np.random.Generator], Plan]
 LATE = (0.02, 0.1)  # s by which one finger closes after the other
-OVER = 4e-4  # m beyond a block's face that a tap commands
 PUSH = 1.5e-3  # m that a push on the ground commands
 STILL = 10.0  # s of holding a block still in the air
 SLOWEST = 0.05  # of the usual pace, amid a hesitation

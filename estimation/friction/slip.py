@@ -32,7 +32,6 @@ DRIFTS = (0.0, 3e-5, 1e-4, 3e-4)  # prior: m per root second
 DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior
 ANYWHERE = 0.01  # prior: m; prior sd of an anchor's height
 NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
-SOFTER = 2e-4  # prior: m/N; error of a pad's compliance where the nominal pad is rigid
 
 
 @dataclass(frozen=True)

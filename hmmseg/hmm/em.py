@@ -9,7 +9,7 @@ Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
@@ -106,16 +106,3 @@ def em(
             before, responsibilities = fit.log_evidence, fit.responsibilities
             emission, durations = emission.updated(responsibilities), durations.updated(responsibilities)
     return fit
-
-
-def from_starts(
-    starts: Iterable[tuple[E, D]],
-    num_trials: int,
-    max_iterations: int = 40,
-    min_iterations: int = 6,
-    tolerance: float = 1e-3,
-) -> list[Fit[E, D]]:
-    """`em` from several starts, the fit of the highest log evidence first."""
-    limits = max_iterations, min_iterations, tolerance
-    fits = [em(emission, durations, num_trials, *limits) for emission, durations in starts]
-    return sorted(fits, key=lambda fit: -fit.log_evidence)

@@ -140,9 +140,3 @@ def words(name: str) -> list[str]:
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
     words = [word for word in re.split(r"[^A-Za-z0-9]+", name.lower()) if word]
     return [part for word in words for part in (re.findall(r"[a-z]+|\d+", word) or [word])]
-
-
-def without_table(text: str, table: Table) -> bool:
-    """Whether a rig's text has no such table yet."""
-    head = "topics" if table.messages else "columns"
-    return re.search(rf"^\s*\[{head}[\].]", text, flags=re.MULTILINE) is None

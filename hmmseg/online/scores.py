@@ -62,7 +62,6 @@ CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # prior: ... times this while a lift begins: slow, but a motion
 ALIKE = 0.5  # prior: probability that a block not met yet is like one that was
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
-_LOG_TOUCHED, _LOG_TOUCHING = math.log1p(-TOUCHING), math.log(TOUCHING)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
 

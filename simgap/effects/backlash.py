@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hmmseg.io.rig import Rig
 from simgap.effects.base import KINEMATICS, Effect, Parameter, World, gradient
 from simgap.effects.kinematics import moved_joints
 
@@ -71,10 +70,6 @@ def _correct(world: World, values, on) -> World:
     )
 
 
-def _resolved(values: dict[str, float], rig: Rig) -> bool:
-    return rig.noise.angle is None or values["width"] > rig.noise.angle
-
-
 def play(q: np.ndarray, width: float) -> np.ndarray:
     """The play operator over rows of q (n, 4): the output follows only outside the dead band."""
     out, last = np.empty_like(q), q[0].copy()
@@ -98,6 +93,4 @@ EFFECT = Effect(
     stage=KINEMATICS,
     correct=_correct,
     apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (play(q, v["width"]), dq)),
-    coarse=True,
-    resolved=_resolved,  # which side of a narrower band a joint lies on, its own noise says as much
 )

@@ -122,11 +122,6 @@ class Parameter:
         return float(np.log(value / self.neutral) / self.sd if self.log else (value - self.neutral) / self.sd)
 
     @property
-    def amplitude(self) -> bool:
-        """Whether it says how strong an effect is: it is zero where there is none."""
-        return not self.log and not self.shape and self.neutral == 0.0
-
-    @property
     def gridded(self) -> bool:
         """Whether a search has to try several start values of it."""
         return self.starts != (0.0,)
@@ -149,16 +144,10 @@ class Effect:
     gives the variance of a random disturbance instead (a `simgap.gap.spread.Spread`).
     `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
     scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
-    `chosen` is false for effects that only
-    `--effect` asks for. `report(values, rig)` gives the parameters as the interface names them. `switched`
-    effects change the equations at their neutral values already. `coarse`
-    effects act between samples: their form holds to a per cent or so, the others' to far less. `form` is the
-    share, `blur` the amount, by which parameters of real parts are off what our own simulator can show.
-    `ties`: patterns (rows that span a space of amplitudes) that independent parts fall into by chance alone.
-    `resolved(values, rig)`: whether the sensors can show so small an effect. `forms`: sets of parameters of
-    which one is free and the others neutral, the usual one first; all are free where none is listed.
-    `admitted(rig)`: key of a form, and standard deviations by parameter, as rig.toml has them under
-    [systematic].
+    `chosen` is false for effects that only `--effect` asks for. `report(values, rig)` gives the parameters
+    as the interface names them. `forms`: sets of parameters of which one is free and the others neutral, the
+    usual one first; all are free where none is listed. `admitted(rig)`: key of a form, and standard
+    deviations by parameter, as rig.toml has them under [systematic].
     """
 
     name: str
@@ -173,13 +162,7 @@ class Effect:
     scene: Callable[[dict[str, float]], dict[str, float]] | None = None
     finish: Callable[[np.ndarray, dict[str, float]], np.ndarray] | None = None
     chosen: bool = True
-    switched: bool = False
-    form: float = 0.0
-    blur: float = 0.0
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
-    coarse: bool = False
-    ties: tuple[tuple[tuple[float, ...], ...], ...] = ()
-    resolved: Callable[[dict[str, float], Rig], bool] | None = None
     forms: tuple[tuple[str, ...], ...] = ()
     scatter: Callable[[Any, np.ndarray], Any] | None = None
     admitted: Callable[[Rig], tuple[str, dict[str, float]]] | None = None
@@ -233,19 +216,6 @@ def per_channel(values: Values, names: tuple[str, ...]) -> Array:
 
 
 FORCES = ("fx1", "fy1", "fx2", "fy2")
-# physics: both fingers alike, and as mirror images: of what points along x and y, and of what turns.
-FORCE_TIES = (
-    ((1.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
-    ((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
-    ((1.0, 0.0, -1.0, 0.0),),
-    ((0.0, 1.0, 0.0, 1.0),),
-)
-JOINT_TIES = (
-    ((1.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 1.0)),
-    ((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, -1.0)),
-    ((1.0, 1.0, 1.0, 1.0),),
-    ((1.0, 1.0, -1.0, -1.0),),
-)  # physics: the same of what turns
 
 
 def flat(performance: Performance) -> np.ndarray:

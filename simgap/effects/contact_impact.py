@@ -38,6 +38,4 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=_correct,
     apply=_apply,
-    coarse=True,
-    form=0.1,  # a touchdown is no constant impulse: it depends on speed and on what is below
 )

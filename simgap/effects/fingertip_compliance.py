@@ -49,7 +49,6 @@ EFFECT = Effect(
     ),
     forms=(("give_normal", "give_shear"), FINGERS),
     stage=CONTACT,
-    form=0.035,  # real pads are no linear springs: their secant changes with the grip
     correct=_correct,
     report=_report,
     admitted=_admitted,

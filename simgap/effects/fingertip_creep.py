@@ -47,5 +47,4 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=_correct,
     apply=_apply,
-    coarse=True,
 )

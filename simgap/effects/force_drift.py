@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from simgap.effects.base import (
-    FORCE_TIES,
     FORCES,
     READOUT,
     Effect,
@@ -49,7 +48,6 @@ EFFECT = Effect(
         Parameter("bend", "1", 0.15, low=-0.6, high=0.6, hidden=True, shape=True),
     ),
     stage=READOUT,
-    ties=FORCE_TIES,
     correct=_correct,
     apply=_apply,
 )

@@ -42,6 +42,4 @@ EFFECT = Effect(
     stage=FILTER,
     correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(smoothing=w.smoothing + _times(v, jnp)),
     apply=_apply,
-    coarse=True,
-    blur=2.5e-3,  # a contact that changes between two samples: a twentieth of them
 )

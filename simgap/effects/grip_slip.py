@@ -54,6 +54,4 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=_correct,
     scene=lambda v: {"friction": v["mu"]},
-    switched=True,
-    coarse=True,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from simgap.effects.base import JOINT_TIES, KINEMATICS, Effect, Parameter, per_channel
+from simgap.effects.base import KINEMATICS, Effect, Parameter, per_channel
 from simgap.effects.kinematics import moved_joints
 
 JOINTS = ("q11", "q12", "q21", "q22")
@@ -16,8 +16,6 @@ EFFECT = Effect(
     parameters=tuple(Parameter(q, "rad", 0.012) for q in JOINTS),
     admitted=lambda rig: ("joint_offset", dict(zip(JOINTS, rig.systematic.joint_offset, strict=True))),
     stage=KINEMATICS,
-    ties=JOINT_TIES,
-    blur=8e-4,  # all joints turned alike hardly show, and take up what the model lacks
     correct=lambda w, v, on: w._replace(joints=w.joints - per_channel(v, JOINTS) * w.jointed),
     apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (q + [v[n] for n in JOINTS], dq)),
 )

@@ -85,5 +85,4 @@ EFFECT = Effect(
     correct=_correct,
     apply=_apply,
     report=_report,
-    coarse=True,
 )

@@ -31,5 +31,4 @@ EFFECT = Effect(
     correct=_correct,
     report=_report,
     scene=lambda v: {"support_stiffness": v["stiffness"]},
-    coarse=True,
 )

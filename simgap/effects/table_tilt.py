@@ -14,5 +14,4 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),
     scene=lambda v: {"tilt": v["angle"]},
-    blur=2e-3,  # told by a few millimetres of x alone; a stack's top need not be inclined as its support is
 )

@@ -31,7 +31,7 @@ SLOW, FAST, DURATION = range(3)
 
 @dataclass(frozen=True)
 class Layout:
-    """What each of F features is: arrays (F,) of `channel` (-1: a duration), `subtask`, `kind`, `bin`,
+    """What each of F features is: arrays (F,) of `channel` (-1: a duration), `subtask`, `kind`,
     `cell` and `width` (DCT coefficients of a power). A cell is what is listed: `cells[k]` = (channel,
     subtask, low, high) with its band in Hz.
 
@@ -50,7 +50,6 @@ class Layout:
     channel: np.ndarray
     subtask: np.ndarray
     kind: np.ndarray
-    bin: np.ndarray
     cell: np.ndarray
     width: np.ndarray
     cells: tuple[tuple[int, int, float, float], ...]
@@ -82,19 +81,19 @@ def layout(given: Ensembles) -> Layout:
         subs.append(_sub_bands(low, window[k]))
         for c in range(len(given.channels)):
             top = bins[k] / (2 * float(np.median(durations[:, k])))
-            rows += [(c, k, SLOW, b, len(cells), 1) for b in range(bins[k])]
+            rows += [(c, k, SLOW, len(cells), 1)] * bins[k]
             cells.append((c, k, 0.0, top))
             for group in np.array_split(np.arange(len(subs[k])), min(BANDS, max(len(subs[k]), 1))):
                 if group.size:
                     widths = [s.stop - s.start for s in subs[k]]
-                    rows += [(c, k, FAST, b, len(cells), widths[b]) for b in group.tolist()]
+                    rows += [(c, k, FAST, len(cells), widths[b]) for b in group.tolist()]
                     edges = subs[k][group[0]].start, subs[k][group[-1]].stop
                     cells.append((c, k, *(e * rate / (2 * window[k]) for e in edges)))
-        rows.append((-1, k, DURATION, 0, len(cells), 1))
+        rows.append((-1, k, DURATION, len(cells), 1))
         cells.append((-1, k, 0.0, 0.0))
-    channel, subtask, kind, part, cell, width = np.array(rows).T
+    channel, subtask, kind, cell, width = np.array(rows).T
     return Layout(given, float(rate), scale, event, np.array(window), tuple(subs), np.array(bins),
-                  channel, subtask, kind, part, cell, width, tuple(cells))  # fmt: skip
+                  channel, subtask, kind, cell, width, tuple(cells))  # fmt: skip
 
 
 def bin_edges(given: Layout, start: float, end: float, subtask: int) -> np.ndarray:

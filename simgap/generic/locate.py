@@ -31,14 +31,13 @@ Z_LARGEST = 37.0  # numerics: beyond, probabilities underflow
 @dataclass(frozen=True)
 class Located:
     """`z` (cells,): normal scores of the difference; `trial_z` (R, cells): of each real trial;
-    `p_value` of any gap; `threshold`, `trial_threshold`: scores a healthy comparison reaches in 5 %.
+    `p_value` of any gap; `threshold`: score that a healthy comparison reaches in 5 %.
     """
 
     z: np.ndarray
     trial_z: np.ndarray
     p_value: float
     threshold: float
-    trial_threshold: float
     exchanged: bool
 
 
@@ -124,25 +123,22 @@ def locate(given: Layout, real: np.ndarray, sim: np.ndarray, seed: int = 0) -> L
     exchanges = _exchanges(len(everything), count, seed)
     if exchanges is None:
         p = min(1.0, float(ndtr(-z.max())) * z.size)
-        limit, trial_limit = (-float(ndtri(LEVEL / n)) for n in (z.size, trial_z.size))
-        return Located(z, trial_z, p, limit, trial_limit, False)
-    null, trial_null = _exchanged(given, everything, count, exchanges, first)
+        return Located(z, trial_z, p, -float(ndtri(LEVEL / z.size)), False)
+    null = _exchanged(given, everything, count, exchanges, first)
     both = np.vstack([[z.max(), z.mean()], null])
     # Share of exchanges at least as large, for either statistic; the smaller one counts.
     ranks = np.array([(both[:, k][None] >= both[:, k][:, None]).mean(1) for k in range(2)]).min(0)
     p = float((ranks <= ranks[0]).mean())
-    quantile = 1 - LEVEL
-    return Located(z, trial_z, p, float(np.quantile(null[:, 0], quantile)),
-                   float(np.quantile(trial_null, quantile)), True)  # fmt: skip
+    return Located(z, trial_z, p, float(np.quantile(null[:, 0], 1 - LEVEL)), True)
 
 
 def _exchanged(
     given: Layout, everything: np.ndarray, count: int, exchanges: list[tuple[int, ...]], first: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Largest and mean score of every exchange (P, 2), and the largest of its single trials (P,)."""
+) -> np.ndarray:
+    """Largest and mean score of every exchange (P, 2)."""
     x = everything - everything.mean(0)
     n, dof = len(x), len(x) - 2
-    null, trial_null = np.zeros((len(exchanges), 2)), np.zeros(len(exchanges))
+    null = np.zeros((len(exchanges), 2))
     for start in range(0, len(exchanges), CHUNK):
         chosen = exchanges[start : start + CHUNK]
         there = np.zeros((len(chosen), n))
@@ -156,12 +152,8 @@ def _exchanged(
             variance.append(_moderated(given, raw, size) if size > 1 else None)
         a, b = (v if v is not None else variance[1 - k] for k, v in enumerate(variance))
         z = _normal(given, (mean[0] - mean[1]) ** 2 / (a + b * count / (n - count)) * count, dof, first)
-        inside = slice(start, start + len(chosen))
-        null[inside] = np.stack([z.max(1), z.mean(1)], 1)
-        ratio = (x[None] - mean[1][:, None]) ** 2 / (a + b / (n - count))[:, None]
-        each = _normal(given, ratio, dof, first).max(2)
-        trial_null[inside] = np.where(there > 0, each, -np.inf).max(1)
-    return null, trial_null
+        null[start : start + len(chosen)] = np.stack([z.max(1), z.mean(1)], 1)
+    return null
 
 
 def _exchanges(total: int, count: int, seed: int) -> list[tuple[int, ...]] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from hmmseg.hmm.chain import InfeasibleAlignment
-from hmmseg.hmm.em import em, from_starts
+from hmmseg.hmm.em import em
 
 STAY = 0.8
 
@@ -91,14 +90,6 @@ def test_evidence_never_decreases():
                 for n in range(1, 12)]  # fmt: skip
     assert np.diff(evidence).min() > -1e-9
     assert evidence[-1] > evidence[0] + 0.1
-
-
-def test_starts_come_back_best_first():
-    trials = recorded()
-    starts = [(Levels(trials, level), Fixed()) for level in (-3.0, 2.0, 0.01)]
-    fits = from_starts(starts, len(trials), max_iterations=2)
-    assert [a.log_evidence >= b.log_evidence for a, b in itertools.pairwise(fits)] == [True, True]
-    assert fits[0].emission.level == pytest.approx(2.0, abs=0.5)
 
 
 def test_a_trial_too_short_says_which_state_starves():

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.generic_ensembles import ensemble
 from hmmseg_cli.diagnose import spread_against
 from hmmseg_cli.main import main
-from simgap.generic.synthetic import ensemble
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from experiments.generic_ensembles import PLANTED, TASK, ensemble
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
@@ -15,7 +16,6 @@ from simgap.generic.diagnose import detect, diagnose
 from simgap.generic.effects import CANDIDATES, predicted, ring_waves, scene, smoothed
 from simgap.generic.features import FAST, SLOW, _sub_bands, bin_edges, layout, means, rows, transformed
 from simgap.generic.ringing import fit_ring, from_swing
-from simgap.generic.synthetic import PLANTED, TASK, ensemble
 
 
 def made(seed=1, effects=None, count=6):
@@ -197,7 +197,7 @@ def test_missing_samples_are_bridged(alike):
 
 def test_rates_may_differ():
     """Simulated at ten times the rate: compared at the real one's."""
-    from simgap.generic.synthetic import Scatter
+    from experiments.generic_ensembles import Scatter
 
     rng = np.random.default_rng(6)
     real, first = ensemble(rng, 5)
