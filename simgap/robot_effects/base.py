@@ -89,11 +89,18 @@ class Setting:
         posed = {c for columns in self.poses().values() for c in columns.values()}
         return [n for n in self.compared() if n not in posed]
 
-    def spread(self, channel: str) -> float:
+    def usual(self, channel: str, share: float, low: float = -np.inf) -> Parameter:
+        """A parameter in a channel's unit: nominally 0, usually this share of the channel's `sd`."""
+        return Parameter(0.0, share * self.sd(channel), self.simulator.channels[channel].unit, low=low)
+
+    def sd(self, channel: str) -> float:
         """Standard deviation of a channel over all recordings [its unit]; 1 where it is constant."""
-        values = np.concatenate([r[channel] for r in self.recordings])
-        found = float(np.nanstd(values))
+        found = float(np.nanstd(np.concatenate([r[channel] for r in self.recordings])))
         return found if found > 0 else 1.0
+
+    def largest(self, channel: str) -> float:
+        """Largest absolute value of a channel in all recordings [its unit]."""
+        return max(float(np.nanmax(np.abs(r[channel]))) for r in self.recordings)
 
 
 def drives(setting: Setting) -> list[str]:

@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from simgap.robot_effects.base import RobotEffect, Setting, places
-from simgap.simulators.protocol import Parameter
 
 
 @njit(cache=True)
@@ -31,11 +30,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
         RobotEffect(
             f"command:{name}.backlash",
             "acted follows commanded through a gap of this width",
-            {
-                "width": Parameter(
-                    0.0, 0.02 * setting.spread(name), setting.simulator.channels[name].unit, low=0.0
-                )
-            },
+            {"width": setting.usual(name, 0.02, low=0.0)},
             command=_played(name),
         )
         for name in places(setting)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from simgap.robot_effects.base import RobotEffect, Setting, drives
-from simgap.simulators.protocol import Parameter
 
 
 def _dead(name: str):
@@ -24,11 +23,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
         RobotEffect(
             f"command:{name}.dead_band",
             "acted = commanded less a band about 0",
-            {
-                "band": Parameter(
-                    0.0, 0.03 * setting.spread(name), setting.simulator.channels[name].unit, low=0.0
-                )
-            },
+            {"band": setting.usual(name, 0.03, low=0.0)},
             command=_dead(name),
         )
         for name in drives(setting)

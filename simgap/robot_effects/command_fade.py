@@ -20,7 +20,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each command that drives torque or duty; `fade` is what is lost at the largest command."""
     out = []
     for name in drives(setting):
-        most = max(float(np.nanmax(np.abs(r[name]))) for r in setting.recordings)
+        most = setting.largest(name)
         if most > 0:
             fade = Parameter(0.0, 0.1, "1", low=-0.9, high=0.9)
             says = "acted = commanded (1 - fade |commanded| / largest)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from simgap.robot_effects.base import RobotEffect, Setting, drives, places
-from simgap.simulators.protocol import Parameter
 
 
 def _shifted(name: str):
@@ -11,18 +10,14 @@ def _shifted(name: str):
 
 
 def candidates(setting: Setting) -> list[RobotEffect]:
-    """One for each command; its usual size is 3 % of the command's spread."""
-    out = []
-    for name in (*drives(setting), *places(setting)):
-        channel = setting.simulator.channels[name]
-        if channel.unit != "1":
-            offset = Parameter(0.0, 0.03 * setting.spread(name), channel.unit)
-            out.append(
-                RobotEffect(
-                    f"command:{name}.offset",
-                    "acted = commanded + offset",
-                    {"offset": offset},
-                    command=_shifted(name),
-                )
-            )
-    return out
+    """One for each command that has a unit; its usual size is 3 % of the command's spread."""
+    return [
+        RobotEffect(
+            f"command:{name}.offset",
+            "acted = commanded + offset",
+            {"offset": setting.usual(name, 0.03)},
+            command=_shifted(name),
+        )
+        for name in (*drives(setting), *places(setting))
+        if setting.simulator.channels[name].unit != "1"
+    ]

@@ -20,7 +20,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each command; `lost` is the share of the largest command that is never acted."""
     out = []
     for name in (*drives(setting), *places(setting)):
-        most = max(float(np.nanmax(np.abs(r[name]))) for r in setting.recordings)
+        most = setting.largest(name)
         if most > 0:
             lost = Parameter(0.0, 0.1, "1", low=0.0, high=0.99)
             says = "acted = commanded, up to (1 - lost) of the largest commanded"

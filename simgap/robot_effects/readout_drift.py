@@ -12,7 +12,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
     out = []
     for name in setting.alone():
         unit = setting.simulator.channels[name].unit
-        rate = Parameter(0.0, 0.03 * setting.spread(name) / longest, f"{unit}/s")
+        rate = Parameter(0.0, 0.03 * setting.sd(name) / longest, f"{unit}/s")
         out.append(
             RobotEffect(
                 f"readout:{name}.drift", "recorded = true + rate (t - t0)", {"rate": rate}, name,
