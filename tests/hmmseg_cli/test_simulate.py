@@ -6,29 +6,18 @@ import json
 
 import pytest
 from PIL import Image
+from simgap_scenes import HAND, STACK
 
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
 from hmmseg_cli.main import main
 from simgap.world.animation import FRAMES, Scene, Trace, animate
+from simgap.world.properties import PAPER_BLOCKS
+from simgap.world.writing import scene_files
 
 TASK = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
-RIG = """rate = 20.0
-[fingers.1]
-base = [0.05, 0.17]
-links = [0.12, 0.12]
-[fingers.2]
-base = [0.21, 0.17]
-links = [0.12, 0.12]
-[fingertip]
-normal_stiffness = 4000.0
-shear_stiffness = 2500.0
-[noise]
-angle = 0.0002
-velocity = 0.03
-force = 0.012
-"""
+RIG = scene_files(STACK, HAND, PAPER_BLOCKS)["rig.toml"]
 
 
 @pytest.fixture
