@@ -62,13 +62,16 @@ class PadDoubt:
 
     Along the grip and in shear, 0 for no doubt: the compliance is 1 + share times the nominal, and its
     extra prior sd is as large. `normal_give`, `shear_give`: how much pads may give, by what the
-    recordings show, whose stiffness the rig leaves unstated; 0 where it states one.
+    recordings show, whose stiffness the rig leaves unstated; 0 where it states one. `usual_normal`,
+    `usual_shear`: forces of one finger as they usually are in a grip, and where a block is put down [N].
     """
 
     normal: float = 0.0
     shear: float = 0.0
     normal_give: float = 0.0
     shear_give: float = 0.0
+    usual_normal: float = 1.0
+    usual_shear: float = 1.0
 
     def slope_sd(self) -> np.ndarray:
         """Standard deviations (3,) by channel of a slope's own error, a share of what truly gives."""
