@@ -29,6 +29,9 @@ from hmmseg.segmentation.switching import SURE, Penetration, switch_probability
 
 LIKELY = 1e-3  # chosen: least probability of an interval within which the crossing is looked at
 SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another
+# prior: that a grip ends when its force is silent, when it slides, when it has opened
+VIEWS = (0.6, 0.2, 0.2)
+FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 DISCREPANCY, KNOWN = 1e-5, 2.0  # prior: m; usual discrepancy of foam, worth so many contacts
 
 
@@ -74,7 +77,8 @@ class Disagreement:
 class Change:
     """Contacts made, or broken, at one boundary: of two, the last one made and the first one broken count.
 
-    `timing` [s] is the uncertainty of the forces' own clock.
+    `timing` [s] is the uncertainty of the forces' own clock. `slips` [m]: at which penetration each contact
+    that is broken slides.
     """
 
     contacts: tuple[Penetration, ...]
@@ -82,6 +86,7 @@ class Change:
     making: bool
     kind: Kind
     timing: float
+    slips: tuple[float, ...] = ()
 
     @property
     def sort(self) -> tuple[Kind, int]:
@@ -179,8 +184,36 @@ def _interval(c: Penetration, change: Change) -> int:
 
 
 def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
-    """Posterior of the moment of a change, with what is `known` of its sort."""
+    """Posterior of the moment of a change, with what is `known` of its sort.
+
+    A grip may be said to end when a pad's friction is spent and it begins to slide, when its force is first
+    silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
+    meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
+    """
     contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
+    views = [contacts]
+    if change.slips:
+        sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
+        opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
+        views += [sliding, opened]
+    found = [_seen(view, change, known) for view in views]
+    weight, t = VIEWS if len(found) > 1 else (1.0,), contacts[0].t
+    sd = float(np.hypot(ONSET, change.timing))
+    times = np.concatenate([times for times, _ in found])
+    masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, found, strict=True)])
+    return blurred(times, masses, float(t[0]), float(t[-1]), sd)
+
+
+def _beyond(c: Penetration, slip: float) -> Penetration:
+    """The contact as far as it is deeper than where it slides [m]."""
+    sd = float(np.hypot(c.sd_place, FRICTION * slip))
+    return replace(c, pressed=np.maximum(c.pressed - slip, 0.0), place=c.place - slip, sd_place=sd)
+
+
+def _seen(
+    contacts: Sequence[Penetration], change: Change, known: Disagreement
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and masses of the moment at which contacts are made, or the first is broken."""
     t, making = contacts[0].t, change.making
     found = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
     combined = crossing_density if making else first_of
@@ -197,8 +230,7 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
                 density = combined([], width)
             times.append(t[n] + inner * width)
             masses.append(mass * density)
-    sd = float(np.hypot(ONSET, change.timing))
-    return blurred(np.concatenate(times), np.concatenate(masses), float(t[0]), float(t[-1]), sd)
+    return np.concatenate(times), np.concatenate(masses)
 
 
 def _shares(found: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ...], float]]:

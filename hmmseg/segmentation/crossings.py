@@ -28,7 +28,7 @@ class Contacts:
     `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
     position along its own closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just
     after each sample, by finger, `sinking` (2, T) that of the mean height downwards [m/s]; `deflection` (T,):
-    the pads' mean shear deflection by the net vertical force [m].
+    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N].
     """
 
     signals: Signals
@@ -38,6 +38,7 @@ class Contacts:
     inward_rate: np.ndarray
     sinking: np.ndarray
     deflection: np.ndarray
+    tangential: np.ndarray
     weight: dict[str, float]
     sd: dict[str, float]
 
@@ -56,7 +57,10 @@ class Contacts:
             making = before.state == FREE
             rests = (after if making else before).state == ON_GROUND
             fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
-            return cut(Change(fingers, prior, making, "impact" if making else "smooth", timing))
+            if making:
+                return cut(Change(fingers, prior, making, "impact", timing))
+            slips = tuple(self._slip(i, stretch) for i in (0, 1))
+            return cut(Change(fingers, prior, making, "smooth", timing, slips))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
             making = after.state == ON_GROUND
             load = self._load(before, stretch, making)
@@ -82,6 +86,13 @@ class Contacts:
             sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
             self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
         ), making)  # fmt: skip
+
+    def _slip(self, i: int, held: np.ndarray) -> float:
+        """Compression [m] at which finger i slides off a block that it has `held`: friction bears no more."""
+        if self.sensing.friction <= 0:
+            return 0.0
+        needed = np.abs(_median(self.tangential[i, held])) / self.sensing.friction
+        return float(np.nan_to_num(_compression(np.array([needed]), self.sensing)[0]))
 
     def _pushed(self, i: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far finger i has pushed the block from where it rested (T,) [m], and its speed (2, T) [m/s].
@@ -129,6 +140,11 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(there)) if there.size else np.nan
 
 
+def _compression(force: np.ndarray, sensing: Sensing) -> np.ndarray:
+    """Compression [m] of one pad at each normal force [N]."""
+    return force * float(shown(sensing.pads).normal1) + sensing.normal.toe.give(2 * force) / 2
+
+
 def shown(pads: Pads) -> Pads:
     """A pad too stiff to show its compression still shows its force, in whatever unit of length."""
     return Pads(*(max(float(c), STIFFEST) for c in pads))
@@ -148,8 +164,9 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     level = parameters.scale["level"]
     return Contacts(
         signals=s, sensing=sensing,
-        compression=normal * np.array([[pads.normal1], [pads.normal2]]) + toe.give(2 * normal) / 2,
+        compression=_compression(normal, sensing),
         inward=inward, inward_rate=rates, sinking=sinking, deflection=-block_y(0.0, fy1, fy2, pads),
+        tangential=np.stack([fy1, fy2]),
         weight=parameters.weight,
         sd={
             "compression": force * (float(pads.normal1) + toe.slope),

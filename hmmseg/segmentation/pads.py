@@ -23,7 +23,7 @@ from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.emissions import TAIL, Parameters
-from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, stretches
+from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest, stretches
 from hmmseg.segmentation.toe import NONE, Toe, find
 
 # prior: of a stated stiffness, where the rig does not say: foams of one make differ by as much
@@ -42,6 +42,7 @@ APART = 4.0  # chosen: sds beyond which a compliance contradicts the rig
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be asked
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
+SLIDING = 0.9  # chosen: quantile of the steepest ratios of forces of all contacts that is friction's
 ENOUGH = 24  # chosen: stretches that tell a delay
 
 
@@ -63,7 +64,8 @@ class Sensing:
     """What one hand's recordings show of its pads and of the delay of its forces.
 
     `delay` [s] is of the forces (negative: they lead), `delay_sd` its standard deviation. Where it is the
-    sensor's (`late`), forces are to be read `delay` later, or, of a `filter`, undone.
+    sensor's (`late`), forces are to be read `delay` later, or, of a `filter`, undone. `friction` is the
+    largest ratio of shear to grip force that one finger's pad is seen to bear as it lets go.
     """
 
     normal: Compliance
@@ -72,6 +74,7 @@ class Sensing:
     delay_sd: float
     late: bool = False
     filter: bool = False
+    friction: float = np.inf
 
     @property
     def pads(self) -> Pads:
@@ -122,6 +125,7 @@ def sense(
     """
     grips: list[Stretch] = []
     loads: list[Stretch] = []
+    ratios: list[float] = []
     for s, (t, path) in zip(signals, paths, strict=True):
         for step in steps:
             if step.state == ON_GROUND and (path == step.index).sum() > 1:
@@ -131,6 +135,7 @@ def sense(
                 for out, stretch in zip((grips, loads), pair, strict=True):
                     if stretch is not None:
                         out.append(stretch)
+                ratios += steepest(s, start, end, parameters)
     nominal = pads_of(rig)
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
@@ -151,7 +156,9 @@ def sense(
         delay, sd, late, filtered = _delay((grips, loads), priors, again=True)
         normal, shear = found()
     normal = replace(normal, toe=toe)
-    return Sensing(normal, shear, delay, float(np.hypot(sd, LATE_SHARE * delay * late)), late, filtered)
+    doubt = float(np.hypot(sd, LATE_SHARE * delay * late))
+    friction = float(np.quantile(ratios, SLIDING)) if ratios else np.inf
+    return Sensing(normal, shear, delay, doubt, late, filtered, friction)
 
 
 def _read(s: Stretch, delay: float, filtered: bool) -> tuple[np.ndarray, np.ndarray]:

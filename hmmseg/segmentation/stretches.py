@@ -71,6 +71,18 @@ def stretches(
     return out[0], out[1]
 
 
+def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]:
+    """The steepest ratio of shear to grip force that each finger shows for sure between two times [s]."""
+    inside = (s.t >= start) & (s.t <= end)
+    sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    out = []
+    for grip, shear in ((s.fx1 - p.bias[0], s.fy1 - p.bias[1]), (-(s.fx2 - p.bias[2]), s.fy2 - p.bias[3])):
+        use = inside & (grip > SIGNIFICANT * sd) & np.isfinite(shear)
+        if use.any():
+            out.append(max(float(np.max((np.abs(shear[use]) - sd) / (grip[use] + sd))), 0.0))
+    return out
+
+
 def reading(
     s: Stretch, shift: float = 0.0, constant: float = 0.0, reach: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:

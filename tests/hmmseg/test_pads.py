@@ -8,9 +8,11 @@ import pytest
 from experiments.boundary_worlds import World, trials_of
 from experiments.sweeps.cells import Cell
 from experiments.sweeps.trials import scene
+from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.align import segment
+from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import Sensing, read_again
-from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading
+from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest
 
 PRIOR = (2.5e-4, 0.75e-4)
 
@@ -114,3 +116,17 @@ def test_reading_again_undoes_what_was_found():
     again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
     np.testing.assert_allclose(again.fx1[:94], ramp[:94], atol=1e-12)
     np.testing.assert_allclose(again.x1, late)
+
+
+def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():
+    t = np.arange(40) * 0.02
+    grip = np.clip(4.0 - t / 0.2, 0.0, None)
+    shear = np.minimum(1.2, 0.8 * grip)  # slides from 1.5 N on
+    still = ("x1", "y1", "vx1", "vy1", "x2", "y2", "vx2", "vy2", "sd_x", "sd_y", "sd_vx", "sd_vy")
+    signals = Signals(t=t, fx1=grip, fy1=-shear, fx2=-grip, fy2=0.5 * shear, sd_force=0.01,
+                      **dict.fromkeys(still, np.zeros_like(t)))  # fmt: skip
+    parameters = Parameters(np.zeros(4), {"a": 1.0}, {"force": 0.01})
+    one, two = steepest(signals, 0.0, 0.8, parameters)
+    assert one == pytest.approx(0.8, abs=0.06) and one < 0.8
+    assert two == pytest.approx(0.4, abs=0.06)
+    assert steepest(signals, 0.9, 1.0, parameters) == []
