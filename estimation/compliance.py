@@ -89,8 +89,8 @@ def slope(
         # A sample that bears the fit alone shows no residual: the jackknife's (MacKinnon and White 1985).
         basis, _ = np.linalg.qr((np.concatenate([x[None], others]) * np.sqrt(trust)).T)
         alone = residual / np.maximum(1 - (basis**2).sum(axis=1), 1e-3)
-        spread = max(float((weights**2 * alone**2).sum()), scale**2 / power)
-        found = Slope(weights, spread)
+        variance = max(float((weights**2 * alone**2).sum()), scale**2 / power)
+        found = Slope(weights, variance)
     return found
 
 

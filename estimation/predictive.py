@@ -59,9 +59,9 @@ def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> Predictive
     scales, shares = of(draws.scales), of(draws.shares)
     predicted = of(draws.chain) @ d.coefficients.T + of(draws.deviations) @ d.shifts.T
     predicted += shares[:, d.channel] * d.unit
-    spread = d.variance * np.exp(2 * scales[:, d.channel])
-    spread += (priors.SCATTER_MEDIAN[d.channel] * d.unit) ** 2
-    z = (d.mean - predicted) / np.sqrt(spread)
+    variance = d.variance * np.exp(2 * scales[:, d.channel])
+    variance += (priors.SCATTER_MEDIAN[d.channel] * d.unit) ** 2
+    z = (d.mean - predicted) / np.sqrt(variance)
     new = rng.normal(size=z.shape)
     p_values, excess, repeats, warnings = {}, {}, {}, []
     for c, name in enumerate(CHANNELS):

@@ -36,10 +36,10 @@ def log_prior(prop: str, coefficients: np.ndarray, values: np.ndarray) -> np.nda
     A sum of independent log-normal variables is taken as the log-normal of the same first two
     moments (Fenton 1960), one with differences as the normal. -inf where a positive sum is not.
     """
-    spread = PROPERTY_LOG_SD[prop] ** 2
-    each = PROPERTY_MEDIAN[prop] * np.exp(spread / 2)
+    of_one = PROPERTY_LOG_SD[prop] ** 2
+    each = PROPERTY_MEDIAN[prop] * np.exp(of_one / 2)
     mean = coefficients.sum() * each
-    variance = (coefficients**2).sum() * each**2 * np.expm1(spread)
+    variance = (coefficients**2).sum() * each**2 * np.expm1(of_one)
     if (coefficients < 0).any():
         return -0.5 * (values - mean) ** 2 / variance
     log_variance = np.log1p(variance / mean**2)

@@ -67,9 +67,9 @@ def _draw_row(
 
     reach = 0.0
     if measured is not None and estimate is not None and "mean" in estimate:
-        spread = 100 * measured[1] / measured[0]
-        ax.fill_betweenx([y - 0.32, y + 0.32], -spread, spread, color=GREY, alpha=0.4, lw=0)
-        reach = spread
+        measured_sd = 100 * measured[1] / measured[0]
+        ax.fill_betweenx([y - 0.32, y + 0.32], -measured_sd, measured_sd, color=GREY, alpha=0.4, lw=0)
+        reach = measured_sd
     if estimate is None:
         ax.text(0, y, " not determined ", va="center", ha="center", fontsize=7.5, style="italic",
                 color=GREY, backgroundcolor="white")  # fmt: skip

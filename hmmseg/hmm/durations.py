@@ -82,9 +82,9 @@ def lasting(mean_samples: ArrayLike, sd_samples: ArrayLike, presence: ArrayLike 
         raise ValueError("lasting: expected one mean and one standard deviation above 0 for each state")
     tables = []
     for mean, sd in zip(means, sds, strict=True):
-        spread = gamma((mean / sd) ** 2, scale=sd**2 / mean)
-        edges = np.arange(1, max(int(np.ceil(spread.isf(RARE))), 1) + 1) + 0.5
-        below = np.append(0.0, spread.cdf(edges))
+        lasting_for = gamma((mean / sd) ** 2, scale=sd**2 / mean)
+        edges = np.arange(1, max(int(np.ceil(lasting_for.isf(RARE))), 1) + 1) + 0.5
+        below = np.append(0.0, lasting_for.cdf(edges))
         with np.errstate(divide="ignore"):
             tables.append(np.log(np.diff(below) / below[-1]))
     return DurationChain(tables, presence, open_end=open_end)

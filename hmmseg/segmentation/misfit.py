@@ -83,7 +83,7 @@ def _matching(runs: Sequence[Run], tail: Sequence[Subtask], c: Conformity) -> in
     return count if count > 1 else 0  # free motion alone says nothing of which release it is
 
 
-def spread(
+def task_boundaries(
     shown: Plan, found: Sequence[BoundaryPosterior], num_subtasks: int, first: float, last: float
 ) -> tuple[BoundaryPosterior, ...]:
     """The task's boundaries from those of the order shown.

@@ -16,7 +16,7 @@ from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.features import features, thin
 from hmmseg.segmentation.fit import Fit, fit
-from hmmseg.segmentation.misfit import Plan, at, explain, plan, spread
+from hmmseg.segmentation.misfit import Plan, at, explain, plan, task_boundaries
 from hmmseg.segmentation.pooling import Pool, Reading, pooled, unfitted
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.recorded import Parts, Recorded
@@ -122,7 +122,7 @@ def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity,
             changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
         )
     ends = reading.ends
-    boundaries = spread(shown, found, len(steps), *ends)
+    boundaries = task_boundaries(shown, found, len(steps), *ends)
     every = to_spans(shown.steps, found, *ends)
     spans = (*every[: shown.num_before], *every[len(every) - shown.num_after :])
     step = steps[verdict.failing]

@@ -105,9 +105,9 @@ def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray]
     proper = np.isfinite(np.linalg.cond(normal)) & (np.linalg.cond(normal) < 1e12) & (count >= 3)
     normal = np.where(proper[..., None, None], normal, np.eye(3))
     solution = np.linalg.solve(normal, right[..., None])[..., 0]
-    misfit = np.maximum(square - (solution * right).sum(-1), 0.0)
+    left = np.maximum(square - (solution * right).sum(-1), 0.0)
     freedom = count - 3
-    fits = proper & ((freedom <= 0) | (misfit <= 2 * gammaincinv(np.maximum(freedom, 1) / 2, 1 - LEVEL)))
+    fits = proper & ((freedom <= 0) | (left <= 2 * gammaincinv(np.maximum(freedom, 1) / 2, 1 - LEVEL)))
     if before + after <= 2:
         fits = proper
     variance = np.where(proper, np.linalg.inv(normal)[..., 0, 0], np.inf)
