@@ -1,167 +1,28 @@
 """What of a MuJoCo model is offered as a cause: its joints, bodies, contacts, actuators and its own options.
 
 Usual sizes are shares of what the robot shows along the logs: torques by inverse dynamics of the smoothed
-motion. Friction that depends on state beyond what MuJoCo has acts as torques along the recorded motion.
+motion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
-from simgap.simulators.mjcf.model import APPLIED, MjcfSimulator
+from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
 from simgap.simulators.mjcf.settable import setting_of
-from simgap.simulators.mjcf.setting import Setting, names_of
+from simgap.simulators.mjcf.setting import Setting, name_of, names_of
+from simgap.simulators.mjcf.state_friction import SHARE, sizes_of, state_friction
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
-SHARE = 0.03  # prior: of the torques that a joint shows: the usual size of what a model lacks there
-SIZE = 0.1  # prior: of a value that the model states, likewise
+SIZE = 0.1  # prior: of a value that the model states: the usual size of what is wrong with it
 GEOMS = 4  # chosen: pairs of touching geoms, those that touch most, whose contact is offered
-
-
-def offered(
-    simulator: MjcfSimulator, recordings: Sequence[Recording], named: Sequence[str]
-) -> list[RobotEffect]:
-    """Give the simulator its parameters, and the candidates beyond them."""
-    motions = [motion_of(simulator, log) for log in recordings]
-    model = simulator.model
-    parameters: dict[str, Parameter] = {}
-    settings: dict[str, Setting] = {}
-    says: dict[str, str] = {}
-
-    def offer(
-        name: str,
-        sd: float,
-        low: float = -np.inf,
-        high: float = np.inf,
-        effect: str | None = None,
-        told: str = "",
-    ) -> None:
-        setting = setting_of(model, name)
-        nominal = setting.get(model)
-        if not sd > 0 or not np.isfinite(sd):
-            return
-        settings[name] = setting
-        low = min(low, nominal)
-        parameters[name] = Parameter(nominal, float(sd), setting.unit, low, high, effect)
-        says[effect or name] = told or f"{name} is not as the model has it"
-
-    moving = [j for j in range(model.njnt) if int(model.jnt_type[j]) in HINGES and _name(model, "joint", j)]
-    told = [j for j in moving if j in simulator.joints.values()]
-    for j in told:
-        name, size = _name(model, "joint", j), _sizes(motions, j)
-        for attribute, scale in (
-            ("damping", size.torque / size.rate),
-            ("frictionloss", size.torque),
-            ("armature", size.torque / size.acceleration),
-            ("stiffness", size.torque / size.reach),
-        ):
-            setting = setting_of(model, f"joint:{name}.{attribute}")
-            offer(
-                setting.name,
-                max(SHARE * scale, SIZE * abs(setting.get(model))),
-                low=0.0,
-                told=f"{SAYS[attribute]} of {name}",
-            )
-    for name in names_of(model, "actuator"):
-        a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
-        if model.actuator_gainprm[a, 0] and simulator.driven and a in simulator.driven.values():
-            offer(f"actuator:{name}.gain", SIZE, low=-0.9, told=f"gain of {name} (of a servo, its stiffness)")
-            if model.actuator_biasprm[a, 2]:
-                offer(
-                    f"actuator:{name}.damping",
-                    SIZE * abs(float(model.actuator_biasprm[a, 2])),
-                    low=0.0,
-                    told=f"velocity gain of {name}",
-                )
-        if model.actuator_forcelimited[a] and a in simulator.driven.values():
-            offer(
-                f"actuator:{name}.limit",
-                SIZE * float(model.actuator_forcerange[a, 1]),
-                low=1e-9,
-                told=f"saturation of {name}",
-            )
-    for b in _moved_bodies(model, [*told, *simulator.free]):
-        name = _name(model, "body", b)
-        if not name or model.body_mass[b] <= 0:
-            continue
-        size = float(np.sqrt(model.body_inertia[b].sum() / model.body_mass[b]))
-        offer(
-            f"body:{name}.mass",
-            SIZE * float(model.body_mass[b]),
-            low=1e-3 * float(model.body_mass[b]),
-            told=f"mass (and inertia) of {name}",
-        )
-        for axis in "xyz":
-            offer(
-                f"body:{name}.com_{axis}",
-                SIZE * size,
-                effect=f"body:{name}.com",
-                told=f"centre of mass of {name}",
-            )
-        children = [c for c in range(model.nbody) if model.body_parentid[c] == b and c != b]
-        if not children or not any(model.body_jntnum[c] for c in children):
-            offer(f"body:{name}.payload", SIZE * _largest(model), low=0.0, told=f"a load at {name}")
-        first = int(model.body_jntadr[b])
-        chained = (
-            model.body_jntnum[b] and int(model.jnt_type[first]) in HINGES and model.body_parentid[b] != 0
-        )
-        if chained and np.linalg.norm(model.body_pos[b]) > 1e-6:
-            offer(f"body:{name}.length", 0.01, low=-0.5, told=f"length of the link before {name}")
-    if np.linalg.norm(model.opt.gravity) > 0:
-        for axis in ("tilt_x", "tilt_y"):
-            offer(f"option.{axis}", 0.01, effect="gravity.direction", told="the base is tilted")
-    offer("option.timestep", 0.5, low=-1.1, high=1.0, told="the simulator's own time step, relative")
-    offer(
-        "option.integrator",
-        0.5,
-        low=0.0,
-        high=1.1,
-        told="the simulator's integrator: this share of another's result",
-    )
-    if simulator.touching:
-        offer(
-            "option.iterations",
-            0.3,
-            low=0.0,
-            high=1.0,
-            told="iterations of the simulator's solver: ten times as many",
-        )
-    for g in _touching(simulator, recordings):
-        name = _name(model, "geom", g)
-        if not name:
-            continue
-        offer(
-            f"geom:{name}.friction",
-            SIZE * max(float(model.geom_friction[g, 0]), 0.1),
-            low=0.0,
-            told=f"friction of {name}",
-        )
-        offer(
-            f"geom:{name}.time_constant",
-            SIZE * float(model.geom_solref[g, 0]),
-            low=1e-4,
-            effect=f"geom:{name}.stiffness",
-            told=f"stiffness and damping of {name}'s contact",
-        )
-        offer(f"geom:{name}.damping_ratio", 2 * SIZE, low=0.05, effect=f"geom:{name}.stiffness")
-        offer(f"geom:{name}.size", 0.01, low=-0.5, told=f"size of {name}")
-    for name in named:
-        if name not in parameters:
-            nominal = setting_of(model, name).get(model)
-            offer(name, SIZE * abs(nominal) if nominal else 0.01)
-    simulator.parameters, simulator.settings, simulator.says = parameters, settings, says
-    simulator.__post_init__()
-    simulator.prepare(recordings)
-    return _state_friction(model, simulator, recordings, motions, told)
-
-
 HINGES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 SAYS = {
     "damping": "viscous friction",
@@ -171,26 +32,136 @@ SAYS = {
 }
 
 
-def _name(model: Any, kind: str, number: int) -> str:
-    return mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), number) or ""
+def offered(
+    simulator: MjcfSimulator, recordings: Sequence[Recording], named: Sequence[str]
+) -> list[RobotEffect]:
+    """Give the simulator its parameters, and the candidates beyond them."""
+    motions = [motion_of(simulator, log) for log in recordings]
+    catalogue = _Catalogue(simulator)
+    joints = catalogue.driven_joints()
+    catalogue.add_joints(joints, motions)
+    catalogue.add_actuators()
+    catalogue.add_bodies(joints)
+    catalogue.add_options()
+    catalogue.add_contacts(recordings)
+    catalogue.add_named(named)
+    simulator.parameters, simulator.settings = catalogue.parameters, catalogue.settings
+    simulator.says = catalogue.says
+    simulator.__post_init__()
+    simulator.prepare(recordings)
+    return state_friction(simulator, recordings, motions, joints)
 
 
-class _Size:
-    """What a joint shows along the logs, root mean squares."""
+class _Catalogue:
+    """Parameters, their settings in the model and what they say, gathered one after another."""
 
-    def __init__(self, torque: float, rate: float, acceleration: float, reach: float) -> None:
-        self.torque, self.rate = max(torque, 1e-9), max(rate, 1e-6)
-        self.acceleration, self.reach = max(acceleration, 1e-6), max(reach, 1e-6)
+    def __init__(self, simulator: MjcfSimulator) -> None:
+        self.simulator, self.model = simulator, simulator.model
+        self.parameters: dict[str, Parameter] = {}
+        self.settings: dict[str, Setting] = {}
+        self.says: dict[str, str] = {}
 
+    def add(self, name: str, sd: float, says: str = "", low: float = -np.inf, high: float = np.inf,
+            effect: str | None = None) -> None:  # fmt: skip
+        """A parameter about the model's own value, unless it has no size; an effect may have several."""
+        setting = setting_of(self.model, name)
+        nominal = setting.get(self.model)
+        if not sd > 0 or not np.isfinite(sd):
+            return
+        self.settings[name] = setting
+        self.parameters[name] = Parameter(nominal, float(sd), setting.unit, min(low, nominal), high, effect)
+        self.says[effect or name] = says or f"{name} is not as the model has it"
 
-def _sizes(motions: Sequence[Motion], joint: int) -> _Size:
-    rms = lambda values: float(np.sqrt(np.mean(np.concatenate(values) ** 2)))  # noqa: E731
-    return _Size(
-        rms([m.torque[joint] for m in motions]),
-        rms([m.rate[joint] for m in motions]),
-        rms([m.acceleration[joint] for m in motions]),
-        rms([m.position[joint] - m.position[joint].mean() for m in motions]),
-    )
+    def driven_joints(self) -> list[int]:
+        """Hinges and slides with a name that are read as joints."""
+        m, read = self.model, self.simulator.joints.values()
+        moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in HINGES and name_of(m, "joint", j)]
+        return [j for j in moving if j in read]
+
+    def add_joints(self, joints: Sequence[int], motions: Sequence[Motion]) -> None:
+        """Damping, dry friction, rotor inertia and stiffness of joints."""
+        for j in joints:
+            name, size = name_of(self.model, "joint", j), sizes_of(motions, j)
+            for attribute, scale in (
+                ("damping", size.torque / size.rate),
+                ("frictionloss", size.torque),
+                ("armature", size.torque / size.acceleration),
+                ("stiffness", size.torque / size.reach),
+            ):
+                setting = setting_of(self.model, f"joint:{name}.{attribute}")
+                sd = max(SHARE * scale, SIZE * abs(setting.get(self.model)))
+                self.add(setting.name, sd, f"{SAYS[attribute]} of {name}", low=0.0)
+
+    def add_actuators(self) -> None:
+        """Gains, velocity gains and saturation of actuators that a log drives."""
+        m, driven = self.model, (self.simulator.driven or {}).values()
+        for name in names_of(m, "actuator"):
+            a = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+            if a not in driven:
+                continue
+            if m.actuator_gainprm[a, 0]:
+                says = f"gain of {name} (of a servo, its stiffness)"
+                self.add(f"actuator:{name}.gain", SIZE, says, low=-0.9)
+                sd = SIZE * abs(float(m.actuator_biasprm[a, 2]))
+                self.add(f"actuator:{name}.damping", sd, f"velocity gain of {name}", low=0.0)
+            if m.actuator_forcelimited[a]:
+                sd = SIZE * float(m.actuator_forcerange[a, 1])
+                self.add(f"actuator:{name}.limit", sd, f"saturation of {name}", low=1e-9)
+
+    def add_bodies(self, joints: Sequence[int]) -> None:
+        """Mass, centre of mass, payload and link length of bodies that move."""
+        m = self.model
+        for b in _moved_bodies(m, [*joints, *self.simulator.free]):
+            name, mass = name_of(m, "body", b), float(m.body_mass[b])
+            if not name or mass <= 0:
+                continue
+            self.add(f"body:{name}.mass", SIZE * mass, f"mass (and inertia) of {name}", low=1e-3 * mass)
+            gyration = float(np.sqrt(m.body_inertia[b].sum() / mass))
+            for axis in "xyz":
+                centre = f"body:{name}.com"
+                self.add(f"{centre}_{axis}", SIZE * gyration, f"centre of mass of {name}", effect=centre)
+            children = [c for c in range(m.nbody) if m.body_parentid[c] == b and c != b]
+            if not any(m.body_jntnum[c] for c in children):
+                self.add(f"body:{name}.payload", SIZE * _largest(m), f"a load at {name}", low=0.0)
+            first = int(m.body_jntadr[b])
+            chained = m.body_jntnum[b] and int(m.jnt_type[first]) in HINGES and m.body_parentid[b] != 0
+            if chained and np.linalg.norm(m.body_pos[b]) > 1e-6:
+                self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
+
+    def add_options(self) -> None:
+        """Gravity's direction and the simulator's own step, integrator and solver."""
+        if np.linalg.norm(self.model.opt.gravity) > 0:
+            for axis in ("tilt_x", "tilt_y"):
+                self.add(f"option.{axis}", 0.01, "the base is tilted", effect="gravity.direction")
+        says = "the simulator's own time step, relative"
+        self.add("option.timestep", 0.5, says, low=-1.1, high=1.0)
+        says = "the simulator's integrator: this share of another's result"
+        self.add("option.integrator", 0.5, says, low=0.0, high=1.1)
+        if self.simulator.touching:
+            says = "iterations of the simulator's solver: ten times as many"
+            self.add("option.iterations", 0.3, says, low=0.0, high=1.0)
+
+    def add_contacts(self, recordings: Sequence[Recording]) -> None:
+        """Friction, stiffness, damping and size of geoms that touch."""
+        m = self.model
+        for g in _touching(self.simulator, recordings):
+            name = name_of(m, "geom", g)
+            if not name:
+                continue
+            friction = max(float(m.geom_friction[g, 0]), 0.1)
+            self.add(f"geom:{name}.friction", SIZE * friction, f"friction of {name}", low=0.0)
+            soft, says = f"geom:{name}.stiffness", f"stiffness and damping of {name}'s contact"
+            sd = SIZE * float(m.geom_solref[g, 0])
+            self.add(f"geom:{name}.time_constant", sd, says, low=1e-4, effect=soft)
+            self.add(f"geom:{name}.damping_ratio", 2 * SIZE, says, low=0.05, effect=soft)
+            self.add(f"geom:{name}.size", 0.01, f"size of {name}", low=-0.5)
+
+    def add_named(self, named: Sequence[str]) -> None:
+        """What the user asks for beyond these."""
+        for name in named:
+            if name not in self.parameters:
+                nominal = setting_of(self.model, name).get(self.model)
+                self.add(name, SIZE * abs(nominal) if nominal else 0.01)
 
 
 def _largest(model: Any) -> float:
@@ -214,80 +185,3 @@ def _touching(simulator: MjcfSimulator, recordings: Sequence[Recording]) -> list
     moving = {int(simulator.model.jnt_bodyid[j]) for j in (*simulator.free, *simulator.joints.values())}
     ranked = sorted(count, key=lambda g: (int(simulator.model.geom_bodyid[g]) not in moving, -count[g]))
     return ranked[:GEOMS]
-
-
-def _state_friction(
-    model: Any,
-    simulator: MjcfSimulator,
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion],
-    joints: Sequence[int],
-) -> list[RobotEffect]:
-    """Friction that depends on load, speed or direction, as torques along the recorded motion."""
-    by_log = {log.name: motion for log, motion in zip(recordings, motions, strict=True)}
-    out = []
-    for j in joints:
-        name, size = _name(model, "joint", j), _sizes(motions, j)
-        turning = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-        unit = "N m" if turning else "N"
-        usual = SHARE * size.torque
-        still = 0.02 * size.rate  # below this the direction of motion is not told
-
-        def way(log: Recording, joint: int = j, still: float = still) -> np.ndarray:
-            return np.tanh(by_log[log.name].rate[joint] / still)
-
-        def load(log: Recording, theta: Mapping[str, float], joint: int = j, way=way) -> np.ndarray:
-            return -theta["share"] * np.abs(by_log[log.name].torque[joint]) * way(log)
-
-        def skew(log: Recording, theta: Mapping[str, float], joint: int = j, way=way) -> np.ndarray:
-            return -theta["skew"] * np.abs(way(log))
-
-        def stribeck(log: Recording, theta: Mapping[str, float], joint: int = j, way=way) -> np.ndarray:
-            rate = by_log[log.name].rate[joint]
-            return -theta["extra"] * np.exp(-((rate / theta["speed"]) ** 2)) * way(log)
-
-        def drag(log: Recording, theta: Mapping[str, float], joint: int = j) -> np.ndarray:
-            rate = by_log[log.name].rate[joint]
-            return -theta["coefficient"] * rate * np.abs(rate)
-
-        share = {"share": Parameter(0.0, SHARE, "1", low=0.0)}
-        out += [
-            _applied(name, "load_friction", "friction in proportion to the torque transmitted", share, load),
-            _applied(
-                name,
-                "direction_friction",
-                "friction larger one way than the other",
-                {"skew": Parameter(0.0, usual, unit)},
-                skew,
-            ),
-            _applied(
-                name,
-                "stribeck",
-                "friction larger near standstill, by extra exp(-(rate / speed)^2)",
-                {
-                    "extra": Parameter(0.0, usual, unit, low=0.0),
-                    "speed": Parameter(
-                        0.3 * size.rate, 0.1 * size.rate, "rad/s" if turning else "m/s", low=0.03 * size.rate
-                    ),
-                },
-                stribeck,
-            ),
-            _applied(
-                name,
-                "quadratic_drag",
-                "drag in proportion to the rate's square",
-                {"coefficient": Parameter(0.0, usual / size.rate**2, f"{unit} s^2/rad^2", low=0.0)},
-                drag,
-            ),
-        ]
-    return out
-
-
-def _applied(joint: str, what: str, says: str, parameters: dict[str, Parameter], torque) -> RobotEffect:
-    column = f"{APPLIED}{joint}"
-
-    def act(log: Recording, theta: Mapping[str, float]) -> Recording:
-        before = log.columns.get(column, np.zeros(len(log)))
-        return log.with_columns({column: before + torque(log, theta)})
-
-    return RobotEffect(f"joint:{joint}.{what}", says, parameters, command=act)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from simgap.robots.diagnose import RobotDiagnosis
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.setting import object_id
 
 
 def patched(xml: Path, found: RobotDiagnosis) -> tuple[str, list[str]]:
@@ -37,54 +37,52 @@ def patched(xml: Path, found: RobotDiagnosis) -> tuple[str, list[str]]:
 def _written(text: str, simulator, name: str, parameters: Mapping[str, float]) -> str | None:
     """The text with one setting in it, None where it has no place."""
     kind, thing, attribute, index = simulator.settings[name].xml or ("", "", "", None)
-    value = parameters[name]
-    model = simulator.model
-    if kind == "joint":
-        return attribute_set(text, "joint", thing, {attribute: number(value)})
+    model, value = simulator.model, parameters[name]
     if kind == "body" and attribute in ("mass", "ipos"):
-        return _inertial(text, model, thing, name, parameters)
-    if kind == "body" and attribute == "pos":
-        b = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, thing)
-        return attribute_set(text, "body", thing, {"pos": numbers(model.body_pos[b] * (1 + value))})
-    if kind == "geom":
-        g = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, thing)
-        stated = {
-            "friction": model.geom_friction,
-            "solref": model.geom_solref,
-            "solimp": model.geom_solimp,
-            "size": model.geom_size,
-        }[attribute][g].copy()
-        if index is None:
-            stated = stated * (1 + value)
-        else:
-            stated[index] = value
-        return attribute_set(text, "geom", thing, {attribute: numbers(stated)})
+        return _inertial(text, model, thing, parameters)
+    if kind == "option":
+        stated = _option(model, attribute, value, parameters)
+        return None if stated is None else option_set(text, {attribute: stated})
     if kind == "actuator":
-        a = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, thing)
-        if attribute == "kp":
-            return attribute_set(
-                text, r"[a-z]+", thing, {"kp": number(model.actuator_gainprm[a, 0] * (1 + value))}
-            )
-        if attribute == "kv":
-            return attribute_set(text, r"[a-z]+", thing, {"kv": number(value)})
-        if attribute == "forcerange":
-            return attribute_set(text, r"[a-z]+", thing, {"forcerange": numbers([-value, value])})
+        stated = _actuator(model, thing, attribute, value)
+        return None if stated is None else attribute_set(text, r"[a-z]+", thing, {attribute: stated})
+    if kind not in ("joint", "body", "geom"):
         return None
-    if kind == "option" and attribute == "gravity":
-        down = np.array(model.opt.gravity)
-        turned = down.copy()
-        for axis, key in enumerate(("option.tilt_x", "option.tilt_y")):
-            turned = turned + np.cross(np.eye(3)[axis], down) * parameters.get(key, 0.0)
-        return option_set(text, {"gravity": numbers(turned)})
-    if kind == "option" and attribute == "timestep":
-        step = model.opt.timestep * max(1 + value, 0.25)
-        return option_set(text, {"timestep": number(step)})
-    return None
+    stated = number(value) if kind == "joint" else _array(model, kind, thing, attribute, index, value)
+    return attribute_set(text, kind, thing, {attribute: stated})
 
 
-def _inertial(text: str, model, body: str, name: str, parameters: Mapping[str, float]) -> str | None:
+def _array(model, kind: str, thing: str, attribute: str, index: int | None, value: float) -> str:
+    """An attribute of several numbers: one of them at a value, or all larger by a share."""
+    stated = np.array(getattr(model, f"{kind}_{attribute}")[object_id(model, kind, thing)])
+    if index is None:
+        return numbers(stated * (1 + value))
+    stated[index] = value
+    return numbers(stated)
+
+
+def _actuator(model, thing: str, attribute: str, value: float) -> str | None:
+    if attribute == "kp":
+        return number(model.actuator_gainprm[object_id(model, "actuator", thing), 0] * (1 + value))
+    return {"kv": number(value), "forcerange": numbers([-value, value])}.get(attribute)
+
+
+def _option(model, attribute: str, value: float, parameters: Mapping[str, float]) -> str | None:
+    if attribute == "timestep":
+        return number(model.opt.timestep * max(1 + value, 0.25))
+    if attribute != "gravity":
+        return None
+    down = np.array(model.opt.gravity)
+    tilts = [
+        parameters.get(f"option.tilt_{axis}", 0.0) * np.cross(np.eye(3)[k], down)
+        for k, axis in enumerate("xy")
+    ]
+    return numbers(down + sum(tilts))
+
+
+def _inertial(text: str, model, body: str, parameters: Mapping[str, float]) -> str | None:
     """The body with an explicit inertial element at its new values."""
-    b = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
+    b = object_id(model, "body", body)
     mass = parameters.get(f"body:{body}.mass", float(model.body_mass[b]))
     scale = mass / float(model.body_mass[b])
     com = [parameters.get(f"body:{body}.com_{a}", float(model.body_ipos[b][k])) for k, a in enumerate("xyz")]

@@ -61,3 +61,8 @@ def array_setting(name: str, unit: str, array: str, at: Any, derived: bool, xml)
         getattr(model, array)[at] = value
 
     return Setting(name, unit, get, put, derived, xml)
+
+
+def name_of(model: Any, kind: str, number: int) -> str:
+    """The name of a joint, body, geom or actuator; empty where it has none."""
+    return mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), number) or ""
