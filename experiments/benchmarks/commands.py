@@ -28,7 +28,7 @@ STAGES = {
     ),
     "loading the segmentation and its kernels": (
         "from hmmseg.segmentation import align as a; import hmmseg.hmm.kernels.dense, "
-        "hmmseg.hmm.kernels.best_path, hmmseg.hmm.kernels.forward_backward"
+        "hmmseg.hmm.kernels.best_path, hmmseg.hmm.kernels.smoothing"
     ),
     "first segmentation (kernels from the disk)": "a.segment([trial], task, rig)",
     "one more segmentation": "a.segment([trial], task, rig)",

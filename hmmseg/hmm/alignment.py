@@ -1,4 +1,4 @@
-"""Most probable path and posterior of whole recordings, in logs, as EM and the segmentation take them.
+"""Most probable path and posterior of whole recordings, as EM and the segmentation take them.
 
 On the host kernels of hmmseg.hmm: nothing is compiled when it is called. hmmseg.hmm.banded has the same
 recursions in JAX, to be differentiated or run on an accelerator.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.hmm.chain import Chain, not_numbers
-from hmmseg.hmm.inference import table, tables_of, viterbi
+from hmmseg.hmm.inference import smoothed_tables, table, viterbi
 from hmmseg.hmm.results import Alignment as Best
 
 Bands = tuple[np.ndarray, ...]
@@ -20,7 +20,7 @@ Bands = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True)
 class Alignment:
-    """Posterior of one recording's alignment, NumPy arrays; fields as in hmmseg.hmm.banded.
+    """Posterior of one recording's alignment, as probabilities; fields as in hmmseg.hmm.results.Posterior.
 
     `path` (num_timesteps,) is the most probable one, `log_prob` its log weight.
     """
@@ -28,9 +28,8 @@ class Alignment:
     path: np.ndarray
     log_prob: float
     log_evidence: float
-    log_smoothed: np.ndarray  # (num_timesteps, num_subtasks)
-    log_advance: np.ndarray  # (num_timesteps - 1, num_subtasks - 1)
-    log_skip: Bands = ()
+    smoothed: np.ndarray  # (num_timesteps, num_subtasks)
+    moves: Bands  # from k to k + 1 (num_timesteps - 1, num_subtasks - 1), to k + 2, ...
 
 
 def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.ndarray,
@@ -47,8 +46,7 @@ def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.nda
         raise not_numbers(ll, int(missing.any(axis=1).argmax()))
     best = viterbi(ll, chain)
     assert isinstance(best, Best)  # of one recording
-    log_evidence, _, smoothed, moves = tables_of(ll, chain, True, False, True)
-    return Alignment(best.path, best.log_prob, log_evidence, smoothed, moves[0], tuple(moves[1:]))
+    return Alignment(best.path, best.log_prob, *smoothed_tables(ll, chain))
 
 
 def align_many(log_likelihoods: Sequence[np.ndarray], bands: Sequence[Bands], *,

@@ -73,7 +73,7 @@ class Fit(Generic[E, D]):
     @property
     def responsibilities(self) -> list[np.ndarray]:
         """Posterior state probabilities (num_timesteps, num_states) of every trial."""
-        return [np.exp(a.log_smoothed) for a in self.alignments]
+        return [a.smoothed for a in self.alignments]
 
 
 def expectation(emission: Emission, durations: Durations, num_trials: int) -> tuple[Alignment, ...]:

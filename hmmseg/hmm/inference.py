@@ -169,55 +169,75 @@ def in_threads(run, lengths: np.ndarray, num_states: int) -> list:
         return list(pool.map(run, [(int(a), int(b)) for a, b in pairwise(cuts)]))
 
 
-def tables_of(ll: np.ndarray, chain: Chain, logs: bool, filtered: bool, smoothed: bool) -> tuple:
-    """Log evidence; filtered and smoothed tables and moves, as logs or plain; empty where not asked for."""
-    num_samples, num_states = ll.shape
-    state = np.empty((num_samples, num_states)) if smoothed else _NONE
-    online = np.empty((num_samples, num_states)) if filtered else _NONE
+def filtered_table(ll: np.ndarray, chain: Chain, table: np.ndarray, logs: bool = False) -> float:
+    """Log evidence; filtered probabilities, or their logs, into `table`, empty where not asked for."""
     if len(chain.bands) > 2:
         from hmmseg.hmm.kernels.general import smooth_general
 
-        moved = np.empty((num_samples - 1 if smoothed else 0, len(chain.bands) - 1, num_states))
-        log_evidence = smooth_general(filled(ll), chain.stacked(), chain.varying, chain.log_initial,
-                                      chain.log_final, online, state, moved)  # fmt: skip
-        moves = tuple(moved[:, d - 1, : max(num_states - d, 0)] for d in range(1, len(chain.bands)))
+        none = np.empty((0, len(chain.bands) - 1, chain.num_states))
+        found = smooth_general(filled(ll), chain.stacked(), chain.varying, chain.log_initial,
+                               chain.log_final, table, _NONE, none)  # fmt: skip
         if not logs:
-            online, state, moves = np.exp(online), np.exp(state), tuple(np.exp(m) for m in moves)
-    else:
-        from hmmseg.hmm.kernels.forward_backward import smooth as kernel
+            np.exp(table, out=table)
+        return _possible(found, -1, ll, chain)
+    from hmmseg.hmm.kernels.forward import evidence
 
-        boundary = np.empty((num_samples - 1, num_states - 1)) if smoothed else _NONE
-        log_evidence, bad = kernel(ll.ctypes.data, ll.dtype == _SINGLE, num_samples, num_states,
-                                   *chain.addresses, online, state, boundary, logs)  # fmt: skip
-        if bad >= 0:
-            raise not_numbers(ll, bad)
-        moves = (boundary,)
+    found, bad = evidence(ll.ctypes.data, ll.dtype == _SINGLE, *ll.shape, *chain.addresses, table, logs)
+    return _possible(found, bad, ll, chain)
+
+
+def smoothed_tables(ll: np.ndarray, chain: Chain) -> tuple[float, np.ndarray, tuple[np.ndarray, ...]]:
+    """Log evidence, and probabilities of states and moves as in Posterior."""
+    num_samples, num_states = ll.shape
+    if len(chain.bands) > 2:
+        from hmmseg.hmm.kernels.general import smooth_general
+
+        state = np.empty((num_samples, num_states))
+        moved = np.empty((num_samples - 1, len(chain.bands) - 1, num_states))
+        found = smooth_general(filled(ll), chain.stacked(), chain.varying, chain.log_initial,
+                               chain.log_final, _NONE, state, moved)  # fmt: skip
+        log_evidence = _possible(found, -1, ll, chain)
+        moves = (moved[:, d - 1, : max(num_states - d, 0)] for d in range(1, len(chain.bands)))
+        return log_evidence, np.exp(state), tuple(np.exp(each) for each in moves)
+    from hmmseg.hmm.kernels.smoothing import probabilities
+
+    # One row a state: the system hands out memory only where something is written.
+    state, boundary = np.zeros((num_states, num_samples)), np.zeros((num_states - 1, num_samples - 1))
+    found, bad = probabilities(ll.ctypes.data, ll.dtype == _SINGLE, num_samples, num_states, *chain.addresses,
+                               state, boundary)  # fmt: skip
+    return _possible(found, bad, ll, chain), state.T, (boundary.T,)
+
+
+def _possible(log_evidence: float, bad: int, ll: np.ndarray, chain: Chain) -> float:
+    """The log evidence; raises where there is none."""
+    if bad >= 0:
+        raise not_numbers(ll, bad)
     if not -np.inf < log_evidence < np.inf:
         raise why_infeasible(ll, chain)
-    return log_evidence, online, state, moves
+    return log_evidence
 
 
 def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain) -> float:
     """Log of the summed weight of all paths."""
     if isinstance(chain, DurationChain):
         return durations.forward(filled(table(log_likelihoods, chain)), chain)[0]
-    return tables_of(table(log_likelihoods, chain), chain, False, False, False)[0]
+    return filtered_table(table(log_likelihoods, chain), chain, _NONE)
 
 
 def forward(log_likelihoods: ArrayLike, chain: AnyChain) -> Filtered:
     """Filtered probabilities: what each sample says together with those before it."""
     if not isinstance(chain, Chain):
         raise ValueError("chain: tables of durations, expected a Chain")
-    found = tables_of(table(log_likelihoods, chain), chain, False, True, False)
-    return Filtered(found[0], found[1])
+    ll = table(log_likelihoods, chain)
+    filtered = np.empty(ll.shape)
+    return Filtered(filtered_table(ll, chain, filtered), filtered)
 
 
 def smooth(log_likelihoods: ArrayLike, chain: AnyChain) -> Posterior:
     """Probabilities of states and boundaries given the whole recording."""
     if isinstance(chain, DurationChain):
         return durations.smooth(filled(table(log_likelihoods, chain)), chain)
-    found = tables_of(table(log_likelihoods, chain), chain, False, False, True)
-    return Posterior(found[0], found[2], found[3])
+    return Posterior(*smoothed_tables(table(log_likelihoods, chain), chain))
 
 
 def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: int = 0) -> Alignments:
@@ -227,7 +247,8 @@ def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: in
     from hmmseg.hmm.kernels.general import draw_starts
 
     ll = table(log_likelihoods, chain)
-    _, online, *_ = tables_of(ll, chain, True, True, False)
+    online = np.empty(ll.shape)
+    filtered_table(ll, chain, online, logs=True)
     rng = np.random.default_rng(seed)
     starts = np.empty((num_draws, chain.num_states), np.int64)
     draw_starts(online, chain.stacked(), chain.varying, chain.log_final, rng.random(num_draws), rng, starts)

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+
+def crossings(moves: Sequence[np.ndarray]) -> np.ndarray:
+    """Probabilities that each boundary is crossed, from those of moves by one state, two, ..."""
+    if len(moves) == 1:
+        return moves[0]
+    crossed = moves[0].copy()
+    for d, band in enumerate(moves[1:], 2):
+        for k in range(band.shape[1]):
+            crossed[:, k : k + d] += band[:, k, None]
+    return crossed
 
 
 @dataclass(frozen=True)
@@ -81,30 +92,27 @@ class Posterior:
 
         Who passes over states crosses all their boundaries at once.
         """
-        if len(self.moves) == 1:
-            return self.moves[0]
-        crossed = self.moves[0].copy()
-        for d, band in enumerate(self.moves[1:], 2):
-            for k in range(band.shape[1]):
-                crossed[:, k : k + d] += band[:, k, None]
-        return crossed
+        return crossings(self.moves)
 
     def start_quantiles(self, q: float) -> np.ndarray:
         """Quantile of the first sample of the states 1, 2, ... (num_states - 1,), given that they start.
 
         NaN for a boundary that the posterior never crosses.
         """
-        cumulative = np.cumsum(self.boundary, axis=0)
-        if not len(cumulative):
-            return np.full(cumulative.shape[1], np.nan)
-        total = cumulative[-1]
-        found = 1.0 + (cumulative < q * total).sum(axis=0)
-        return np.where(total > 0, found, np.nan)
+        return self._quantiles(q)[:, 0]
 
     def start_intervals(self, level: float = 0.9) -> np.ndarray:
         """Central credible interval [samples] of each boundary, as its first sample (num_states - 1, 2)."""
-        ends = (1 - level) / 2, (1 + level) / 2
-        return np.stack([self.start_quantiles(q) for q in ends], axis=1)
+        return self._quantiles((1 - level) / 2, (1 + level) / 2)
+
+    def _quantiles(self, *levels: float) -> np.ndarray:
+        boundary = self.boundary
+        found = np.full((boundary.shape[1], len(levels)), np.nan)
+        for k, probability in enumerate(boundary.T):
+            cumulative = np.cumsum(probability)
+            if cumulative.size and cumulative[-1] > 0:
+                found[k] = 1.0 + np.searchsorted(cumulative, np.array(levels) * cumulative[-1])
+        return found
 
     def confidence(self, alignment: Alignment, within: int = 0) -> np.ndarray:
         """Probability (num_states - 1,) that each boundary of an alignment is right to `within` samples."""

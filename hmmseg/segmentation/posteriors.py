@@ -31,12 +31,12 @@ def contact_changes(
     """
     t = thinned.t
     table = contacts(signals, sensing, parameters)
-    path = np.asarray(posterior.log_smoothed).argmax(axis=1)
+    path = posterior.smoothed.argmax(axis=1)
     last = np.searchsorted(path, np.arange(len(steps) - 1), side="right") - 1
     edges = [float(t[0]), *t[last], float(t[-1])]
     out = []
     for k in range(len(steps) - 1):
-        probability = np.exp(posterior.log_advance[:, k])
+        probability = posterior.moves[0][:, k]
         prior = Prior(t, probability, (edges[k], edges[k + 2]))
         n = int(probability.argmax())
         out.append(table.change(steps[k], steps[k + 1], prior, _held_side(t, path, steps, k, n)))
@@ -54,7 +54,7 @@ def boundary_posteriors(
     found = []
     for k, change in enumerate(changes):
         if change is None:
-            found.append(combine(t, np.exp(posterior.log_advance[:, k]), {}))
+            found.append(combine(t, posterior.moves[0][:, k], {}))
         else:
             posted = moment(change, known.get(change.sort, Disagreement()))
             found.append(nearest_touch(touches, posted) if len(change.contacts) > 1 else posted)

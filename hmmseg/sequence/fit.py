@@ -91,7 +91,7 @@ def _fit_unlabelled(data: list[Features], task: SequenceTask, mapping: FeatureMa
         ]
         emissions, fine, _ = learner.run(fine, 1 / learner.stacked.shape[1], FLOORS[-1:])
         emissions = replace(emissions, temper=_coarsened(learner, emissions, fine))
-        fine = [np.exp(a.log_smoothed) for a in learner.align(emissions, fine)]
+        fine = [a.smoothed for a in learner.align(emissions, fine)]
         models.append(_finish(data, task, mapping, learner, emissions, fine, None))
     shares_of = [float(probability[i] / total) for i in order]
     others = tuple(Alternative(p, model) for p, model in zip(shares_of[1:], models[1:], strict=True))

@@ -12,6 +12,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hmm.alignment import Alignment, align_many
+from hmmseg.hmm.results import crossings
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.detectors import Detectors, learn
@@ -192,8 +193,4 @@ def _log_probability(alignment: Alignment, cells: np.ndarray) -> float:
 
 def boundary_probabilities(alignment: Alignment) -> np.ndarray:
     """Probability (num_cells - 1, num_states - 1) that subtasks up to k end at each cell edge."""
-    crossing = np.exp(alignment.log_advance)
-    for d, band in enumerate(alignment.log_skip, 2):
-        for k in range(band.shape[1]):
-            crossing[:, k : k + d] += np.exp(band[:, k])[:, None]
-    return crossing
+    return crossings(alignment.moves)

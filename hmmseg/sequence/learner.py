@@ -87,7 +87,7 @@ class Learner:
             for _ in range(steps):
                 aligned = self.align(emissions, probability, detectors)
                 probability = [
-                    np.exp(a.log_smoothed) if path is None else np.eye(self.num_states)[path]
+                    a.smoothed if path is None else np.eye(self.num_states)[path]
                     for a, path in zip(aligned, self.known, strict=True)
                 ]
                 emissions = update(emissions, self.stacked, self.pooled(probability), floor)

@@ -50,7 +50,7 @@ def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.nda
     The first subtask may be cropped to any length, so it is never called squeezed.
     """
     for k in range(1, len(names)):
-        cells = float(np.exp(alignment.log_smoothed[:, k]).sum())
+        cells = float(alignment.smoothed[:, k].sum())
         if not optional[k] and typical[k] >= MEASURABLE and cells < max(SQUEEZED * typical[k], 2.0):
             return Failure(k, names[k], None, "is squeezed to almost nothing: it does not happen")
     worse, poorer = (scores(log_likelihoods, mean_cells, alignment) - misfit[:, 0]) / misfit[:, 1]

@@ -141,7 +141,7 @@ def _learned(learner: Learner, start: Sequence[np.ndarray], settled: bool, named
     if any(np.isfinite(known).any() for known in labels):
         free = learner.align(emissions, probability, labels=False)
         for alignment, known in zip(free, labels, strict=True):
-            agreement += _agreement(np.exp(alignment.log_smoothed), known)
+            agreement += _agreement(alignment.smoothed, known)
     share = learner.independent_share(emissions, probability) * features
     return Reading(probability, settled, evidence, share, ends, agreement)
 
@@ -217,7 +217,7 @@ def stretches(
             taught, start, _ = alone.run(alone.one_hot([path]), temper, floors[1:3], steps=1)
             aligned = learner.align(taught, start)
             _, probability, evidence = learner.run(
-                [np.exp(a.log_smoothed) for a in aligned], temper, floors[2:], steps=3)  # fmt: skip
+                [a.smoothed for a in aligned], temper, floors[2:], steps=3)  # fmt: skip
             if evidence > highest:
                 best, highest = probability, evidence
     assert best is not None

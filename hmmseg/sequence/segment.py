@@ -124,9 +124,9 @@ def _jitter(model: SequenceModel) -> np.ndarray:
 
 def _visit_probabilities(alignment: Alignment) -> np.ndarray:
     """Probability (num_states,) that a path enters or starts in each state."""
-    visited = np.exp(alignment.log_smoothed[0])
-    for d, band in enumerate((alignment.log_advance, *alignment.log_skip), 1):
-        visited[d:] += np.exp(band).sum(0)
+    visited = alignment.smoothed[0].copy()
+    for d, band in enumerate(alignment.moves, 1):
+        visited[d:] += band.sum(0)
     return visited
 
 

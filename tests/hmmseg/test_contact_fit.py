@@ -86,7 +86,7 @@ def check_recovery(found, trials):
     for levels in p.levels:
         np.testing.assert_allclose([levels[k] for k in LEVELS], list(LEVELS.values()), atol=6e-5)
     for posterior, (_, labels) in zip(found.posteriors, trials, strict=True):
-        path = np.asarray(posterior.log_smoothed).argmax(axis=1)
+        path = posterior.smoothed.argmax(axis=1)
         assert np.mean(path == labels) > 0.985
 
 
@@ -136,7 +136,7 @@ def test_missing_samples_and_channels_do_not_stop_the_fit():
     holes = {name: np.where(rng.uniform(size=f.t.size) < 0.15, np.nan, getattr(f, name))
              for name in ("vx", "vy", "ay", "y", "d")}  # fmt: skip
     found = fit([replace(f, force=np.where(lost, np.nan, f.force), **holes)], STEPS)
-    path = np.asarray(found.posteriors[0].log_smoothed).argmax(axis=1)
+    path = found.posteriors[0].smoothed.argmax(axis=1)
     assert np.mean(path == labels) > 0.95
 
 

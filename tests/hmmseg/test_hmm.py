@@ -258,3 +258,28 @@ def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
         with pytest.raises(hmm.InfeasibleAlignment, match=reason) as caught:
             getattr(hmm, function)(table, chain_of(bands), *more)
         assert caught.value.subtask == subtask
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("apart", [0.01, 0.5, 3.0])
+@pytest.mark.parametrize("num_states", [3, 12, 40])
+def test_what_smoothing_leaves_out_is_nothing(num_states, apart, varying):
+    # Many blocks, in which few or all states are probable; the plain recursion leaves out none.
+    rng = np.random.default_rng(num_states)
+    n = 3000
+    state = np.sort(rng.integers(0, num_states, n))
+    ll = -0.5 * (apart * (state[:, None] - np.arange(num_states)) + rng.normal(size=(n, 1))) ** 2
+    ll[rng.integers(0, n, 20), rng.integers(0, num_states, 20)] -= 1250.0  # fifty standard deviations away
+    ll[1000:1400] = np.nan
+    ll[1700:1800, : num_states // 3] = -np.inf
+    # Some thirds fit a stretch far better than the states on either side of them that the rest asks for.
+    ll[1400:1500, 2 * num_states // 3 :] += 40.0
+    shape = (n - 1,) if varying else ()
+    stay, advance = rng.normal(size=(*shape, num_states)), rng.normal(size=(*shape, num_states - 1))
+    never = np.full((*shape, num_states - 2), -np.inf)
+    found = hmm.smooth(ll, hmm.Chain(stay, advance))
+    plain = hmm.smooth(ll, hmm.Chain(stay, advance, [never]))
+    np.testing.assert_allclose(found.log_evidence, plain.log_evidence, rtol=1e-13)
+    np.testing.assert_allclose(found.smoothed, plain.smoothed, atol=1e-9)
+    np.testing.assert_allclose(found.boundary, plain.boundary, atol=1e-9)
+    np.testing.assert_allclose(found.smoothed.sum(1), 1.0, atol=1e-9)

@@ -34,7 +34,7 @@ def decide(delta, rows, count, num_states, stay, advance, stay_step, advance_ste
 def best_path(ll, single, num_rows, num_states, stay, advance, varying, initial, final, starts, i):
     """First sample of each state into row i of `starts`; (log weight, first row with NaN or -1).
 
-    Addresses as in hmmseg.hmm.kernels.forward_backward.smooth. A state that the path does not visit
+    Addresses as in hmmseg.hmm.kernels.forward.evidence. A state that the path does not visit
     starts where the next one does, or at the end.
     """
     vectors, width = (num_states + 6) // 8, row_width(num_states)

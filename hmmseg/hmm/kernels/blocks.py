@@ -11,7 +11,7 @@ import numpy as np
 
 from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.hmm.kernels.simd import ahead, at, bits_of, double_of, doubles_at, singles_at, value_at
-from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, exponentials, forward_step, logarithms, renormalise
+from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, exponentials, forward_step, highest, renormalise
 
 PAD = 8  # numerics: states; tables are padded to multiples of it
 FIRST = 7  # numerics: states of a vector
@@ -70,6 +70,48 @@ def load(address, single, num_states, start, stop, out):
 
 
 @compiled
+def load_part(address, single, num_states, start, stop, first, width, out):
+    """`load` of `width` states from `first` on, of rows that are known to be sound."""
+    if width == num_states:
+        load(address, single, num_states, start, stop, out)
+        return
+    for r in range(stop - start):
+        begin = (start + r) * num_states + first
+        for k in range(width):
+            value = number(address, single, begin + k)
+            out[PAD + r * width + k] = 0.0 if value != value else value
+
+
+@compiled
+def most_gained(ll, single, num_states, start, stop):
+    """Log weight of the emissions of samples [start, stop) along the best of all states at each."""
+    gained = 0.0
+    for t in range(start, stop):
+        best = -np.inf
+        if single:
+            ones = ahead(singles_at(ll), t * num_states)
+            if num_states >= 8:
+                for k in range(0, num_states - 8, 8):
+                    best = max(best, highest(ahead(ones, k)))
+                best = max(best, highest(ahead(ones, num_states - 8)))
+            else:
+                for k in range(num_states):
+                    best = max(best, value_at(ahead(ones, k)))
+        else:
+            twos = ahead(doubles_at(ll), t * num_states)
+            if num_states >= 8:
+                for k in range(0, num_states - 8, 8):
+                    best = max(best, highest(ahead(twos, k)))
+                best = max(best, highest(ahead(twos, num_states - 8)))
+            else:
+                for k in range(num_states):
+                    best = max(best, value_at(ahead(twos, k)))
+        if -np.inf < best:  # neither missing nor impossible
+            gained += best
+    return gained
+
+
+@compiled
 def any_missing(rows, count):
     """Whether there is a NaN among `count` numbers."""
     missing = 0
@@ -80,9 +122,17 @@ def any_missing(rows, count):
 
 
 @compiled
+def begin_of_line(numbers):
+    """First of these numbers that begins a line of the cache: vectors across two lines are slow."""
+    return (-(numbers.ctypes.data >> 3)) & 7
+
+
+@compiled
 def doubles(size, value):
-    """So many doubles of one value (np.full takes seconds to compile)."""
-    out = np.empty(size)
+    """So many doubles of one value, on lines of the cache (np.full takes seconds to compile)."""
+    room = np.empty(size + 7)
+    first = begin_of_line(room)
+    out = room[first : first + size]
     for i in range(size):
         out[i] = value
     return out
@@ -90,11 +140,19 @@ def doubles(size, value):
 
 @compiled
 def integers(size, value):
-    """So many integers of one value."""
-    out = np.empty(size, np.int64)
+    """So many integers of one value, on lines of the cache."""
+    room = np.empty(size + 7, np.int64)
+    first = begin_of_line(room)
+    out = room[first : first + size]
     for i in range(size):
         out[i] = value
     return out
+
+
+@compiled
+def row_table(count, width):
+    """Rows of weights, not yet known."""
+    return doubles(count * width, 1.0).reshape(count, width), integers(count * width, 0).reshape(count, width)
 
 
 @compiled
@@ -134,13 +192,6 @@ def emissions(address, single, num_rows, num_states, start, stop, x, mantissa, e
     bad = load(address, single, num_states, start, stop, x)
     to_weights(x, size, mantissa, exponent)
     return bad
-
-
-@compiled
-def to_logs(mantissa, exponent, size, logs):
-    """Logarithms of `size` weights from PAD on."""
-    for i in range(PAD, PAD + size, 8):
-        logarithms(at(mantissa, i), at(exponent, i), at(logs, i))
 
 
 @compiled
@@ -201,8 +252,8 @@ def forward_block(am, ae, pm, pe, sm, se, vm, ve, stay_step, advance_step, first
     for r in range(count):
         old, new, p = r * width, (r + 1) * width, PAD + r * num_states
         s, v = PAD + r * stay_step, PAD + r * advance_step
-        fm[new + FIRST] = fm[old + FIRST] * sm[s] * pm[p]
-        fe[new + FIRST] = fe[old + FIRST] + se[s] + pe[p]
+        fm[new + FIRST] = fm[old + FIRST] * (sm[s] * pm[p])
+        fe[new + FIRST] = fe[old + FIRST] + (se[s] + pe[p])
         for c in range(0, num_states - 1, 8):
             forward_step(
                 at(fm, old + PAD + c), at(fe, old + PAD + c), at(pm, p + 1 + c), at(pe, p + 1 + c),

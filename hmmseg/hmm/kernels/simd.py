@@ -94,10 +94,6 @@ class Vec:
         """The same bits as doubles."""
         return Vec(self.builder, self.builder.bitcast(self.value, ir.VectorType(F64, WIDTH)))
 
-    def to_float(self) -> Vec:
-        """Integers as doubles of the same value, for magnitudes below 2^51 (by the bits of 1.5 2^52)."""
-        return (self + MAGIC_BITS).floats() - MAGIC
-
     def mask(self):
         """A comparison's results as one integer, the first element in its lowest bit."""
         bits = self.builder.bitcast(self.value, ir.IntType(WIDTH))
@@ -108,6 +104,10 @@ class Vec:
         second = ir.Constant(self.value.type, ir.Undefined) if other is None else other.value
         mask = ir.Constant(ir.VectorType(I32, WIDTH), order)
         return Vec(self.builder, self.builder.shuffle_vector(self.value, second, mask))
+
+    def first(self):
+        """The first element."""
+        return self.builder.extract_element(self.value, ir.Constant(I32, 0))
 
     def reversed(self) -> Vec:
         """Elements from last to first."""

@@ -11,7 +11,7 @@ import math
 
 from numba import types
 
-from hmmseg.hmm.kernels.simd import MAGIC, MAGIC_BITS, Lanes, Vec, vector_function
+from hmmseg.hmm.kernels.simd import MAGIC, MAGIC_BITS, WIDTH, Lanes, Vec, vector_function
 
 ZERO_EXPONENT = -(1 << 60)  # numerics: of a weight that is zero; sums of a few of them still fit 64 bits
 LEAST_LOG = -7e14  # numerics: a log weight below counts as -inf
@@ -52,6 +52,15 @@ def viterbi_step(lanes: Lanes, delta, log_likelihood, stay, advance, left):
     return entered.mask()
 
 
+@vector_function(types.float64)
+def highest(lanes: Lanes, numbers):
+    """The highest of eight numbers."""
+    best = lanes.load(numbers)
+    for apart in (4, 2, 1):
+        best = best.maximum(best.shuffled([(i + apart) % WIDTH for i in range(WIDTH)]))
+    return best.first()
+
+
 @vector_function(types.void)
 def exponentials(lanes: Lanes, logs, mantissa, exponent):
     """exp of eight numbers as weights: mantissas from 0.7 to 1.42.
@@ -70,29 +79,6 @@ def exponentials(lanes: Lanes, logs, mantissa, exponent):
 
 
 @vector_function(types.void)
-def logarithms(lanes: Lanes, mantissa, exponent, logs):
-    """Natural logarithms of eight weights; -inf where they are zero.
-
-    2 artanh(s) with s = (m - 1) / (m + 1) and m between 0.7 and 1.42.
-    """
-    bits = lanes.load(mantissa).bits()
-    scale = (bits >> 52) - 1023
-    m = ((bits & _MANTISSA) | _ONE).floats()
-    high = m > math.sqrt(2)
-    m = high.where(m * 0.5, m)
-    scale = scale + high.where(scale * 0 + 1, 0) + lanes.load(exponent)
-    s = (m - 1.0) / (m + 1.0)
-    square = s * s
-    series = square * (2 / 23) + 2 / 21
-    for n in range(19, 0, -2):
-        series = series.times_plus(square, 2 / n)
-    whole = scale.maximum(-(1 << 50)).to_float()
-    out = whole.times_plus(_LN2_HIGH, s.times_plus(series, whole * _LN2_LOW))
-    possible = scale > IMPOSSIBLE_EXPONENT
-    lanes.store(possible.where(out, -math.inf), logs)
-
-
-@vector_function(types.void)
 def renormalise(lanes: Lanes, mantissa, exponent):
     """Mantissas back to [1, 2); needed once in some sixteen steps."""
     bits = lanes.load(mantissa).bits()
@@ -101,77 +87,66 @@ def renormalise(lanes: Lanes, mantissa, exponent):
     lanes.store(total.maximum(ZERO_EXPONENT), exponent)
 
 
-def _plain(m: Vec, exponent: Vec, offset: Vec, factor: Vec) -> Vec:
-    e = (exponent - offset).maximum(-1022)
-    value = m * _power_of_two((e > 1000).where(e * 0 + 1000, e)) * factor
-    return (e > -1000).where(value, 0.0)
-
-
-@vector_function(types.void)
-def plain(lanes: Lanes, mantissa, exponent, offset, factor, out):
-    """Weights as ordinary numbers: m 2^(e - offset) factor; zero below 1e-300."""
-    lanes.store(
-        _plain(lanes.load(mantissa), lanes.load(exponent), lanes.same(offset), lanes.same(factor)), out
-    )
+def _plain(m: Vec, exponent: Vec) -> Vec:
+    """Probabilities as ordinary numbers, zero below 1e-300."""
+    return (exponent > -1000).where(m * _power_of_two(exponent.maximum(-1022)), 0.0)
 
 
 @vector_function(types.void)
 def forward_step(lanes: Lanes, m, e, pm, pe, sm, se, am, ae, leftm, lefte, outm, oute):
     """Weights of paths up to the next sample: (stay + arrive from the left) times emission."""
+    emission, emission_e = lanes.load(pm), lanes.load(pe)
     before, at = lanes.load(m), lanes.load(e)
-    stays, stays_e = before * lanes.load(sm), at + lanes.load(se)
-    enters, enters_e = before.shifted(leftm) * lanes.load(am), at.shifted(lefte) + lanes.load(ae)
+    # What does not wait for the last sample is multiplied first.
+    stays, stays_e = before * (lanes.load(sm) * emission), at + (lanes.load(se) + emission_e)
+    enters = before.shifted(leftm) * (lanes.load(am) * emission)
+    enters_e = at.shifted(lefte) + (lanes.load(ae) + emission_e)
     total, exponent = _added(stays, stays_e, enters, enters_e)
-    lanes.store(total * lanes.load(pm), outm)
-    lanes.store(exponent + lanes.load(pe), oute)
-
-
-@vector_function(types.void)
-def weigh(lanes: Lanes, m, e, pm, pe, outm, oute):
-    """Weights of the rest times the emission; states run backwards in m and e, forwards in p."""
-    lanes.store(lanes.load(m) * lanes.load(pm, back=True), outm)
-    lanes.store(lanes.load(e) + lanes.load(pe, back=True), oute)
-
-
-@vector_function(types.void)
-def backward_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute):
-    """Weights of the rest one sample earlier, from what `weigh` made; all tables run forwards."""
-    after, at = lanes.load(m), lanes.load(e)
-    stays, stays_e = after * lanes.load(sm, back=True), at + lanes.load(se, back=True)
-    leaves = after.shifted(leftm) * lanes.load(am, back=True)
-    leaves_e = at.shifted(lefte) + lanes.load(ae, back=True)
-    total, exponent = _added(stays, stays_e, leaves, leaves_e)
     lanes.store(total, outm)
     lanes.store(exponent, oute)
 
 
-def _joint(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute, fm, fe) -> tuple[Vec, Vec, Vec, Vec]:
-    """`backward_step`, and with forward weights f the joint weights of states and of advances."""
+@vector_function(types.void)
+def probable_step(lanes: Lanes, m, e, pm, pe, upm, upe, sm, se, am, ae, leftm, lefte, fm, fe, state, crossed):
+    """Weights of the rest one sample earlier, in place, and what they make of forward weights f.
+
+    The rest's states run backwards in m and e, those of all other tables forwards; `up`: emissions of the
+    states above. With f over the evidence they are the probabilities of states, and of advances from them,
+    `crossed`.
+    """
+
+    def back(pointer) -> Vec:
+        return lanes.load(pointer, back=True)
+
     after, at = lanes.load(m), lanes.load(e)
-    stays, stays_e = after * lanes.load(sm, back=True), at + lanes.load(se, back=True)
-    leaves = after.shifted(leftm) * lanes.load(am, back=True)
-    leaves_e = at.shifted(lefte) + lanes.load(ae, back=True)
+    # What does not wait for the sample behind is multiplied first.
+    stays, stays_e = after * (back(pm) * back(sm)), at + (back(pe) + back(se))
+    leaves = after.shifted(leftm) * (back(upm) * back(am))
+    leaves_e = at.shifted(lefte) + (back(upe) + back(ae))
     total, exponent = _added(stays, stays_e, leaves, leaves_e)
-    lanes.store(total, outm)
-    lanes.store(exponent, oute)
-    forward, forward_e = lanes.load(fm, back=True), lanes.load(fe, back=True)
-    return forward * total, forward_e + exponent, forward * leaves, forward_e + leaves_e
+    lanes.store(total, m)
+    lanes.store(exponent, e)
+    lanes.store(_plain(back(fm) * total, back(fe) + exponent), state, back=True)
+    lanes.store(_plain(back(fm) * leaves, back(fe) + leaves_e), crossed, back=True)
 
 
 @vector_function(types.void)
-def joint_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute,
-               fm, fe, gm, ge, xm, xe):  # fmt: skip
-    """`backward_step`, and with forward weights f the joint weights g of states and x of advances."""
-    found = _joint(lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute, fm, fe)
-    for vector, out in zip(found, (gm, ge, xm, xe), strict=True):
-        lanes.store(vector, out, back=True)
-
-
-@vector_function(types.void)
-def probable_step(lanes: Lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute,
-                  fm, fe, offset, factor, state, crossed):  # fmt: skip
-    """`joint_step` that stores probabilities, the joint weights over 2^offset times `factor`."""
-    gm, ge, xm, xe = _joint(lanes, m, e, sm, se, am, ae, leftm, lefte, outm, oute, fm, fe)
-    norm = lanes.same(offset), lanes.same(factor)
-    lanes.store(_plain(gm, ge, *norm), state, back=True)
-    lanes.store(_plain(xm, xe, *norm), crossed, back=True)
+def turn(lanes: Lanes, rows, step, out, out_step):
+    """Eight rows of eight numbers, `step` apart, as columns of `out`, whose rows are `out_step` apart."""
+    builder, found = lanes.builder, []
+    for _ in range(WIDTH):
+        found.append(lanes.load(rows))
+        rows = builder.gep(rows, [step])
+    for apart in (4, 2, 1):  # squares on the diagonal stay, those beside it change places
+        for i in range(WIDTH):
+            if not i & apart:
+                upper, lower = found[i], found[i + apart]
+                found[i] = upper.shuffled(
+                    [WIDTH + j - apart if j & apart else j for j in range(WIDTH)], lower
+                )
+                found[i + apart] = upper.shuffled(
+                    [WIDTH + j if j & apart else j + apart for j in range(WIDTH)], lower
+                )
+    for column in found:
+        lanes.store(column, out)
+        out = builder.gep(out, [out_step])

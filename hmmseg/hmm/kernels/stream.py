@@ -19,14 +19,14 @@ from hmmseg.hmm.kernels.blocks import (
     exponentials,
     first_row,
     forward_block,
-    integers,
     load,
     weights_of,
 )  # fmt: skip
 from hmmseg.hmm.kernels.compile import compiled
-from hmmseg.hmm.kernels.forward_backward import backward_block, log_of, put, put_filtered, total
+from hmmseg.hmm.kernels.forward import log_of, put_filtered, total
 from hmmseg.hmm.kernels.general import log_add
 from hmmseg.hmm.kernels.simd import at
+from hmmseg.hmm.kernels.smoothing import backward_block, plain
 from hmmseg.hmm.kernels.steps import IMPOSSIBLE_EXPONENT, ZERO_EXPONENT
 
 
@@ -66,30 +66,30 @@ def window(num_states, addresses, first, head, am, ae, pm, pe, ended, smoothed, 
     `ended`: the recording ends here, in the states that the chain says. Returns whether it can.
     """
     stay, advance, _, _, final = addresses
-    count = head - first
-    cells = (count + 1) * num_states + 2 * PAD
-    sm, se = weights_of(stay, num_states)
-    vm, ve = weights_of(advance, num_states - 1)
+    count, last = head - first, num_states - 1
     final_m, final_e = weights_of(final, num_states)
-    bm, be = empty_row(num_states)
-    gm, ge, xm, xe = np.empty(cells), integers(cells, 0), np.empty(cells), integers(cells, 0)
-    x = np.empty(cells)
     if not ended:
         for k in range(num_states):
             final_m[PAD + k], final_e[PAD + k] = 1.0, 0
-    last = count * num_states
-    for k in range(num_states):
-        i, j = FIRST + k, FIRST + num_states - 1 - k
-        bm[j], be[j] = final_m[PAD + k], final_e[PAD + k]
-        gm[PAD + last + k], ge[PAD + last + k] = am[head, i] * bm[j], ae[head, i] + be[j]
     sum_m, sum_e = total(am, ae, head, final_m, final_e, num_states)
     if sum_e < IMPOSSIBLE_EXPONENT:
         return False
-    p = first * num_states
+    sm, se = weights_of(stay, num_states)
+    vm, ve = weights_of(advance, last)
+    bm, be = empty_row(num_states)
+    for k in range(num_states):
+        rest_m, rest_e = final_m[PAD + k] / sum_m, final_e[PAD + k] - sum_e
+        bm[FIRST + last - k], be[FIRST + last - k] = rest_m, rest_e
+        smoothed[count, k] = plain(am[head, FIRST + k] * rest_m, ae[head, FIRST + k] + rest_e)
+    p, cells = first * num_states, count * num_states + 2 * PAD
+    state, crossed = np.empty(cells), np.empty(cells)
     backward_block(am[first : head + 1], ae[first : head + 1], bm, be, pm[p:], pe[p:], sm, se, vm, ve, 0, 0,
-                   1, count, num_states, gm, ge, xm, xe)  # fmt: skip
-    put(gm, ge, (count + 1) * num_states, sum_e, 1 / sum_m, False, 0.0, x, smoothed.reshape(smoothed.size), 0)
-    put(xm, xe, count * (num_states - 1), sum_e, 1 / sum_m, False, 0.0, x, boundary.reshape(boundary.size), 0)
+                   1, count, num_states, state, crossed)  # fmt: skip
+    for r in range(count):
+        for k in range(num_states):
+            smoothed[r, k] = state[PAD + r * num_states + k]
+        for k in range(last):
+            boundary[r, k] = crossed[PAD + r * last + k]
     return True
 
 
