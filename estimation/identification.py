@@ -14,7 +14,7 @@ from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.observations import Aligned, Noise, aligned_weights
 from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
-from estimation.remarks import misfits, soft_pads, unnamed, unrepeated, unstated_pads
+from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
 from estimation.sampler import Draws, sample
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
@@ -193,6 +193,8 @@ def identify_aligned(
     ]
     warnings += soft_pads(design, rig)
     warnings += unnamed(aligned.task, design)
+    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(kept) if u.single}
+    warnings += dense(aligned.task, rig, means)
     return Identification(
         aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in kept[:num]),
         draws[:, :num], tuple(kept[num:]), draws[:, num:], sampled if kept else None,

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from estimation.compliance import unit_pads
 from estimation.design import Design
 from estimation.observations import CHANNELS
-from hmmseg.io.rig import Rig
+from hmmseg.io.plausibility import Finding, all_changed
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
+from hmmseg.io.units import UNITS
 from hmmseg.segmentation.align import AlignedTrials
 
+STEEL = 7850.0  # physics: [kg/m^3]
+DEEPEST = 10.0  # limit: depths of a block in widths; none is held by two pads that is deeper
+LIGHT = 1500.0  # limit: [kg/m^3]: plastics and stone, of which the unit that makes it is the likeliest
 NOT_LEVEL = 2e-3  # chosen: m; more than a tilted table or a slip in the grip make of a move on a level
 
 
@@ -62,6 +69,31 @@ def misfits(aligned: AlignedTrials) -> list[str]:
     found = [trial.segmentation for trial in aligned.trials]
     remarks = dict.fromkeys(remark for s in found for remark in s.remarks)
     return [*(f"{s.file}: {failure}" for s in found for failure in s.failures), *remarks]
+
+
+def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> list[str]:
+    """Blocks too heavy for their size, of whatever they are made: forces in a smaller unit than N.
+
+    `found`: means by (object, property) [N, m].
+    """
+    for obj in task.objects:
+        weight, width = found.get((obj, "weight")), found.get((obj, "width"))
+        if weight is None or width is None or width <= 0:
+            continue
+        height = found.get((obj, "height"), width)
+        area = width * (height if height > 0 else width)
+        depth = weight / (rig.gravity * STEEL * area)
+        if depth < DEEPEST * width:
+            continue
+        density = weight / (rig.gravity * area**1.5)
+        unit = min(("mN", "gf"), key=lambda name: abs(np.log(density * UNITS[name][1] / LIGHT)))
+        names = rig.gripper.wrench[:3] if rig.gripper is not None else FORCE_CHANNELS
+        remedy = Finding(names[0], "", all_changed(names, rig, unit=unit)).remedy
+        return [
+            f"{obj} weighs {weight:.3g} N at {width * 1e3:.3g} x {area / width * 1e3:.3g} mm: of steel it "
+            f"would be {depth:.2g} m deep, so forces look like {unit}; expected {remedy}"
+        ]
+    return []
 
 
 def unrepeated(design: Design) -> list[str]:

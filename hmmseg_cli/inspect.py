@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,8 @@ RigFile = Annotated[Path | None, typer.Option(
 WriteOption = Annotated[Path | None, typer.Option(
     "--write", metavar="RIG.toml", help="Add the proposed mapping to this rig, or make it.")]  # fmt: skip
 BARS = "▁▂▃▄▅▆▇█"
+# Names that `hmmseg new` gives a gripper's columns until somebody says which they are.
+LAID_OUT = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
 
 
 def inspect(
@@ -51,12 +54,46 @@ def _extended(rig_file: Path, found: list[Any]) -> str:
         raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
     text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""
     now = parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
-    table = proposed[0].split("\n", 1)[0]
-    if (table == "[columns]" and now.columns) or (table == "[topics]" and now.topics):
-        raise InputError(f"--write {rig_file}", f"already has {table}", "a rig without it")
-    text = f"{text.rstrip()}\n\n{proposed[0]}".lstrip()
+    for table, said in (("[columns]", now.columns), ("[topics]", now.topics)):
+        if said and table in proposed[0].split("\n"):
+            raise InputError(f"--write {rig_file}", f"already has {table}", "a rig without it")
+    gripper, rest = split_gripper(proposed[0])
+    if now.gripper is not None and gripper:
+        if not set(now.gripper.channels) <= LAID_OUT:
+            raise InputError(f"--write {rig_file}", "already has [gripper]", "a rig without it")
+        text, gripper = with_gripper(text, gripper), []
+    text = "\n".join([text.rstrip(), "", *gripper, rest]).lstrip()
     parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
     return text
+
+
+def split_gripper(proposed: str) -> tuple[list[str], str]:
+    """Lines of a proposal's [gripper], and the rest of its text."""
+    lines = proposed.split("\n")
+    if lines[0] != "[gripper]":
+        return [], proposed
+    end = next((i for i, line in enumerate(lines[1:], 1) if line.startswith("[")), len(lines))
+    return [line for line in lines[:end] if line], "\n".join(lines[end:])
+
+
+def with_gripper(text: str, gripper: list[str]) -> str:
+    """A rig's text whose [gripper] has these lines in the place of its own of the same keys."""
+    lines = text.split("\n")
+    start = next(i for i, line in enumerate(lines) if line.strip().startswith("[gripper]"))
+    end = next(
+        (i for i, line in enumerate(lines[start + 1 :], start + 1) if line.startswith("[")), len(lines)
+    )
+    for line in gripper[1:]:
+        key = re.escape(line.split(" = ", 1)[0])
+        for pattern in (rf"\s*{key}\s*=", rf"\s*#\s*{key}\s*="):
+            at = next((i for i in range(start + 1, end) if re.match(pattern, lines[i])), None)
+            if at is not None:
+                lines[at] = line
+                break
+        else:
+            lines.insert(start + 1, line)
+            end += 1
+    return "\n".join(lines)
 
 
 def _show(out: Output, found: Any) -> None:
@@ -82,6 +119,11 @@ def _show(out: Output, found: Any) -> None:
         out.warn(f"{found.file}: column {line}")
     if found.toml:
         out.print("proposed for rig.toml:", found.toml)
+    elif found.unknown:
+        out.print(
+            f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
+            "which (hmmseg new lays it out)"
+        )
 
 
 def _number(value: float | None) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hmmseg.errors import InputError
+from hmmseg.hand.axes import check_axes
+from hmmseg.hand.force_units import check_noise
 from hmmseg.hand.gripper_signs import check_gripper
 from hmmseg.hand.signs import check_signs
 from hmmseg.hand.wrist import halved
@@ -26,9 +28,9 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
     Units come first: what moves 120 m has no sides.
     """
     out: list[Finding] = []
-    looks = [check_clock, check_lengths, check_angles, check_velocities, check_forces, check_signs]
-    if halved(trial):
-        looks.remove(check_signs)  # a wrist's force has no sides
+    looks = [check_clock, check_lengths, check_angles, check_velocities, check_forces]
+    if not halved(trial):
+        looks += [check_noise, check_axes, check_signs]  # a wrist's force has no sides
     if rig.gripper is not None:
         looks = [check_clock, check_gripper]
     for look in looks:

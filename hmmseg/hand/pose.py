@@ -52,7 +52,7 @@ def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose
     if np.linalg.norm(across) < 0.5:
         where = f"{trial.file}: [gripper] closing"
         problem = f"the pads close along {gripper.closing}, which is mostly up and down"
-        raise InputError(where, problem, "the tool's axis along which they close")
+        raise InputError(where, problem, "the axis along which they close, and a quaternion x, y, z, w")
     window = _window(t, position) if window is None else window
     velocity, acceleration = (smooth(t, position, deriv, window) for deriv in (1, 2))
     return Pose(t, position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)

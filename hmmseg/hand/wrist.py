@@ -14,18 +14,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from hmmseg.hand.gripper_signs import counts_closing, lifts_pull
-from hmmseg.hand.opening import Grip, closings, grip_of
+from hmmseg.hand.carried import ACTIVE, contradiction, grip_force_of, held_by
+from hmmseg.hand.force_units import tool_warnings
+from hmmseg.hand.gripper_signs import lifts_pull
+from hmmseg.hand.opening import Grip
 from hmmseg.hand.pose import Pose, bridged, pose_of, smooth
-from hmmseg.hand.tool import Tool, applied_force, free_tool
+from hmmseg.hand.quaternion_order import order_warnings
+from hmmseg.hand.tool import Tool
 from hmmseg.io.gripper import Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
-ACTIVE = 8.0  # chosen: noise scales above which the wrist feels something
-RAISED = 3e-3  # chosen: m from where it gripped: the hand has gone somewhere
-TOGETHER = 5  # chosen: samples within one smoothing window
-LOADED = 5.0  # chosen: standard errors at which a grip carries a load
 # chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
 LAG = 0.012
 TILT = 0.01  # chosen: rad; an arm whose orientation is not recorded holds its hand level by about as much
@@ -74,94 +73,18 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     assert gripper is not None
     pose = pose_of(trial, gripper)
     opening = np.sum([bridged(trial.t, trial.channels[name]) for name in gripper.opening], axis=0)
-    held = closings(trial.t, opening)
-    free = _surely_free(opening, held)
-    tool = free_tool(trial, rig, pose, free)
-    force = applied_force(trial, rig, pose, tool)
-    active = np.linalg.norm(np.nan_to_num(force), axis=1) > ACTIVE * tool.noise
     pressing = grip_force_of(trial, gripper)
-    grips = []
-    for closing in held:
-        give = give_of(rig, pressing, opening, closing)
-        grip = grip_of(trial.t, opening, active, closing, give)
-        if grip is not None:
-            grips.append(grip)
-    loads = [_load(grip, pose, force, tool) for grip in grips]
-    loaded = [grip for grip, load in zip(grips, loads, strict=True) if load is None or load != 0]
-    lifts = [load for load in loads if load]
-    if lifts and max(lifts) < 0:
-        raise lifts_pull(trial, rig, min(lifts))
-    if grips and not lifts and _carries(-opening, trial, pose, force, tool):
-        raise counts_closing(trial, rig)
-    return as_fingers(trial, rig, pose, tool, opening, force, loaded or grips, pressing)
-
-
-def _carries(opening: np.ndarray, trial: Trial, pose: Pose, force: np.ndarray, tool: Tool) -> bool:
-    """Whether something is lifted in some closing of this opening."""
-    nothing = np.zeros(opening.size, bool)
-    grips = [grip_of(trial.t, opening, nothing, each, 0.0) for each in closings(trial.t, opening)]
-    return any((_load(grip, pose, force, tool) or 0) > 0 for grip in grips if grip is not None)
-
-
-def _surely_free(opening: np.ndarray, held: list[tuple[int, int, int]]) -> np.ndarray:
-    """Samples outside of everything that may be a grip: more open than halfway back."""
-    free = np.ones(opening.size, bool)
-    for begun, least, opened in held:
-        top = min(opening[begun], opening[opened]) if opened > least else opening[begun]
-        inside = np.arange(begun, opened + 1)
-        free[inside[opening[inside] < opening[least] + 0.5 * (top - opening[least])]] = False
-    return free
-
-
-def grip_force_of(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
-    """What each pad presses with [N]: samples, or a number while it grips; None where nothing tells."""
-    if isinstance(gripper.grip_force, str):
-        return np.abs(trial.channels[gripper.grip_force])
-    if gripper.grip_force is not None:
-        return float(gripper.grip_force)
-    if gripper.motor_current is not None and gripper.force_per_ampere is not None:
-        return np.abs(trial.channels[gripper.motor_current]) * gripper.force_per_ampere
-    return None
-
-
-def give_of(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, closing: tuple[int, int, int]
-            ) -> float | None:  # fmt: skip
-    """What both pads give while held [m]; None where the force is not known."""
-    if pressing is None:
-        return None
-    if not isinstance(pressing, np.ndarray):
-        force = pressing
-    else:
-        begun, least, opened = closing
-        inside = slice(begun, opened + 1)
-        low = opening[inside] <= opening[least] + 0.1 * (opening[begun] - opening[least])
-        force = float(np.nanmedian(pressing[inside][low]))
-    return 2 * force / rig.fingertip.normal_stiffness if np.isfinite(force) else None
-
-
-def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
-    """What the hand carries while raised, or pushes while it moves along [N]: 0 where it is nothing.
-
-    None where it never goes anywhere, which leaves nothing to judge by.
-    """
-    inside = slice(grip.start, grip.stop)
-    height = pose.position[inside] @ pose.up
-    raised = height - max(height[0], height[-1]) > RAISED
-    lifted = raised.sum() > 3
-    moved = (
-        raised
-        if lifted
-        else np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > RAISED
-    )
-    load = force[inside][moved] @ (pose.up if lifted else pose.across)
-    load = load[np.isfinite(load)]
-    if load.size < 4:
-        return None
-    scatter = max(1.4826 * float(np.median(np.abs(load - np.median(load)))), tool.noise)
-    found = float(np.median(load))
-    if abs(found) <= LOADED * scatter / np.sqrt(load.size / TOGETHER):
-        return 0.0
-    return found if lifted else abs(found)
+    held = held_by(trial, rig, pose, opening, pressing)
+    if held.lifts and max(held.lifts) < 0:
+        raise lifts_pull(trial, rig, min(held.lifts))
+    if held.grips and not held.lifts:
+        told = contradiction(trial, rig, pose, opening, held)
+        if told is not None:
+            raise told
+    loaded = [grip for grip, load in zip(held.grips, held.loads, strict=True) if load is None or load != 0]
+    found = as_fingers(trial, rig, pose, held.tool, opening, held.force, loaded or held.grips, pressing)
+    order = order_warnings(trial, rig, held.tool, held.free)
+    return replace(found, warnings=(*order, *tool_warnings(trial, rig, held.tool)))
 
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,

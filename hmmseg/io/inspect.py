@@ -14,6 +14,7 @@ from hmmseg.io.propose import as_toml, mended, propose
 from hmmseg.io.propose_gripper import propose_gripper
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
+from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS
 from hmmseg.io.units import unit_in_name
 
 BUCKETS = 24  # numerics: of a small plot
@@ -54,6 +55,13 @@ class Inspection:
     mapping: dict[str, dict[str, Any]]
     toml: str
     said: tuple[str, ...]
+
+    @property
+    def unknown(self) -> bool:
+        """Whether neither a hand's own names are there nor any were recognised."""
+        names = {channel.name for channel in self.channels}
+        fingers = (set(CARTESIAN_CHANNELS) - set(CARTESIAN_OPTIONAL), set(JOINT_CHANNELS))
+        return not self.toml and not any(wanted <= names for wanted in fingers)
 
 
 def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:

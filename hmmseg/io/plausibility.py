@@ -101,14 +101,22 @@ def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
         name, travel = max(far.items(), key=lambda item: item[1])
-        unit = "cm" if travel < 30 else "mm" if travel < 5e3 else "um"
-        other = ' (or "cm")' if unit == "mm" and travel < 100 else ""
-        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {unit}{other}"
+        unit, told = length_unit(travel)
+        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {told}"
         return [Finding(name, problem, all_changed(far, rig, unit=unit))]
     if travels and max(travels.values()) < STILL:
         problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were in km"
         return [Finding("x1", problem, all_changed(travels, rig, unit="mm"), certain=False)]
     return []
+
+
+def length_unit(travel: float) -> tuple[str, str]:
+    """The likeliest unit of positions that travel so many units, and that with the next likely one."""
+    if travel < 30:
+        return "cm", 'cm (or "in")'
+    if travel < 100:
+        return "mm", 'mm (or "cm")'
+    return ("mm", "mm") if travel < 5e3 else ("um", "um")
 
 
 def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:

@@ -1,8 +1,8 @@
 """A mapping proposed from the names in another lab's file, mended by what can be seen in it.
 
 Names are taken apart into words: which finger (left, right, 1, 2), which quantity (position,
-velocity, force, joint), which axis. It is a proposal: units and signs follow from physics where
-they can, and a person looks at the rest.
+velocity, force, joint), which axis. Of three axes the plane of the work is looked for in what the fingers do.
+It is a proposal: units and signs follow from physics where they can, and a person looks at the rest.
 """
 
 from __future__ import annotations
@@ -11,24 +11,29 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from hmmseg.errors import InputError
 from hmmseg.io.columns import Column
 from hmmseg.io.plausibility import entry_text
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table
+from hmmseg.io.table import Table, numbers
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, trial_of
 from hmmseg.io.units import UNITS, known_unit, measures, unit_in_name
 
-TIME = ("t", "time", "timestamp", "stamp", "timestamps", "sec", "seconds", "clock", "times")
-LEFT = {"left", "l", "lf", "finger1", "f1", "thumb", "1", "lh"}
-RIGHT = {"right", "r", "rf", "finger2", "f2", "index", "2", "rh"}
+TIME = ("t", "time", "timestamp", "stamp", "timestamps", "sec", "seconds", "clock", "times", "zeit",
+        "zeitstempel")  # fmt: skip
+LEFT = {"left", "l", "lf", "finger1", "f1", "thumb", "1", "lh", "links", "linker"}
+RIGHT = {"right", "r", "rf", "finger2", "f2", "index", "2", "rh", "rechts", "rechter"}
 QUANTITIES = {
-    "v": {"v", "vel", "velocity", "velocities", "speed", "twist", "vx", "vy", "vz"},
-    "f": {"f", "force", "forces", "wrench", "load", "fx", "fy", "fz"},
+    "v": {"v", "vel", "velocity", "velocities", "speed", "twist", "vx", "vy", "vz", "geschwindigkeit"},
+    "f": {"f", "force", "forces", "wrench", "load", "fx", "fy", "fz", "kraft"},
     "dq": {"dq", "qd", "qdot", "jointvel", "dtheta"},
-    "q": {"q", "joint", "joints", "angle", "theta", "qpos"},
-    "p": {"pos", "position", "positions", "pose", "tip", "xyz", "x", "y", "z", "point"},
+    "q": {"q", "joint", "joints", "angle", "theta", "qpos", "winkel"},
+    "p": {"pos", "position", "positions", "pose", "tip", "xyz", "x", "y", "z", "point", "weg", "lage"},
 }
+VECTORS = {3: "xyz", 4: "xyzw"}
+MOVES = 1e-3  # numerics: of the longest travel; an axis along which fingers move less is none they work in
 AXES = {"x": {"x", "fx", "vx"}, "y": {"y", "fy", "vy"}, "z": {"z", "fz", "vz"}}
 TURNING = {"torque", "moment", "mx", "my", "mz", "tx", "ty", "tz", "orientation", "quaternion", "rot"}
 
@@ -42,7 +47,7 @@ def propose(table: Table) -> dict[str, dict[str, Any]]:
     sources: dict[str, str] = {} if table.messages else _clock(names)
     for channels in (CARTESIAN_CHANNELS, JOINT_CHANNELS):
         found = {channel: channel for channel in channels if channel in names}
-        found |= {channel: name for channel, name in _matched(names).items()
+        found |= {channel: name for channel, name in _matched(names, table).items()
                   if channel in channels and channel not in found}  # fmt: skip
         if len(found) > len(channels) / 2:
             sources |= found
@@ -102,17 +107,53 @@ def _clock(names: Sequence[str]) -> dict[str, str]:
     return {}
 
 
-def _matched(names: Sequence[str]) -> dict[str, str]:
-    """The first column that fits each of our channels; z is up where a finger has no y."""
+def _matched(names: Sequence[str], table: Table) -> dict[str, str]:
+    """The first column that fits each of our channels, as the axes of the work go by x and y."""
     found: dict[str, str] = {}
-    for name in names:
-        channel = _channel(words(name))
+    for name, parts in split(names).items():
+        channel = _channel(parts)
         if channel is not None:
             found.setdefault(channel, name)
-    out = {name: source for name, source in found.items() if "z" not in name}
-    for name, source in found.items():
-        if "z" in name and name.replace("z", "y") not in found:
-            out[name.replace("z", "y")] = source
+    across, up = _plane(found, table)
+    out: dict[str, str] = {}
+    for channel, name in found.items():
+        axis = re.search("[xyz]", channel)
+        if axis is None:
+            out[channel] = name
+        elif axis[0] in (across, up):
+            out[channel.replace(axis[0], "x" if axis[0] == across else "y")] = name
+    return out
+
+
+def _plane(found: Mapping[str, str], table: Table) -> tuple[str, str]:
+    """Axes across and up of fingers whose channels (with z for a third axis) come from these columns.
+
+    Up is z where the fingers move along it (ROS, REP 103) or there is no y; across is where they stand
+    apart most.
+    """
+    there = [axis for axis in "xyz" if {f"{axis}1", f"{axis}2"} <= set(found)]
+    if len(there) < 3:
+        return "x", "z" if "z" in there and "y" not in there else "y"
+    try:
+        pairs = {a: [numbers(table, found[f"{a}{i}"]) for i in (1, 2)] for a in there}
+    except (InputError, KeyError):
+        return "x", "y"
+    if not all(np.isfinite(values).any() for a in there for values in pairs[a]):
+        return "x", "y"
+    travel = {a: max(float(np.nanmax(values) - np.nanmin(values)) for values in pairs[a]) for a in there}
+    moves = [a for a in there if travel[a] > MOVES * max(travel.values())]
+    up = "z" if "z" in moves else "y"
+    apart = {a: abs(float(np.nanmedian(pairs[a][1]) - np.nanmedian(pairs[a][0]))) for a in there if a != up}
+    return max(apart, key=lambda axis: apart[axis]), up
+
+
+def split(names: Sequence[str]) -> dict[str, list[str]]:
+    """Words of each name; the entries of a vector of three or four end in their axis instead of a number."""
+    out = {}
+    for name in names:
+        base, _, index = name.removesuffix("]").rpartition("[")
+        axes = VECTORS.get(sum(each.startswith(f"{base}[") for each in names)) if index.isdigit() else None
+        out[name] = words(name) if axes is None else [*words(base), axes[int(index)]]
     return out
 
 

@@ -7,14 +7,16 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from hmmseg.io.propose import as_toml, words
+from hmmseg.io.propose import as_toml
+from hmmseg.io.propose import split as split_names
 from hmmseg.io.table import Table
 from hmmseg.io.units import UNITS, known_unit, unit_in_name
 
-OPENING = {"width", "opening", "gap", "aperture", "gripper", "finger", "fingers"}
-FORCE = {"f", "force", "forces", "fx", "fy", "fz"}
+OPENING = {"width", "opening", "gap", "aperture", "gripper", "finger", "fingers", "oeffnung", "öffnung"}
+FORCE = {"f", "force", "forces", "fx", "fy", "fz", "kraft"}
 TORQUE = {"torque", "tau", "moment", "tx", "ty", "tz", "mx", "my", "mz"}
-PLACE = {"pos", "position", "p", "ee", "tcp", "tool", "hand", "eef", "flange", "pose", "px", "py", "pz"}
+TOOL = {"ee", "tcp", "tool", "hand", "eef", "flange"}
+PLACE = TOOL | {"pos", "position", "p", "pose", "px", "py", "pz"}
 MOVING = {
     "v",
     "vel",
@@ -37,9 +39,10 @@ def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> s
 
     `entries` are those of `[columns]` or `[topics]` that are proposed already.
     """
-    split = {name: words(name) for name in table.names}
+    split = split_names(table.names)
     forces = _by_axis(split, FORCE, TORQUE | MOVING | {"grip", "gripper", "finger"})
-    places = _by_axis(split, PLACE, FORCE | TORQUE | MOVING | TURN | OPENING - {"gripper"})
+    never = FORCE | TORQUE | MOVING | TURN | OPENING - {"gripper"}
+    places = _by_axis(split, TOOL, never | {"to", "rel", "relative"}) or _by_axis(split, PLACE, never)
     other = FORCE | TORQUE | MOVING | CURRENT | PLACE - {"pos", "position"}
     openings = [name for name, found in split.items() if set(found) & OPENING and not set(found) & other]
     if len(forces) < 3 or not places or not openings:

@@ -8,12 +8,20 @@ import typing
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from hmmseg.errors import InputError, nearest
 
-Positive = Annotated[float, Field(gt=0, strict=True)]  # inf allowed: a rigid pad
 LARGEST = 1e12  # numerics: SI units; squares of what is larger overflow sooner or later
+
+
+def _rigid(value: float) -> float:
+    if LARGEST < value < float("inf"):
+        raise ValueError(f"found {value:.3g}; expected at most {LARGEST:.0e}, or inf")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, strict=True), AfterValidator(_rigid)]  # inf allowed: a rigid pad
 FinitePositive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False, strict=True)]
 Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
 Deviation = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False, strict=True)]

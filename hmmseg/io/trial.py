@@ -109,7 +109,7 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
         trial = two_fingers(trial, rig)
     elif halved(trial):
         trial = from_halves(trial, rig)
-    return replace(trial, warnings=warnings)
+    return replace(trial, warnings=(*warnings, *trial.warnings))
 
 
 def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:

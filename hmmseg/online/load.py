@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hmmseg.hand.wrist import LOADED, RAISED, TOGETHER
+from hmmseg.hand.carried import LOADED, RAISED, TOGETHER
 
 WENT = 20  # chosen: samples of a hand that goes somewhere before what it bears is judged
 

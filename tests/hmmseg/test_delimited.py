@@ -56,6 +56,16 @@ def test_spreadsheets_unicode_text(tmp_path):
     np.testing.assert_allclose(read_trial(tmp_path / "a.txt", task=PLAIN).channels["f"], F)
 
 
+def test_umlauts_of_spreadsheets(tmp_path):
+    text = written(";", ",", before=["# Prüfstand 3: Öffnung in °"])
+    (tmp_path / "a.csv").write_bytes(text.replace("f", "Öf").encode("cp1252"))
+    trial = read_trial(tmp_path / "a.csv", task=SequenceTask(("a",), channels=("x", "Öf")))
+    np.testing.assert_allclose(trial.channels["Öf"], F)
+    (tmp_path / "a.csv").write_bytes(b"\x00\xff\x01" + text.encode("cp1252"))
+    with pytest.raises(InputError, match=r"cannot be read .'utf-8' codec"):
+        read_trial(tmp_path / "a.csv", task=PLAIN)
+
+
 def test_a_row_of_units_is_believed(tmp_path):
     (tmp_path / "a.tsv").write_text(written("\t", after_header=["[s]\t[mm]\t[mN]"]))
     trial = read_trial(tmp_path / "a.tsv", task=PLAIN)

@@ -6,26 +6,15 @@ The oracle is the recording itself: written into rig.toml, the proposed entries 
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fault_scene import CARTESIAN, FOLDER, FREE, JOINT, JOINTED, mended
 
 from hmmseg.errors import InputError
-from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import Rig, parse_rig, read_rig
+from hmmseg.io.rig import read_rig
 from hmmseg.io.trial import JOINT_CHANNELS, read_trial
-
-FOLDER = Path(__file__).resolve().parents[2] / "recordings/none_1"
-JOINTED = read_rig(FOLDER / "rig.toml")
-JOINT = {name: values for name, values in [
-    (name, values) for trial in [read_trial(FOLDER / "trial_01.csv", JOINTED)]
-    for name, values in [("t", trial.t), *trial.channels.items()]]}  # fmt: skip
-_SIGNALS = task_space(read_trial(FOLDER / "trial_01.csv", JOINTED), JOINTED)
-CARTESIAN = {name: getattr(_SIGNALS, name) for name in (
-    "t", "x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")}  # fmt: skip
-FREE = parse_rig({})
 
 
 def changed(table, **factors):
@@ -74,15 +63,6 @@ MISFITS = {
     "x flipped": (CARTESIAN, changed(CARTESIAN, x=-1, vx=-1), FREE, "column x1: is right of x2 in a grip"),
 }  # fmt: skip
 ELSEWHERE = {"rates in deg/s": ("q", "dq")}
-
-
-def mended(rig: Rig, line: str) -> Rig:
-    """The rig with the entries that a line proposes, read as TOML."""
-    proposed = line.rsplit("; expected ", 1)[-1].rsplit("; ", 1)[-1]
-    proposed = proposed.removeprefix("for times from 0, ").removesuffix(" under [columns] in rig.toml")
-    entries = re.findall(r'\w+ = (?:\{[^}]*\}|"[^"]*")', re.sub(r' \(or "cm"\)', "", proposed))
-    table = tomllib.loads("\n".join(entries))
-    return rig.model_copy(update={"columns": parse_rig({"columns": table}).columns})
 
 
 @pytest.mark.parametrize("case", MISFITS)

@@ -123,7 +123,7 @@ def test_a_missing_sample_is_bridged(performed):
             PLAIN,
             {},
             {"gap": 1e3},
-            r'looks like cm|looks like mm; expected gap = \{from = "gap", unit = "mm"\}',
+            r'looks like mm \(or %\); expected gap = \{from = "gap", unit = "mm"\}',
         ),
         (
             PLAIN,

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from file_writers import write_mcap, write_robomimic
+from log_writers import mcap_of
 
 from hmmseg.io.inspect import inspect
 from hmmseg.io.propose import propose
@@ -35,6 +36,9 @@ def cartesian() -> dict[str, np.ndarray]:
     return {name: getattr(signals, name) for name in names}
 
 
+T = np.arange(0, 2, 0.02)
+WRIST = {"t": T, "width": 0.06 - 0.03 * (T > 1), "ee_y": 0.1 * T, "ee_z": 0.2 - 0.05 * T,
+         **{f"{letter}{axis}": np.sin(T) for letter in "FT" for axis in "xyz"}}  # fmt: skip
 OTHERS = {
     "t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
     "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
@@ -150,6 +154,36 @@ def test_new_lays_out_files_that_read(tmp_path, hand):
     rig, task = read_rig(tmp_path / "lab/rig.toml"), read_task(tmp_path / "lab/task.toml")
     assert (rig.jointed, rig.gripper is not None) == (hand == "jointed", hand == "gripper")
     assert hasattr(task, "sequence") == (hand == "none")
+
+
+def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
+    """`new`, then `inspect --write`: the file's names in the places of those laid out, all else as it was."""
+    from walk_scene import wrist_topics
+
+    rig = tmp_path / "lab/rig.toml"
+    log = mcap_of(tmp_path / "a.mcap", wrist_topics(WRIST))
+    assert main(["new", str(rig.parent), "--hand", "gripper", "--quiet"]) == 0
+    before = rig.read_text()
+    assert main(["inspect", str(log), "--write", str(rig), "--quiet"]) == 0
+    gripper = read_rig(rig).gripper
+    assert gripper.position["z"] == "/franka/ee_pose.pose.position.z"
+    assert gripper.opening[1] == "/franka_gripper/joint_states.position.panda_finger_joint2"
+    assert gripper.wrench[5] == "/ft_sensor/wrench.wrench.torque.z"
+    kept = [line for line in rig.read_text().split("\n") if "/" not in line.split(" = ")[-1]]
+    assert set(kept) <= {*before.split("\n"), 'closing = "y"  # the axis along which the pads close'}
+    assert main(["inspect", str(log), "--write", str(rig), "--quiet"]) == 2  # they are somebody's now
+    assert "already has [gripper]; expected a rig without it" in capsys.readouterr().err
+
+
+def test_axes_of_the_work_are_found_in_what_the_fingers_do(tmp_path):
+    """Three axes of poses and wrenches, of which the fingers close along y and lift along z."""
+    from walk_scene import finger_topics
+
+    ours = cartesian()
+    found = inspect(mcap_of(tmp_path / "a.mcap", finger_topics(ours)))
+    assert {name: fields["from"].rsplit(".", 1)[1] for name, fields in found.mapping.items()} == {
+        "x1": "y", "y1": "z", "fx1": "y", "fy1": "z", "x2": "y", "y2": "z", "fx2": "y", "fy2": "z",
+    }  # fmt: skip
 
 
 def test_new_never_hangs_and_never_writes_over(tmp_path):

@@ -21,6 +21,7 @@ from hmmseg.io.units import known_unit
 
 COMMENTS = ("#", "%", "//")
 SPACES = r"\s+"
+TEXT = frozenset(range(256)) - set(range(9)) - set(range(14, 32)) - {127}  # bytes that a text may have
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|NaN|inf|")
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
@@ -82,6 +83,16 @@ def _no_points(columns: dict[str, np.ndarray], rows: np.ndarray, where: str) -> 
 def find_layout(path: Path) -> Layout:
     """Layout of a text file, every row checked for its number of cells."""
     encoding = _encoding(path)
+    try:
+        return _layout(path, encoding)
+    except UnicodeDecodeError as error:
+        start = error.object[: error.start + 1]
+        if encoding != "utf-8-sig" or not set(start) < TEXT:
+            raise
+        return _layout(path, "cp1252")  # umlauts as spreadsheets of western Europe write them
+
+
+def _layout(path: Path, encoding: str) -> Layout:
     separator, header, comment = "", None, ""
     units: dict[str, str] = {}
     skipped: list[int] = []
