@@ -4,7 +4,7 @@
 
 FOLDER holds tosses.csv and source_params.json (DAIRLab/contact-nets). Every toss is a log of the cube's pose;
 the model is built from the published mass, side, friction and inertia. TOSSES of them, evenly chosen, are
-taken: windows are begun anew at every change of contact.
+taken, without the SEEN ones on which the settings of the method were chosen.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from experiments.real.robot_gap import asked, published
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.mjcf.load import load_mjcf
 
-TOSSES = 16
+SEEN, TOSSES = 16, 24
 SOURCE_UNIT = 0.0524  # m: half of the published side
 POSE = {"x": "x", "y": "y", "z": "z", "qw": "qw", "qx": "qx", "qy": "qy", "qz": "qz"}
 
@@ -58,13 +58,18 @@ def write_inputs(folder: Path, into: Path, count: int = TOSSES) -> list[Path]:
     (into / "map.toml").write_text(map_text(), encoding="utf-8")
     tosses: Any = pd.read_csv(folder / "tosses.csv")
     numbers = np.unique(tosses.toss)
-    chosen = numbers[np.linspace(0, numbers.size - 1, min(count, numbers.size)).round().astype(int)]
+    numbers = np.setdiff1d(numbers, evenly(numbers, SEEN))
     out = []
-    for number in chosen:
+    for number in evenly(numbers, count):
         path = into / f"toss_{number:03d}.csv"
         tosses[tosses.toss == number][["t", *POSE]].to_csv(path, index=False)
         out.append(path)
     return out
+
+
+def evenly(values: np.ndarray, count: int) -> np.ndarray:
+    """At most so many of the values (n,), evenly chosen."""
+    return values[np.linspace(0, values.size - 1, min(count, values.size)).round().astype(int)]
 
 
 def run(folder: Path, count: int = TOSSES) -> RobotDiagnosis:

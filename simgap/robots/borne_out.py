@@ -48,7 +48,7 @@ def _log_likelihood(f: Forms, effects: tuple[int, ...], x: np.ndarray) -> float:
     own = list(f.gap.own)
     if own:
         x, count = x.copy(), 1.0 + np.maximum(taken.energy(x) / f.count - 1.0, 0.0)
-        bend, pull = np.tensordot(1 / count, taken.bend, 1), (1 / count) @ taken.pull
+        bend, pull = taken.weighed(1 / count)
         x[own] = 0.0
         x[own] = np.linalg.solve(bend[np.ix_(own, own)] + np.eye(len(own)), (pull - bend @ x)[own])
     return float(f.background.marginal(taken.energy(x), f.count, taken.shift)[0].sum())

@@ -76,15 +76,36 @@ def diagnose(
 ) -> RobotDiagnosis:
     """Diagnose logs against a simulator. `forced` names effects instead of choosing; `more` are further
     candidates; `warn` is told at once what cannot be told apart. InputError for input at fault."""
-    rng = np.random.default_rng(seed)
     noise = noises(simulator, recordings)
     effects = candidates_of(Setting(simulator, recordings)) | {e.name: e for e in more}
     for name in forced:
         if name not in effects or effects[name].fitted:
             raise InputError(f"--effect {name}", "is no candidate", nearest(name, list(effects)))
-    composed = Composed.of(
+    whole = Composed.of(
         simulator, recordings, effects, noise, **({} if length is None else {"length": length})
     )
+    # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
+    # is not to be outvoted by it, and what it tells is asked where those tell nothing.
+    if not forced and (calm := whole.calm()) is not whole:
+        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn)
+        if found.verdict.causes:
+            return found
+        tell("where bodies move in contact")
+    return _diagnosed(whole, whole, forced, seed, phases, tell, warn)
+
+
+def _diagnosed(
+    whole: Composed,
+    composed: Composed,
+    forced: Sequence[str],
+    seed: int,
+    phases: Phases | None,
+    tell: Tell,
+    warn: Tell,
+) -> RobotDiagnosis:
+    """The diagnosis of a part of the windows; `whole` has all, and in all of them what is left is told."""
+    rng = np.random.default_rng(seed)
+    simulator, recordings, effects = composed.simulator, composed.recordings, composed.effects
     parts = phases_of(simulator, recordings) if phases is None else phases
     warnings: list[str] = []
 
@@ -134,8 +155,9 @@ def diagnose(
     told_apart = fold[rows] if off and len(recordings) >= 3 else None
     tell("shares")
     names = tuple(usable[j] for j in causes)
-    told_by = explained(composed, linear, sensor, plain.point, names)
-    verdict = judge(f, s, causes, null, rng, told_by, bool(forced), told_apart)
+    told_by = explained(composed, linear, sensor, plain.point, names, whole)
+    every = s if whole is composed else _every(whole, linear.point, [*along, *names], parts, names)
+    verdict = judge(f, s, causes, null, rng, told_by, every, bool(forced), told_apart)
     far = None
     if verdict.causes:
         tell("how far")
@@ -158,6 +180,17 @@ def diagnose(
         off.scale,
         tuple(warnings),
     )
+
+
+def _every(
+    whole: Composed, point: Point, effects: Sequence[str], parts: Phases, causes: Sequence[str]
+) -> Forms:
+    """The gap of all windows about a point, by the sensors' noise alone, with these causes as its
+    candidates."""
+    linear = linearise(whole, point, effects)
+    kinds = {n: c.kind for n, c in whole.simulator.channels.items()}
+    white = covariances(linear, whole.windows, kinds).whitener()
+    return forms(gap_of(whole, linear, white, parts, causes))
 
 
 def _plain(composed: Composed, point: Point, wanted: Sequence[str]) -> Linear:

@@ -1,10 +1,11 @@
-"""How much of the gap a set of causes explains, each cause by what is lost without it, and by regime.
+"""How much of the gap a set of causes explains, each cause by what is lost without it, by regime and channel.
 
 Squares of residuals, whitened by the sensors' noise alone, are compared at points fitted exactly, each set at
 its own least squares: a straight line from where a cause acts back to where it does not is no measure of a
-friction that would have saturated half way. Flight and contact are regimes of their own: a model may lack one
-thing in flight and another where bodies strike, and what is left there does not take back what was explained
-here.
+friction that would have saturated half way. Flight, rest and motion in contact are regimes of their own, and
+in each a cause is judged by the channels in which it acts: a model may lack one thing that makes bodies fall
+slower, another that turns them, and a third where they strike, and what is left there does not take back what
+was explained here.
 """
 
 from __future__ import annotations
@@ -16,19 +17,22 @@ import numpy as np
 
 from simgap.attribution.shares import DRAWS, Shares
 from simgap.robots.gap import fitted_along
-from simgap.robots.linear import Linear, base_at
+from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Rows
 from simgap.robots.search import moved_to
-from simgap.robots.whiten import Whitener
+from simgap.robots.whiten import Whitener, covariances
+from simgap.robots.windows import REGIMES
 
-FREE, TOUCHING, WHOLE = "nothing touches", "bodies touch", "whole"
+WHOLE = "whole"
+SEEN = 3.0  # chosen: standard deviations of noise's squares: a smaller gap of a cell is none
 
 
 @dataclass(frozen=True)
 class Explained:
-    """Squares by regime: `before` (R,) with nothing but what is fitted along, `after` (R,) with all causes,
-    `without` (J, R) with one of them left out, `floor` (R,) the noise's own."""
+    """Squares by regime and channel: `before` (R, C) with nothing but what is fitted along, `after` (R, C)
+    with all causes, `without` (J, R, C) with one of them left out, `floor` (R, C) the noise's own. `asked`
+    (R,): regimes in which causes were sought; they rest on no other."""
 
     causes: tuple[str, ...]
     regimes: tuple[str, ...]
@@ -36,25 +40,38 @@ class Explained:
     after: np.ndarray
     without: np.ndarray
     floor: np.ndarray
+    asked: np.ndarray
 
     @property
     def left(self) -> np.ndarray:
         """Share (R,) of each regime's gap that is left; 1 where there is none to speak of."""
-        gap = self.before - self.floor
-        seen = gap > 3 * np.sqrt(2 * self.floor)
-        return np.where(seen, np.clip((self.after - self.floor) / np.where(seen, gap, 1.0), 0.0, 1.0), 1.0)
+        return _left(self.before.sum(1), self.after.sum(1), self.floor.sum(1))
+
+    @property
+    def where_it_acts(self) -> np.ndarray:
+        """Share (J, R) of the gap that is left where each cause acts: of channels by what is lost there
+        without it. 1 where it takes nothing, or was not sought."""
+        cell = _left(self.before, self.after, self.floor)
+        lost = self.lost
+        whole = lost.sum(2)
+        return np.where(self.asked & (whole > 0), (lost * cell).sum(2) / np.where(whole > 0, whole, 1.0), 1.0)
+
+    @property
+    def lost(self) -> np.ndarray:
+        """Squares (J, R, C) that come back where each cause is left out."""
+        return np.maximum(self.without - self.after, 0.0)
 
     @property
     def part(self) -> np.ndarray:
         """Share (J, R) of what is explained in each regime that goes by each cause."""
-        lost = np.maximum(self.without - self.after, 0.0)
+        lost = self.lost.sum(2)
         return lost / np.maximum(lost.sum(0), 1e-12)
 
     def shares(self, kept: Sequence[int], rng: np.random.Generator) -> Shares:
         """All regimes together, with draws of each kept cause's share."""
         before, floor = float(self.before.sum()), float(self.floor.sum())
         after = min(float(self.after.sum()), before)
-        lost = np.maximum(self.without.sum(1) - after, 0.0)
+        lost = np.maximum(self.without.sum((1, 2)) - after, 0.0)
         part = lost / max(float(lost.sum()), 1e-12)
         # Noise around what is left, and around what there was, makes the interval.
         drawn = after + np.sqrt(2 * floor + 4 * max(after - floor, 0.0)) * rng.standard_normal(DRAWS)
@@ -63,35 +80,75 @@ class Explained:
         return Shares(before, after, floor, told[:, None] * part[list(kept)], left)
 
 
+def _left(before: np.ndarray, after: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """Share of a gap that is left; 1 where there is none to speak of."""
+    gap = before - floor
+    seen = gap > SEEN * np.sqrt(2 * floor)
+    return np.where(seen, np.clip((after - floor) / np.where(seen, gap, 1.0), 0.0, 1.0), 1.0)
+
+
 def regimes_of(rows: Rows) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of regimes, and each row's (N,)."""
-    if rows.touching.all() or not rows.touching.any():
-        return (WHOLE,), np.zeros(rows.log.size, int)
-    return (FREE, TOUCHING), rows.touching.astype(int)
+    """Names of the regimes that there are, and each row's (N,)."""
+    there, number = np.unique(rows.regime, return_inverse=True)
+    return (WHOLE,) if there.size == 1 else tuple(REGIMES[k] for k in there), number
 
 
 def explained(
-    composed: Composed, linear: Linear, sensor: Whitener, plain: Point, causes: Sequence[str]
+    composed: Composed, linear: Linear, sensor: Whitener, plain: Point, causes: Sequence[str], whole: Composed
 ) -> Explained:
-    """Of causes that act at the linear model's point; `plain`: where what is fitted along is without them."""
-    names, of = regimes_of(linear.rows)
-    there = np.isfinite(linear.residual)
+    """Of causes that act at the linear model's point, fitted to its rows and told of all rows of `whole`;
+    `plain`: where what is fitted along is without them."""
+    asked = _Squares.of(composed, linear, sensor)
+    every, rows = asked, linear.rows
+    if whole is not composed:
+        there = linearise(whole, linear.point, [])
+        kinds = {n: c.kind for n, c in whole.simulator.channels.items()}
+        every, rows = (
+            _Squares.of(whole, there, covariances(there, whole.windows, kinds).whitener()),
+            whole.rows,
+        )
+    names, _ = regimes_of(rows)
 
-    def squares(point: Point) -> np.ndarray:
-        residual = linear.rows.observed - base_at(composed, point).rows
-        white = sensor(np.where(there & np.isfinite(residual), residual, 0.0)) ** 2
-        return np.bincount(of, np.where(there, white, 0.0), len(names))
-
-    def least(point: Point) -> np.ndarray:
-        return squares(moved_to(composed, linear, sensor, point))
+    def least(*points: Point) -> np.ndarray:
+        found = [*points, *(moved_to(composed, linear, sensor, p) for p in points)]
+        return every(min(found, key=lambda p: asked(p).sum()))
 
     along = fitted_along(composed)
     mine = {n: dict(linear.point[n]) for n in along}
-    bare = (least(plain), least(mine)) if along else (squares({}),)
-    before = min(bare, key=np.sum)
-    floor = np.bincount(of[there], minlength=len(names)).astype(float)
+    before = least(plain, mine) if along else every({})
+    sought = np.isin(np.unique(rows.regime), np.unique(linear.rows.regime))
     if not causes:
-        return Explained((), names, before, before, np.zeros((0, len(names))), floor)
-    after = min(squares(linear.point), least(linear.point), key=np.sum)
+        return Explained((), names, before, before, np.zeros((0, *before.shape)), every.floor, sought)
+    after = least(linear.point)
     without = [least({n: v for n, v in linear.point.items() if n != out}) for out in causes]
-    return Explained(tuple(causes), names, before, after, np.array(without), floor)
+    return Explained(tuple(causes), names, before, after, np.array(without), every.floor, sought)
+
+
+@dataclass(frozen=True)
+class _Squares:
+    """Squares (R, C) of whitened residuals at a point, of rows that are `there` (N,), by `cell` (N,)."""
+
+    composed: Composed
+    sensor: Whitener
+    there: np.ndarray
+    cell: np.ndarray
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, composed: Composed, linear: Linear, sensor: Whitener) -> _Squares:
+        names, regime = regimes_of(composed.rows)
+        shape = len(names), len(composed.rows.channels)
+        cell = regime * shape[1] + composed.rows.channel
+        return cls(composed, sensor, np.isfinite(linear.residual), cell, shape)
+
+    def __call__(self, point: Point) -> np.ndarray:
+        residual = self.composed.rows.observed - base_at(self.composed, point).rows
+        white = self.sensor(np.where(self.there & np.isfinite(residual), residual, 0.0)) ** 2
+        return self._by_cell(np.where(self.there, white, 0.0))
+
+    @property
+    def floor(self) -> np.ndarray:
+        return self._by_cell(self.there.astype(float))
+
+    def _by_cell(self, values: np.ndarray) -> np.ndarray:
+        return np.bincount(self.cell, values, self.shape[0] * self.shape[1]).reshape(self.shape)

@@ -56,15 +56,17 @@ def judge(
     twins: Sequence[float],
     rng: np.random.Generator,
     told_by: Explained,
+    every: Forms,
     forced: bool = False,
     fold: np.ndarray | None = None,
 ) -> Verdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
-    `causes` were borne out by held-out rows, and explain what `told_by` says, in that order; `twins` are
-    healthy twins' statistics.
+    `causes` were borne out by held-out rows, and explain what `told_by` says, in that order; `every` is the
+    gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
+    statistics.
 
-    Causes are known where they leave little of the gap of any regime (flight, contact); what they leave in
-    another is the remainder, which is told."""
+    A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
+    channels that it moves. What is left in others is the remainder, which is told."""
     gap = f.gap
     models = rivals(f, causes)
     score = np.array([m.score for m in models])
@@ -74,12 +76,11 @@ def judge(
     exceed = sum(t >= value for t in twins)
     p = max(p, exceed / len(twins)) if twins else p
     detection = Detection(value, p, 1 / (len(twins) + 1) if twins else 0.0)
-    # Where most of a gap is left, what the causes take of it may stand in for anything: no cause rests on it.
-    rests = told_by.left <= MOST
-    part = told_by.part[:, rests if rests.any() else ~rests].max(1) if causes else np.zeros(0)
-    kept = causes if forced else tuple(j for j, s in zip(causes, part, strict=True) if s >= LEAST)
+    # Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it.
+    least = np.where(told_by.part >= LEAST, told_by.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
+    kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
     parts = told_by.shares([causes.index(j) for j in kept], rng)
-    left = float(told_by.left.min()) if kept else 1.0  # of the regime that they explain best
+    left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
     none = float(expit((np.log(max(p, 1e-300)) - np.log(ALARM)) / 0.5))
     known = float(expit(np.log(MOST / max(left, 1e-6)) / WIDTH)) if kept else 0.0
     name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
@@ -98,15 +99,16 @@ def judge(
         verdict = "named"
     elif p < ALARM:
         verdict = "unknown"
-        if kept and left <= MOST:
+        if kept:
             partners = _partners(models, causes, kept)
             if fold is not None:
                 partners = tuple(sorted({*partners, *_not_told_apart(f, models, causes, kept, fold)}))
             verdict = "set" if partners else "named"
     told = kept if verdict in ("named", "set") else ()
-    noise = np.ones(len(gap.rows.channels))
-    rows, band = sensor.gap.rows, sensor.spectrum.band
-    before, after = _left(sensor, ()), _left(sensor, told)
+    noise, rows, band = np.ones(len(gap.rows.channels)), every.gap.rows, every.spectrum.band
+    before = _left(every, ())
+    number = {c.name: j for j, c in enumerate(every.gap.candidates)}
+    after = _left(every, tuple(sorted(number[gap.candidates[j].name] for j in told)))
     chance = {
         c.name: float(sum(w for m, w in zip(models, weight, strict=True) if j in m.effects)) * (1 - none)
         for j, c in enumerate(gap.candidates)

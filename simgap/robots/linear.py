@@ -14,7 +14,8 @@ import numpy as np
 from hmmseg.errors import InputError
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Rows
-from simgap.simulators.protocol import Channels, run_all
+from simgap.robots.windows import REGIMES, STRIKES
+from simgap.simulators.protocol import Channels
 
 STEP = 0.05  # numerics: of a parameter's standard deviation: the finite difference
 START_STEP = 0.3  # numerics: of a start's
@@ -63,7 +64,7 @@ class Base:
 def base_at(composed: Composed, point: Point) -> Base:
     """Rollouts of all windows at a point."""
     begun = composed.starts(point)
-    true = run_all(composed.simulator, composed.jobs(point, begun))
+    true = composed.rolled(point, begun)
     read = composed.read(true, point)
     return Base(point, begun, true, read, composed.rows.averaged(read))
 
@@ -145,12 +146,12 @@ def vary(
 
 def wobbling(composed: Composed, linear: Linear) -> Composed:
     """With the wobble of contacts by all effects that were linearised (see `Composed`)."""
-    touching = linear.rows.touching
-    if not (linear.starts and touching.any() and linear.moved):
+    strikes = linear.rows.regime == REGIMES.index(STRIKES)
+    if not (linear.starts and strikes.any() and linear.moved):
         return composed
     size = {n: np.array([p.sd for p in composed.effects[n].parameters.values()]) for n in linear.moved}
     columns = np.concatenate([m.jacobian * size[n] for n, m in linear.moved.items()], 1)
-    return replace(composed, wobble=np.where(touching[:, None] & np.isfinite(columns), columns, 0.0))
+    return replace(composed, wobble=np.where(strikes[:, None] & np.isfinite(columns), columns, 0.0))
 
 
 def _each_log_at_once(
@@ -183,7 +184,7 @@ def _rows_at(
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
     if not effect.reads:
-        run = run_all(composed.simulator, composed.jobs(moved, base.begun))
+        run = composed.rolled(moved, base.begun)
         return composed.rows.averaged(composed.read(run, moved))
     out = composed.rows.averaged(composed.read(base.true, moved))
     if effect.undoes:
@@ -211,7 +212,7 @@ def _by_start(composed: Composed, base: Base) -> dict[str, np.ndarray]:
             s if s is None or state not in s else {**s, state: s[state] + h}
             for s, h in zip(base.begun, steps, strict=True)
         ]
-        run = run_all(composed.simulator, composed.jobs(base.point, begun))
+        run = composed.rolled(base.point, begun)
         there = composed.rows.averaged(composed.read(run, base.point))
         by_row = np.array(steps)[composed.rows.window]
         change = np.where(by_row > 0, (there - base.rows) / np.where(by_row > 0, by_row, 1.0), 0.0)

@@ -9,9 +9,11 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.rows import Rows, rows_of
-from simgap.robots.windows import LENGTH, Window, alike, cut, start_of
+from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, alike, cut, start_of
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
+
+SETTLE = 0.2  # chosen: s that a model has to come to rest where a window is of rest
 
 Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; what is not named is neutral
 
@@ -21,7 +23,7 @@ class Composed:
     """A simulator with effects around it, along the windows of recordings.
 
     `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
-    touch; None where nothing touches.
+    move in contact; None where there is none.
     """
 
     simulator: Simulator
@@ -59,6 +61,13 @@ class Composed:
             self, windows=windows, rows=rows_of(self.recordings, windows, self.noise), wobble=wobble
         )
 
+    def calm(self) -> Composed:
+        """The same in flight and at rest alone, where there are such windows; else this."""
+        windows = tuple(w for w in self.windows if w.regime != STRIKES)
+        if not windows or len(windows) == len(self.windows):
+            return self
+        return replace(self, windows=windows, rows=rows_of(self.recordings, windows, self.noise), wobble=None)
+
     def commanded(self, point: Point) -> list[Recording]:
         """The recordings with commands as the drives took them."""
         out = list(self.recordings)
@@ -76,6 +85,19 @@ class Composed:
                 if short in self.effects[name].model:
                     out[self.effects[name].model[short]] = value
         return out
+
+    def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
+        """True channels of every window from these starts; None where a rollout diverged."""
+        jobs = self.jobs(point, starts)
+        leads = [0] * len(jobs)
+        for i, (window, job) in enumerate(zip(self.windows, jobs, strict=True)):
+            if window.regime == RESTS:
+                settling, leads[i] = settled(job.recording)
+                jobs[i] = replace(job, recording=settling)
+        return [
+            None if channels is None else {n: v[lead:] for n, v in channels.items()}
+            for channels, lead in zip(run_all(self.simulator, jobs), leads, strict=True)
+        ]
 
     def jobs(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Job]:
         """One run for each window."""
@@ -139,7 +161,17 @@ class Composed:
 
     def run(self, point: Point) -> list[Channels | None]:
         """True channels of every window."""
-        return run_all(self.simulator, self.jobs(point, self.starts(point)))
+        return self.rolled(point, self.starts(point))
+
+
+def settled(window: Recording) -> tuple[Recording, int]:
+    """A window with SETTLE before it in which all is as at its first sample, and how many samples that is:
+    the model is to lie where it would lie itself, and not on its way there."""
+    step = float(np.median(np.diff(window.t)))
+    lead = max(1, round(SETTLE / step))
+    t = np.concatenate([window.t[0] - step * np.arange(lead, 0, -1), window.t])
+    columns = {n: np.concatenate([np.full(lead, v[0]), v]) for n, v in window.columns.items()}
+    return Recording(window.name, t, columns, window.first), lead
 
 
 def _read(acting: Sequence, stretch: Recording, begin: float, true: Channels) -> Channels:

@@ -1,13 +1,16 @@
-"""The noise of each channel: as stated or learned from second differences, at least its resolution's."""
+"""The noise of each channel: as stated or learned from differences, at least its resolution's."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import comb
 
 import numpy as np
 
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
+
+ORDERS = (2, 4)  # numerics
 
 
 def resolution(values: np.ndarray) -> float:
@@ -23,12 +26,20 @@ def resolution(values: np.ndarray) -> float:
 
 
 def learned(recordings: Sequence[Recording], name: str) -> float:
-    """Standard deviation of white noise from second differences (variance 6 sigma^2), robustly."""
-    second = np.concatenate([np.diff(r[name], 2) for r in recordings])
-    second = second[np.isfinite(second)]
-    if not second.size:
+    """Standard deviation of white noise from differences, robustly, the least of those of ORDERS.
+
+    Of order n they have variance C(2n, n) sigma^2, the sum of squared binomials, and motion only adds to it:
+    a second difference holds gravity, a fourth no parabola.
+    """
+    return min(_by_difference(recordings, name, order) for order in ORDERS)
+
+
+def _by_difference(recordings: Sequence[Recording], name: str, order: int) -> float:
+    found = np.concatenate([np.diff(r[name], order) for r in recordings])
+    found = found[np.isfinite(found)]
+    if not found.size:
         return 1.0
-    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
+    return float(1.4826 * np.median(np.abs(found)) / np.sqrt(comb(2 * order, order)))
 
 
 def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simgap.robots.rows import Rows
-from simgap.robots.windows import FREE
+from simgap.robots.windows import FREE, moves, reaches
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -81,25 +81,16 @@ OTHER = "other contacts"
 
 def phases_by_motion(simulator: Simulator, recordings: Sequence[Recording]) -> Phases:
     """`still` and `moving`: half seconds in which any position goes further than a hundredth of its range."""
-    names = [n for n, c in simulator.channels.items() if c.kind == "position"]
-    if not names:
+    reach = reaches(simulator, recordings)
+    if not reach:
         return one_phase(recordings)
-    reach = {n: max(max(float(np.nanmax(r[n]) - np.nanmin(r[n])) for r in recordings), 1e-12) for n in names}
     starts, numbers = [], []
     for log in recordings:
         edges = np.arange(log.t[0], log.t[-1], min(0.5, 0.25 * float(log.t[-1] - log.t[0])))
         rows = np.searchsorted(log.t, edges)
         ends = np.append(rows[1:], len(log))
-        going = [
-            any(_travel(log[n][a:b]) > 0.01 * reach[n] for n in names)
-            for a, b in zip(rows, ends, strict=True)
-        ]
+        going = [moves(log, int(a), int(b), reach) for a, b in zip(rows, ends, strict=True)]
         changes = np.flatnonzero(np.diff(np.array(going, int), prepend=-1))
         starts.append(edges[changes])
         numbers.append(np.array(going, int)[changes])
     return Phases(("still", "moving"), tuple(starts), tuple(numbers))
-
-
-def _travel(values: np.ndarray) -> float:
-    seen = values[np.isfinite(values)]
-    return float(np.ptp(seen)) if seen.size else 0.0

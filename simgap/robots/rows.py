@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.errors import InputError
-from simgap.robots.windows import Window
+from simgap.robots.windows import FLIES, REGIMES, Window
 from simgap.simulators.protocol import Channels
 from simgap.simulators.recording import Recording
 
@@ -29,11 +29,16 @@ class Rows:
     window: np.ndarray
     time: np.ndarray
     since: np.ndarray  # s from the window's first sample
-    touching: np.ndarray  # whether the row's window has contacts
+    regime: np.ndarray  # the number of its window's in REGIMES
     observed: np.ndarray
     variance: np.ndarray
     of: tuple[slice, ...]
     _picks: tuple[_Pick, ...]
+
+    @property
+    def touching(self) -> np.ndarray:
+        """Whether each row's window has contacts (N,)."""
+        return self.regime != REGIMES.index(FLIES)
 
     def averaged(self, read: Sequence[Channels | None]) -> np.ndarray:
         """Rows (N,) of simulated channels by window; NaN where a rollout diverged."""
@@ -94,7 +99,5 @@ def rows_of(recordings: Sequence[Recording], windows: Sequence[Window], noise: M
         raise InputError("recordings", "have no samples of the channels to compare", "numbers")
     joined = [np.concatenate([p[i] for p in parts]) for i in range(7)]
     log, channel, window, time, since, observed, variance = joined
-    touching = np.array([w.touching for w in windows])[window]
-    return Rows(
-        names, log, channel, window, time, since, touching, observed, variance, tuple(of), tuple(picks)
-    )
+    regime = np.array([REGIMES.index(w.regime) for w in windows])[window]
+    return Rows(names, log, channel, window, time, since, regime, observed, variance, tuple(of), tuple(picks))

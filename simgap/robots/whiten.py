@@ -7,14 +7,16 @@ of a window have covariance
 
 N the sensors' noise, L_c two integrals over time for a position, one for a velocity, none for a force or
 where the simulator cannot be restarted: what is not modelled moves a joint even where the model has it
-stuck. A body on a support is another matter, for the support takes what pushes it: in windows with contacts
-L_c is the model's own response to a change of the start's rate, come later. Times of samples are uncertain
-by s of the source `clock`, which adds s^2 times the squared rate. And no impact is like another: which corner
-strikes first, where a surface is rough. In the source `contacts` every effect may be off by s of its usual
-sizes, anew in each window with contacts, so that few impacts that a model misses decide nothing.
-The s_c are found by maximum likelihood (type II) and are zero where that gains nothing; the multiplier m of
-each window (log-normal: the model is off in some places more than in others) by its posterior mode. The
-Cholesky factor turns rows into innovations: what each says beyond those before it in its window.
+stuck. A body that moves on a support is another matter, for the support takes what pushes it: there L_c is
+the model's own response to a change of the start's rate, come later. In flight and in contact a model is off
+by other amounts: each regime has sizes of its own. Times of samples are uncertain by s of the source `clock`,
+which adds s^2 times the squared rate. No impact is like another: which corner strikes first, where a surface
+is rough. In the source `contacts` every effect may be off by s of its usual sizes, anew in each window in
+which bodies move in contact, so that few impacts that a model misses decide nothing. Nor does a body come to
+lie twice alike: by s of the sources `lying` it is elsewhere in each window of rest, and all that pushes it
+there is in that. The s_c are found by maximum likelihood (type II) and are zero where that gains nothing; the
+multiplier m of each window (log-normal: the model is off in some places more than in others) by its posterior
+mode. The Cholesky factor turns rows into innovations: what each says beyond those before it in its window.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from simgap.robots.linear import Linear
-from simgap.robots.windows import Window
+from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES, Window
 from simgap.simulators.protocol import RATE
 
 TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
@@ -142,20 +144,26 @@ def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
 
 
 CLOCK = "clock"  # a source whose s [s] is the sd of samples' times
+LIES = "lying"  # a source whose s is the sd of where a body comes to rest, anew in each window, by channel
 CONTACTS = "contacts"  # a source whose s is how many usual sizes every effect is off by in each contact
-TOUCHING = ", touching"  # a model is off by other amounts where bodies touch: a source of its own
 INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics
 
 
 def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: bool) -> dict[str, Source]:
     rows = linear.rows
     out: dict[str, Source] = {}
-    since, channel, touching = rows.since[block], rows.channel[block], bool(rows.touching[block[0]])
+    since, channel, regime = rows.since[block], rows.channel[block], REGIMES[rows.regime[block[0]]]
+    every = np.arange(since.size)
     for c in np.unique(channel):
         name, mine = rows.channels[c], channel == c
         t = since[mine]
         rate = linear.starts.get(f"{name}{RATE}")
-        if rate is not None and touching:
+        if regime == RESTS and name in linear.starts:
+            # The model starts where the body lies, and has gone to where it would lie itself.
+            column = mine - linear.starts[name][block]
+            out[f"{name}, {LIES}"] = Source(every, np.outer(column, column))
+            continue
+        if rate is not None and regime == STRIKES:
             response = _propagated(t, since, channel, rate[block])
             moved = np.flatnonzero(np.abs(response).max(1))
             response = response[moved]
@@ -163,11 +171,11 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
             moved, response = np.flatnonzero(mine), np.eye(t.size)
             for _ in range(INTEGRALS[kinds[name]] if free else 0):
                 response = _integral(t) @ response
-        key = f"{name}{TOUCHING}" if touching else name
+        key = name if regime == FLIES else f"{name}, {regime}"
         out[key] = Source(moved, response @ np.exp(-np.abs(t[:, None] - t) / TAU) @ response.T)
-    if linear.wobble is not None and touching:
-        out[CONTACTS] = Source(np.arange(since.size), linear.wobble[block] @ linear.wobble[block].T)
-    out[CLOCK] = Source(np.arange(since.size), np.diag(linear.rates[block] ** 2))
+    if linear.wobble is not None and regime == STRIKES:
+        out[CONTACTS] = Source(every, linear.wobble[block] @ linear.wobble[block].T)
+    out[CLOCK] = Source(every, np.diag(linear.rates[block] ** 2))
     return out
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from simgap.simulators.protocol import RATE, Simulator
 from simgap.simulators.recording import Recording
@@ -24,12 +25,16 @@ NEIGHBOURS = 5  # chosen: samples
 # chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
 DOUBT = 3.0
 FREE = "free"  # what a simulator's `contact_states` call the state in which nothing touches
+STILL = 0.01  # chosen: share of a channel's range; a stretch in which none goes further is still
+AT_REST, CALM = 0.002, 0.05  # chosen: likewise, and s: what touches and goes no further in this time rests
+# A model may lack one thing in flight, another at rest, and a third where bodies strike, slide or roll.
+FLIES, RESTS, STRIKES = REGIMES = ("nothing touches", "bodies rest on each other", "bodies move in contact")
 
 
 @dataclass(frozen=True)
 class Window:
     """Rows [begin, end) of log number `log`; `start` and its standard deviations by state, or None;
-    `touching`: bodies touch somewhere in it, where the simulator tells."""
+    `regime`: one of REGIMES, where the simulator tells its contacts."""
 
     log: int
     begin: int
@@ -37,25 +42,33 @@ class Window:
     forward: bool  # the start is smoothed from later samples alone
     start: dict[str, float] | None
     doubt: dict[str, float]
-    touching: bool = False
+    regime: str = FLIES
 
 
 def cut(
     simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[str, float], length: float = LENGTH
 ) -> list[Window]:
-    """Windows of about `length` [s] that tile every log, new ones begun at the simulator's `contacts`.
+    """Windows of about `length` [s] that tile every log, new ones begun at the simulator's `contacts`, and
+    where what touches comes to rest.
 
     A simulator that cannot be restarted has one window a log. `noise` by channel [its unit].
     """
     out = []
+    reach = reaches(simulator, recordings)
     for number, log in enumerate(recordings):
         if not restarts(simulator):
             out.append(Window(number, 0, len(log), True, None, {}))
             continue
-        marks, touching = _marks(simulator, log), _touching(simulator, log)
+        touching = _touching(simulator, log)
+        rests = touching & resting(log, reach)
+        turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
+        marks = [*_marks(simulator, log), *log.t[turns].tolist()]
         for begin, end in itertools.pairwise(_edges(log, marks, length)):
             near = any(abs(float(log.t[begin]) - m) < REACH for m in marks)
-            window = Window(number, begin, end, near, None, {}, bool(touching[begin:end].any()))
+            regime = FLIES
+            if touching[begin:end].any():
+                regime = RESTS if rests[begin:end].all() else STRIKES
+            window = Window(number, begin, end, near, None, {}, regime)
             out.append(_begun(simulator, log, window, noise))
     return out
 
@@ -74,6 +87,34 @@ def _begun(simulator: Simulator, log: Recording, window: Window, noise: Mapping[
     state = start_of(simulator, log, window.begin, noise, window.forward)
     values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
     return replace(window, start=values, doubt=doubt)
+
+
+def reaches(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:
+    """The range of every position channel over all logs [its unit]."""
+    names = [n for n, c in simulator.channels.items() if c.kind == "position"]
+    return {n: max(max(travel(r[n]) for r in recordings), 1e-12) for n in names}
+
+
+def moves(log: Recording, begin: int, end: int, reach: Mapping[str, float]) -> bool:
+    """Whether any position goes further than STILL of its `reach` in the rows [begin, end)."""
+    return any(travel(log[n][begin:end]) > STILL * most for n, most in reach.items())
+
+
+def resting(log: Recording, reach: Mapping[str, float]) -> np.ndarray:
+    """The samples (num_timesteps,) about which no position goes further than AT_REST of its reach within
+    CALM."""
+    size = max(2, round(CALM / max(float(np.median(np.diff(log.t))), 1e-9))) if len(log) > 1 else 1
+    calm = np.full(len(log), bool(reach))
+    for name, most in reach.items():
+        known = np.where(np.isfinite(log[name]), log[name], np.nanmean(log[name]))
+        calm &= maximum_filter1d(known, size) - minimum_filter1d(known, size) <= AT_REST * most
+    return calm
+
+
+def travel(values: np.ndarray) -> float:
+    """The range of values (n,), NaN left out."""
+    seen = values[np.isfinite(values)]
+    return float(np.ptp(seen)) if seen.size else 0.0
 
 
 def _marks(simulator: Simulator, log: Recording) -> list[float]:

@@ -7,6 +7,7 @@ import pytest
 
 from simgap.robot_effects import by_log, readout_pose
 from simgap.robot_effects.base import Setting
+from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import Channel, Parameter
 from simgap.simulators.recording import Recording
 
@@ -124,7 +125,8 @@ def test_flight_and_contact_are_told_apart(dropped):
     assert fall - 0.03 < first < fall + 0.01 and what[0] == "free"
     noise = dict.fromkeys(POSE, 1e-3)
     windows = cut(simulator, [log], noise, 0.2)
-    assert not windows[0].touching and windows[-1].touching
+    assert windows[0].regime == FLIES and windows[-1].regime == RESTS
+    assert {w.regime for w in windows} <= {FLIES, STRIKES, RESTS}
     assert any(abs(log.t[w.begin] - first) < 0.011 for w in windows)
     phases = phases_of(simulator, [log])
     rows = rows_of([log], windows, noise)
@@ -147,7 +149,8 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     composed = wobbling(composed, linearise(composed, {}, [scale.name]))
     linear = linearise(composed, {}, [scale.name])
     kinds = {n: c.kind for n, c in simulator.channels.items()}
-    whiten = covariances(linear, composed.windows, kinds).whitener(Discrepancy({CONTACTS: 1.0}, {}))
+    usual = {CONTACTS: 1.0, "z, lying": 2e-2 * 0.05}
+    whiten = covariances(linear, composed.windows, kinds).whitener(Discrepancy(usual, {}))
     slope = whiten(linear.moved[scale.name].jacobian)[:, 0]
     residual = whiten(linear.residual)
     free = ~composed.rows.touching
@@ -155,3 +158,49 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     assert told == pytest.approx(-0.03, abs=0.004)
     each = [float(slope[w] @ slope[w]) for w in composed.rows.of if composed.rows.touching[w.start]]
     assert max(each) <= 1.01 / 0.02**2  # no window in contact tells more than the scale's usual size
+
+
+def test_what_lies_still_rests_and_what_slows_down_does_not():
+    from simgap.robots.windows import AT_REST, resting
+
+    t = np.arange(0, 1.0, 0.01)
+    log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
+    rests = resting(log, {"q": 1.0})
+    rate = np.exp(-t / 0.1) / 0.1
+    assert rests[t > 0.53].all()
+    assert not rests[(rate * 0.04 > AT_REST) & (t < 0.47)].any()
+
+
+def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):
+    """It begins 1.5 mm within the board, for it is read on a scale of 0.97, and has left it by the first
+    sample."""
+    from simgap.robots.linear import base_at
+    from simgap.robots.model import Composed
+
+    simulator, log = dropped
+    composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
+    rows, base = composed.rows, base_at(composed, {})
+    still = (rows.regime == REGIMES.index(RESTS)) & (rows.channel == 2)
+    assert still.any()
+    settled = rows.observed[still][20:]  # the body itself sinks in for a while, by less than a millimetre
+    np.testing.assert_allclose(settled / base.rows[still][20:], 0.97, atol=2e-3)
+    calm = composed.calm()
+    assert {w.regime for w in calm.windows} == {FLIES, RESTS} and calm.calm() is calm
+
+
+def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
+    """The source of rest moves the height, which the board settles, and not the place, which the start
+    does."""
+    from simgap.robots.linear import linearise
+    from simgap.robots.model import Composed
+    from simgap.robots.whiten import LIES, covariances
+
+    simulator, log = dropped
+    composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
+    linear = linearise(composed, {}, [])
+    cov = covariances(linear, composed.windows, {n: c.kind for n, c in simulator.channels.items()})
+    still = next(i for i, n in enumerate(cov.window) if composed.windows[n].regime == RESTS)
+    rows = composed.rows.channel[cov.blocks[still]]
+    height, place = (np.diag(cov.sources[still][f"{a}, {LIES}"].covariance) for a in "zx")
+    assert height[rows == 2] == pytest.approx(1.0, abs=0.1)
+    assert np.abs(place[rows == 0]).max() < 0.1

@@ -11,12 +11,13 @@ from simgap_swing import Swing, log
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
-from simgap.robots.borne_out import borne_out, weakest
-from simgap.robots.explained import FREE, TOUCHING, explained
+from simgap.robots.borne_out import borne_out, held_out_scores, weakest
+from simgap.robots.explained import Explained, explained
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises
 from simgap.robots.whiten import covariances
+from simgap.robots.windows import FLIES, REGIMES, STRIKES
 from simgap.simulators.user import checked
 
 FOLDS, EACH = 6, 300
@@ -61,7 +62,7 @@ def damped() -> Composed:
 def told(model: Composed, point, causes):
     linear = linearise(model, point, [])
     sensor = covariances(linear, model.windows, {"angle": "position"}).whitener()
-    return explained(model, linear, sensor, {}, causes)
+    return explained(model, linear, sensor, {}, causes, model)
 
 
 def test_a_planted_effect_explains_the_gap_and_another_does_not(damped):
@@ -76,7 +77,32 @@ def test_what_contacts_leave_does_not_deny_what_flight_bears_out(damped):
     rows = damped.rows
     late = rows.window >= np.median(rows.window)
     rough = rows.observed + np.where(late, 0.3 * np.sin(40 * rows.time), 0.0)
-    model = replace(damped, rows=replace(rows, touching=late, observed=rough))
+    model = replace(
+        damped, rows=replace(rows, regime=np.where(late, REGIMES.index(STRIKES), 0), observed=rough)
+    )
     found = told(model, {"viscous": {"viscous": 0.02}}, ("viscous",))
-    assert found.regimes == (FREE, TOUCHING)
+    assert found.regimes == (FLIES, STRIKES)
     assert found.left[0] < 0.05 and found.left[1] > 0.5
+
+
+def test_a_cause_is_judged_by_the_channels_in_which_it_acts():
+    """It takes nine tenths of the first channel's gap; most of the regime's is in the second."""
+    before, floor = np.array([[1000.0, 9000.0]]), np.array([[10.0, 10.0]])
+    after, other = np.array([[109.0, 9000.0]]), np.array([[200.0, 8000.0]])
+    found = Explained(
+        ("a", "b"), ("whole",), before, after, np.stack([before, after + other]), floor, np.ones(1, bool)
+    )
+    assert found.left == pytest.approx([(109 + 9000 - 20) / (10000 - 20)])
+    assert found.where_it_acts[0] == pytest.approx([0.1], abs=1e-3)
+    assert found.where_it_acts[1, 0] == pytest.approx((200 * 0.1 + 8000) / 8200, abs=2e-3)
+
+
+def test_what_each_log_has_of_its_own_is_fitted_to_the_logs_held_out():
+    """Every log is off by a constant of its own, which is no cause, and the planted effect is borne out."""
+    rng = np.random.default_rng(2)
+    gap, fold = gap_of([1.0] * FOLDS, 2, rng)
+    own = (fold[:, None] == np.arange(FOLDS)) * 3.0
+    shifted = replace(gap, residual=gap.residual + own @ rng.standard_normal(FOLDS), nuisance=own,
+                      own=tuple(range(FOLDS)))  # fmt: skip
+    assert borne_out(shifted, (0, 1), fold) == (0,)
+    assert min(held_out_scores(shifted, [(0,)], fold)) > -2 * EACH
