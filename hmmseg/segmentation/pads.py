@@ -18,11 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.contact.decompose import ON_GROUND, Subtask
+from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.emissions import TAIL, Parameters
+from hmmseg.segmentation.lateness import Squeeze, lateness, squeeze
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest, stretches
 from hmmseg.segmentation.toe import NONE, Toe, find
 
@@ -31,10 +32,10 @@ STIFFNESS_SD = 0.3
 RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force sensor
 SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after all
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
-SLOWEST = 0.1  # prior: s; time constant of a force sensor's filter
-# chosen: s; delays up to it are tried in steps of half a sample, then around the best of them ...
-LONGEST = 0.3
-FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics
+BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
+SILENT = 3.0  # chosen: sds of noise below which a force is none
+REACH = 0.4  # numerics: s; free motion beside a hold that is looked at: the longest delay, and a touch
+FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays below what counts as one
 LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
 LATE = 0.01  # chosen: s; a longer delay is the sensor's
 DECISIVE = 15.0  # chosen: nats for a longer delay against none; its prior probability is about exp(-5)
@@ -99,19 +100,34 @@ def read_again(s: Signals, sensing: Sensing) -> Signals:
     """The signals with forces brought forward by the delay, or with their filter undone."""
     if not sensing.late:
         return s
-    forces = {}
+    forces, louder = {}, 1.0
     for name in ("fx1", "fy1", "fx2", "fy2"):
         force = getattr(s, name)
         there = np.isfinite(force)
-        t, known = s.t[there], force[there]
         if sensing.filter:
-            step = np.diff(t)
-            kept = np.exp(-step / sensing.delay)
-            known = (known[1:] - kept * known[:-1]) / (1 - kept)
-            forces[name] = np.interp(s.t, t[1:] - step / 2, known)
+            forces[name] = np.full_like(force, np.nan)
+            forces[name][there], louder = _unfiltered(s.t[there], force[there], sensing.delay, s.sd_force)
         else:
-            forces[name] = np.interp(s.t + sensing.delay, t, known, right=np.nan)
-    return replace(s, **forces)
+            forces[name] = np.interp(s.t + sensing.delay, s.t[there], force[there], right=np.nan)
+    return replace(s, **forces, sd_force=s.sd_force * louder)
+
+
+def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float, sd: float) -> tuple[np.ndarray, float]:
+    """Forces [N] without their first-order filter of this time `constant` [s], and how much louder they are.
+
+    (F_n - k F_(n-1)) / (1 - k), k the share that a sample interval h keeps, is a steady input, or one that
+    changes evenly as it was constant - h k / (1 - k) before: h / 2 where it is slow. What lies between two of
+    them is interpolated, but a touch is not seen before its force is.
+    """
+    step = np.diff(t)
+    kept = np.exp(-step / constant)
+    read = np.r_[force[:1], (force[1:] - kept * force[:-1]) / (1 - kept)]
+    ago = np.r_[0.0, constant - step * kept / (1 - kept)]
+    louder = float(np.median(np.sqrt(1 + kept**2) / (1 - kept)))
+    between = np.interp(t, t - ago, read)
+    level = np.nan_to_num(sd) * louder
+    silent = np.abs(read) < SILENT * level
+    return np.where(silent & (np.abs(between) > np.abs(read)), read, between), louder
 
 
 def sense(
@@ -125,6 +141,7 @@ def sense(
     """
     grips: list[Stretch] = []
     loads: list[Stretch] = []
+    squeezes: list[Squeeze | None] = []
     ratios: list[float] = []
     for s, (t, path) in zip(signals, paths, strict=True):
         for step in steps:
@@ -136,16 +153,18 @@ def sense(
                     if stretch is not None:
                         out.append(stretch)
                 ratios += steepest(s, start, end, parameters)
+                if not again:
+                    squeezes.append(squeeze(s, *_beside(t, path, steps, step.index), parameters))
     nominal = pads_of(rig)
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
-    delay, sd, late, filtered = _delay((grips, loads), priors, again)
+    delay, sd, late, filtered = _delay((grips, loads), priors, squeezes)
     toe = NONE
     if not (late or again):  # forces that were late, or a wrist's, show no law so finely
         toe = find([(*_read(s, delay, filtered), s.sd) for s in grips])
         if toe is not NONE:  # what bends looks like what is late
             grips = [replace(s, toe=toe) for s in grips]
-            delay, sd, late, filtered = _delay((grips, loads), priors, again=True)
+            delay, sd, late, filtered = _delay((grips, loads), priors)
 
     def found() -> list[Compliance]:
         return [_compliance([(*_read(s, delay, filtered), s.sd) for s in own], prior)
@@ -153,10 +172,11 @@ def sense(
 
     normal, shear = found()
     if late and normal.value < priors[0][0] / IMPLAUSIBLE:  # noise that a delay happens to smooth away
-        delay, sd, late, filtered = _delay((grips, loads), priors, again=True)
+        delay, sd, late, filtered = _delay((grips, loads), priors)
         normal, shear = found()
     normal = replace(normal, toe=toe)
-    doubt = float(np.hypot(sd, LATE_SHARE * delay * late))
+    between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if late else 0.0
+    doubt = float(np.sqrt(sd**2 + (LATE_SHARE * delay * late) ** 2 + between**2))
     friction = float(np.quantile(ratios, SLIDING)) if ratios else np.inf
     return Sensing(normal, shear, delay, doubt, late, filtered, friction)
 
@@ -171,37 +191,43 @@ def _prior(compliance: float, stated: float) -> tuple[float, float]:
     return compliance, (stated or STIFFNESS_SD) * compliance if compliance > 0 else SOFT
 
 
+def _beside(t: np.ndarray, path: np.ndarray, steps: Sequence[Subtask], index: int) -> tuple[float, float]:
+    """Ends [s] of a hold with the free motion beside it: a touch may be earlier than its forces."""
+    ends = []
+    for beside, end, way in ((index - 1, 0, -1), (index + 1, -1, 1)):
+        near = float(t[np.flatnonzero(path == index)[end]])
+        free = t[path == beside] if 0 <= beside < len(steps) and steps[beside].state == FREE else t[:0]
+        far = near + way * REACH
+        ends.append(float(np.clip(far, free[0], free[-1])) if free.size else near)
+    return ends[0], ends[1]
+
+
 def _delay(
-    kinds: Sequence[Sequence[Stretch]], priors: Sequence[tuple[float, float]], again: bool
-) -> tuple[float, float, bool, bool]:
-    """Delay [s], its sd, whether it is the sensor's, and whether a filter explains it better."""
+    kinds: Sequence[Sequence[Stretch]], priors: Sequence[tuple[float, float]],
+    squeezes: Sequence[Squeeze | None] = (),
+) -> tuple[float, float, bool, bool]:  # fmt: skip
+    """Delay [s], its sd, whether it is the sensor's, and whether a filter explains it better.
+
+    Without `squeezes` it is below what counts as the sensor's.
+    """
     kinds = [own[:: max(1, len(own) // ENOUGH)] for own in kinds]
     if not any(kinds):
         return 0.0, LEAD_SD, False, False
-    best, late, filtered = 0.0, False, False
-    if not again:
-        interval = float(np.median(np.concatenate([s.step for own in kinds for s in own])))
-        coarse = np.arange(0.0, LONGEST, max(interval / 2, 0.005))
-        grids = {False: coarse, True: coarse[coarse <= SLOWEST]}
-        none = evidence(kinds, priors, np.zeros(1), False)[:, 0]
-        each = {filtered: evidence(kinds, priors, grid, filtered) for filtered, grid in grids.items()}
-        together = {filtered: found.sum(axis=0) for filtered, found in each.items()}
-        filtered = float(together[True].max()) > float(together[False].max())
-        i = int(together[filtered].argmax())
-        best = float(grids[filtered][i])
-        late = best > LATE and float(together[filtered][i] - none.sum()) > DECISIVE
-        # A delay is common to all forces; what one kind alone favours is a fault of the linear pad.
-        late = late and bool((each[filtered][:, i] >= none).all())
-    fine = FINE + (best if late else 0.0)
-    log_posterior = evidence(kinds, priors, fine, filtered and late, inner=not late).sum(axis=0)
-    if not late:
-        log_posterior = log_posterior - (fine / LEAD_SD) ** 2 / 2
+    there = [s for s in squeezes if s is not None]
+    found = lateness(there[:: max(1, len(there) // ENOUGH)], priors[0], LATE)
+    if found is not None and found.delay > LATE and found.gain > DECISIVE:
+        # A delay is common to all forces; what the grip alone favours is a fault of its pads.
+        tried = np.array([0.0, found.delay])
+        none, late = evidence(kinds[1:], priors[1:], tried, found.filter)[0]
+        if late >= none:
+            return found.delay, found.sd, True, found.filter
+    log_posterior = evidence(kinds, priors, FINE, False, inner=True).sum(axis=0) - (FINE / LEAD_SD) ** 2 / 2
     if not np.isfinite(log_posterior).any():
         return 0.0, LEAD_SD, False, False
     weight = np.exp(log_posterior - log_posterior.max())
     weight /= weight.sum()
-    mean = float(weight @ fine)
-    return mean, float(np.sqrt(weight @ (fine - mean) ** 2)), late, filtered and late
+    mean = float(weight @ FINE)
+    return mean, float(np.sqrt(weight @ (FINE - mean) ** 2)), False, False
 
 
 def _compliance(

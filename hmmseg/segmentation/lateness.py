@@ -1,0 +1,164 @@
+"""Do forces come late? The grip as the fingers' distance predicts it, delayed or filtered, is compared.
+
+While both fingers press, the pads give what the distance falls short of the block's width,
+
+    load(t) = max(width - distance(t), 0) / compliance,
+
+from before the touch until after the release. A sensor that is late shows this `shift` s later, one with
+a first-order filter smoothed by a time `constant`. Distances are joined by cubic Hermite pieces with the
+measured speeds. So touches and releases, where load changes most, say most, and a filter is told from a
+delay by how sharp they are. Widths follow from each hold, the compliance is profiled under its prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.signal import lfilter
+
+from hmmseg.hand.signals import Signals
+from hmmseg.segmentation.emissions import TAIL, Parameters
+from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.stretches import SIGNIFICANT
+from hmmseg.segmentation.toe import DEPENDENT
+
+STEP = 0.0025  # numerics: s; distances and filters are evaluated at such steps
+SHIFTS = np.arange(-0.01, 0.301, 0.005)  # prior: s; delays that are tried, alike; foams lead by some ms
+CONSTANTS = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1])  # prior: s; filters
+COMPLIANCES = np.geomspace(0.33, 3.0, 17)  # numerics: times what the rig says
+UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; of pads that are said to be rigid
+FORM, ONSET = 0.05, 0.0015  # prior: share by which a pad's force is off its law, and s by which it leads
+HOLD = 0.75  # chosen: share of a squeeze's firmest load from which it holds its block
+FIRMEST = 0.95  # numerics: quantile
+SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recording tells
+
+
+@dataclass(frozen=True)
+class Squeeze:
+    """One grip on a block at rest with the free motion beside it, arrays (N,).
+
+    Times t [s], the fingers' distance [m] and its rate [m/s], the summed grip `load` [N], NaN where one
+    finger presses alone, and their noise.
+    """
+
+    t: np.ndarray
+    distance: np.ndarray
+    rate: np.ndarray
+    load: np.ndarray
+    sd_distance: float
+    sd_load: float
+
+
+def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | None:
+    """The squeeze between `start` and `end` [s]; None without samples enough."""
+    sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    one, two = s.fx1 - p.bias[0], -(s.fx2 - p.bias[2])
+    alone = (np.maximum(one, two) > SIGNIFICANT * sd) & (np.minimum(one, two) <= SIGNIFICANT * sd)
+    rate = np.gradient(s.distance, s.t) if s.derived else s.vx2 - s.vx1
+    use = (s.t >= start) & (s.t <= end) & np.isfinite(one + two + s.distance + rate)
+    if use.sum() < 6 or not (~alone & use).any():
+        return None
+    known = s.sd_x[np.isfinite(s.sd_x)]
+    noise = np.sqrt(2.0) * (float(np.median(known)) if known.size else noise_sd(s.x1))
+    load = np.where(alone, np.nan, one + two)
+    return Squeeze(
+        s.t[use], s.distance[use], rate[use], load[use], noise if noise > 0 else SLOWEST_SD, np.sqrt(2.0) * sd
+    )
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """How late forces are: `delay` [s], its standard deviation, and whether it is a filter's time constant.
+
+    `gain`: nats by which that explains the recording better than a lead or a delay below `least`.
+    """
+
+    delay: float
+    sd: float
+    filter: bool
+    gain: float
+
+
+def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], least: float) -> Lateness | None:
+    """The delay, or filter, that explains the forces best; None where there is nothing to tell it by.
+
+    `prior`: mean and sd of the compliance of a pad [m/N]. `least` [s]: what is less is no delay.
+    """
+    if not squeezes:
+        return None
+    compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
+    cost = ((compliances - prior[0]) / prior[1]) ** 2 / 2
+    shifted = -cost[:, None] + sum(_log_shifted(s, compliances) for s in squeezes)
+    filtered = -cost[:, None] + sum(_log_filtered(s, compliances) for s in squeezes)
+    families = ((SHIFTS, shifted.max(axis=0)), (CONSTANTS, filtered.max(axis=0)))
+    none = families[0][1][least >= SHIFTS].max()
+    found = []
+    for which, (values, log_likelihood) in enumerate(families):
+        weight = np.exp(log_likelihood - log_likelihood.max())
+        weight /= weight.sum()
+        mean = float(weight @ values)
+        sd = float(np.sqrt(weight @ (values - mean) ** 2 + np.min(np.diff(values)) ** 2 / 12))
+        found.append(Lateness(mean, sd, bool(which), float(log_likelihood.max() - none)))
+    return max(found, key=lambda one: one.gain)
+
+
+def _log_shifted(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
+    """Log-likelihoods (num_compliances, num_shifts) of one squeeze."""
+    grid, out = _grid(s), []
+    clock = s.t[:, None] - SHIFTS
+    for c in compliances:
+        load = _load(s, grid, c)
+        out.append(_log_likelihood(s, c, *(np.interp(clock, grid, x) for x in (load, _pace(load)))))
+    return np.stack(out)
+
+
+def _log_filtered(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
+    """Log-likelihoods (num_compliances, num_constants) of one squeeze."""
+    grid, out = _grid(s), []
+    for c in compliances:
+        load = _load(s, grid, c)
+        smooth = [(_smoothed(load, k), _smoothed(_pace(load), k)) for k in CONSTANTS]
+        read = np.array([[np.interp(s.t, grid, x) for x in pair] for pair in smooth])
+        out.append(_log_likelihood(s, c, read[:, 0].T, read[:, 1].T))
+    return np.stack(out)
+
+
+def _grid(s: Squeeze) -> np.ndarray:
+    return np.arange(s.t[0], s.t[-1] + STEP, STEP)
+
+
+def _load(s: Squeeze, grid: np.ndarray, compliance: float) -> np.ndarray:
+    """Load [N] at each time of the grid, of pads of this compliance."""
+    there = np.nan_to_num(s.load)
+    holds = there >= HOLD * np.quantile(there, FIRMEST)
+    width = float(np.median(s.distance[holds] + compliance * there[holds]))
+    distance = CubicHermiteSpline(s.t, s.distance, s.rate)(np.minimum(grid, s.t[-1]))
+    return np.maximum(width - distance, 0.0) / compliance
+
+
+def _pace(load: np.ndarray) -> np.ndarray:
+    return np.abs(np.gradient(load, STEP))
+
+
+def _smoothed(values: np.ndarray, constant: float) -> np.ndarray:
+    if constant == 0:
+        return values
+    kept = float(np.exp(-STEP / constant))
+    return lfilter([1 - kept], [1, -kept], values, zi=[kept * values[0]])[0]
+
+
+def _log_likelihood(s: Squeeze, compliance: float, load: np.ndarray, pace: np.ndarray) -> np.ndarray:
+    """Log-likelihood (M,) of the forces of one squeeze, given loads and their rates (N, M); Student-t.
+
+    What a distance's noise makes of a load counts where there is one.
+    """
+    pressed = load > s.sd_load
+    sd = np.sqrt(s.sd_load**2 + (s.sd_distance / compliance * pressed) ** 2
+                 + (FORM * load) ** 2 + (ONSET * pace) ** 2)  # fmt: skip
+    there = np.isfinite(s.load)
+    z = (np.nan_to_num(s.load)[:, None] - load) / sd
+    each = -(TAIL + 1) / 2 * np.log1p(z**2 / TAIL) - np.log(sd)
+    return DEPENDENT * each[there].sum(axis=0)
