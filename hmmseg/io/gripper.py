@@ -9,7 +9,6 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable
 
 AXES = ("x", "y", "z")
-SIGNED = ("x", "y", "z", "-x", "-y", "-z")
 Axis = Literal["x", "y", "z"]
 Direction = Literal["x", "y", "z", "-x", "-y", "-z"]
 

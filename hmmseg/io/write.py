@@ -22,7 +22,6 @@ from hmmseg.io.formats import kind_of, read_table, split_part
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Span
 
-TABLES = (".csv", ".parquet")
 TOPIC = "/hmmseg/subtask"
 ADDED = ("subtask_index", "subtask", "object", "state", "boundary_sd")
 

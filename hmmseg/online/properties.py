@@ -11,7 +11,6 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.rounds import one_round
 
-NAMES = ("weight", "width", "height")
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 
 

@@ -1,11 +1,10 @@
-"""Synthetic trials as a folder of recordings: rig, task, actual properties, trials and their truth."""
+"""Synthetic trials as texts of files: rig, task, actual properties, trials and their truth."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,25 +13,8 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.world.properties import UNITS, Blocks
-from simgap.world.simulate import SimulatedTrial
 
 DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals by a channel's first letter
-
-
-def write_trials(folder: str | Path, task: BlockTask, rig: Rig, blocks: Blocks,
-                 trials: Sequence[SimulatedTrial]) -> list[Path]:  # fmt: skip
-    """Write trials of the same blocks in the input format; the files written.
-
-    rig.toml, task.toml, actual.toml (the true properties), trial_NN.csv and truth/trial_NN.json.
-    """
-    folder = Path(folder)
-    (folder / "truth").mkdir(parents=True, exist_ok=True)
-    texts = scene_files(task, rig, blocks)
-    for k, simulated in enumerate(trials, 1):
-        texts |= trial_files(k, simulated.trial, simulated.boundaries, simulated.seed)
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
-    return [folder / name for name in texts]
 
 
 def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:

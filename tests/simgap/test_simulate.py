@@ -14,7 +14,7 @@ from hmmseg.io.trial import read_trial
 from simgap.world.operator import OperatorSettings, minimum_jerk
 from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
 from simgap.world.simulate import simulate_trial, simulate_trials
-from simgap.world.writing import toml, write_trials
+from simgap.world.writing import scene_files, toml, trial_files
 
 TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND}, (Move("a", GROUND), Move("b", "a"), Move("c", "b")))
 SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Move("b", "a")))
@@ -109,7 +109,11 @@ def test_a_cartesian_hand_records_positions():
 
 
 def test_files_are_read_back_as_they_were(tmp_path, stacked):
-    write_trials(tmp_path, STACK, RIG, PAPER_BLOCKS, [stacked])
+    (tmp_path / "truth").mkdir()
+    texts = scene_files(STACK, RIG, PAPER_BLOCKS)
+    texts |= trial_files(1, stacked.trial, stacked.boundaries, stacked.seed)
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
     assert read_rig(tmp_path / "rig.toml") == RIG
     assert read_task(tmp_path / "task.toml") == STACK
     back = read_trial(tmp_path / "trial_01.csv", RIG)
