@@ -15,7 +15,6 @@ from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
-from simgap.effects import catalogue
 from simgap.gap.frame import build
 from simgap.gap.grips import HELD, LOOSE, firmness
 from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
@@ -94,11 +93,3 @@ def test_noise_of_a_jointed_finger_changes_with_its_pose():
     assert np.ptp(one["y"]) > 0.05 * one["y"].mean() and np.ptp(one["force"]) == 0
     np.testing.assert_allclose(sample_noise(s, rig, 4)["y"], s.sd_y / 2)
     np.testing.assert_allclose(channel_noise(one)[:, CHANNELS.index("distance")], np.sqrt(2) * s.sd_x)
-
-
-def test_a_dead_band_narrower_than_an_angles_noise_is_no_evidence():
-    rig = read_rig(DEMO / "rig.toml")
-    resolved = catalogue()["backlash"].resolved
-    assert resolved is not None and rig.noise.angle is not None
-    assert resolved({"width": 1.1 * rig.noise.angle}, rig)
-    assert not resolved({"width": 0.9 * rig.noise.angle}, rig)
