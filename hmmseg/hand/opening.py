@@ -97,7 +97,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tup
 def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.ndarray:
     """The opening [m] every STEP, means of what lies within, of samples [start, stop)."""
     group = max(1, int(STEP / float(np.median(np.diff(t))) + 1e-6))
-    size = (stop - start) // group
+    size = (min(stop, opening.size) - start) // group
     return opening[start : start + size * group].reshape(size, group).mean(axis=1)
 
 

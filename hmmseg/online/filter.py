@@ -79,6 +79,7 @@ class Filter:
         self.crossings: list[Crossing] = []
         self.first_t = math.nan  # of the first row [s]
         self.touches: list[tuple[float, float]] = []  # known apart from forces [s]
+        self.together = 1.0 / MAX_RATE  # readings nearer to each other than this are no two [s]
         self._waiting: list[tuple[float, np.ndarray]] = []
         self._velocities = True
         width, rows = self.layout.width, 24 * len(self.kinds)
@@ -179,7 +180,7 @@ class Filter:
         since = s.since if s.since >= 0.999 / MAX_RATE else 0.0
         if since:
             s.since = 0.0
-        share = min(1.0, dt * MAX_RATE) if dt > 0 else 1.0
+        share = min(1.0, dt / self.together) if dt > 0 else 1.0
         s.last_t = t
         s.last_row = row
         s.count, _ = advance(

@@ -131,6 +131,7 @@ class Watcher:
             return
         if f.force_noise is None:  # each finger has half of the sensor's, and their sum all of it
             f.force_noise = wrist.tool.noise / math.sqrt(2)
+            f.together = max(f.together, wrist.delay)  # what is smoothed errs alike for as long as the window
         f.touches, f.properties.touch_sd = wrist.touches, wrist.touch_sd
         f.properties.force_sd = wrist.force_sd
         if wrist.back and self._mark is not None:

@@ -164,11 +164,11 @@ def test_an_arm_of_another_simulator(shared):
     })  # fmt: skip
     blocks = json.loads((folder / "truth.json").read_text())
     errors = []
-    for k in (1, 3):
+    for k in (1, 2, 3, 4):
         raw = trial_of(read_table(folder / f"wrist_0{k}.csv", None), rig, None)
         columns = {"t": raw.t} | raw.channels
-        watcher, _, final = follow(columns, rig, read_task(folder / "task.toml"))
-        assert final["fits"]
+        watcher, lines, final = follow(columns, rig, read_task(folder / "task.toml"))
+        assert final["fits"] and all(line["fits"] for line in lines)
         truth = json.loads((folder / "truth" / f"trial_0{k}.json").read_text())["boundaries"]
         errors += [abs(c.t - b) for c, b in zip(watcher.crossings, truth, strict=True)]
         for obj, actual in blocks.items():
@@ -177,6 +177,24 @@ def test_an_arm_of_another_simulator(shared):
             for prop in ("weight", "width", "height"):
                 assert abs(found[prop]["mean"] - actual[prop]) < 3 * found[prop]["sd"]
     assert np.median(errors) < 0.03
+
+
+def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
+    """As when a block drops out of the grip in mid-air; what is smoothed errs alike, but not so much."""
+    folder = shared / "panda" / "wrist_restack_1"
+    rig = parse_rig({
+        "gravity": 9.81,
+        "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width", "wrench": ["Fx", "Fy", "Fz"]},
+        "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
+    })  # fmt: skip
+    raw = trial_of(read_table(folder / "wrist_01.csv", None), rig, None)
+    columns = {"t": raw.t} | raw.channels
+    gone = (raw.t > 4.36) & (raw.t < 5.78)
+    columns["Fz"] = columns["Fz"] + 0.466 * gone
+    _, lines, final = follow(columns, rig, read_task(folder / "task.toml"))
+    assert not final["fits"]
+    first = next(line["t"] for line in lines if not line["fits"])
+    assert 4.36 < first < 4.86
 
 
 def test_the_command_follows_a_wrist(performed, monkeypatch, capsys, tmp_path):

@@ -11,6 +11,7 @@ from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_rec
 from hmmseg.contact.decompose import decompose
 from hmmseg.contact.hands import revealed_by
 from hmmseg.errors import InputError
+from hmmseg.hand.opening import closings, grip_of
 from hmmseg.hand.pose import pose_of
 from hmmseg.hand.tool import applied_force, free_tool
 from hmmseg.io.rig import parse_rig
@@ -69,6 +70,16 @@ def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
             assert abs(draws.mean() - getattr(block, prop)) < 3 * draws.std()
         assert found.of(obj, "width").std() > 1e-4  # what the pads give is not measured
         assert "wrist" in found.reasons[f"{obj}.friction"]
+
+
+@pytest.mark.parametrize("after", range(1, 6))
+def test_a_recording_may_end_as_it_grips(after):
+    """So few samples that the way of the touch is not all there."""
+    t = np.arange(50) / 50
+    opening = np.maximum(0.05 - 0.04 * np.maximum(t - 0.5, 0), 0.05 - 0.04 * (t[-after] - 0.5))
+    (closing,) = closings(t, opening)
+    grip = grip_of(t, opening, np.zeros(50, bool), closing, None)
+    assert grip is None or opening[-1] <= grip.width <= 0.05
 
 
 def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
