@@ -12,4 +12,5 @@ EFFECT = Effect(
     mistaken_for=("force_gain", "fingertip_compliance"),
     parameters=(Parameter("property", "1", 0.05),),
     stage=HAND,
+    wrist=True,
 )

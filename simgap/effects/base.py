@@ -7,7 +7,7 @@ truth is taken forward (`apply`, `scene`) to make recordings with a known effect
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -147,7 +147,9 @@ class Effect:
     `chosen` is false for effects that only `--effect` asks for. `report(values, rig)` gives the parameters
     as the interface names them. `forms`: sets of parameters of which one is free and the others neutral, the
     usual one first; all are free where none is listed. `admitted(rig)`: key of a form, and standard
-    deviations by parameter, as rig.toml has them under [systematic].
+    deviations by parameter, as rig.toml has them under [systematic]. `wrist`: its first form shows in a
+    sensor in the wrist. `played`: values at which it is felt in a played world where none are given,
+    by default from its priors; empty for one that cannot be felt.
     """
 
     name: str
@@ -166,6 +168,8 @@ class Effect:
     forms: tuple[tuple[str, ...], ...] = ()
     scatter: Callable[[Any, np.ndarray], Any] | None = None
     admitted: Callable[[Rig], tuple[str, dict[str, float]]] | None = None
+    wrist: bool = False
+    played: Mapping[str, float] | None = None
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""

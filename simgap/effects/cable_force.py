@@ -52,4 +52,5 @@ EFFECT = Effect(
     correct=_correct,
     apply=_apply,
     report=_report,
+    wrist=True,
 )

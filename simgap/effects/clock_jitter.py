@@ -47,4 +47,5 @@ EFFECT = Effect(
     parameters=(Parameter("sd", "s", 1.0, neutral=0.004, log=True, low=1e-4, high=0.05),),
     stage=READOUT,
     scatter=_scatter,
+    wrist=True,
 )

@@ -38,4 +38,5 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=_correct,
     apply=_apply,
+    wrist=True,
 )

@@ -53,4 +53,5 @@ EFFECT = Effect(
     report=_report,
     admitted=_admitted,
     scene=lambda v: {"normal_stiffness": v["normal_stiffness"], "shear_stiffness": v["shear_stiffness"]},
+    played={"normal_stiffness": 800.0, "shear_stiffness": 500.0},
 )

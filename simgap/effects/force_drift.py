@@ -50,4 +50,5 @@ EFFECT = Effect(
     stage=READOUT,
     correct=_correct,
     apply=_apply,
+    played={},  # of a recording as a whole
 )

@@ -39,4 +39,5 @@ EFFECT = Effect(
     stage=SCALE,
     correct=_correct,
     apply=lambda p, v, rng: with_force(p, flat(p) * (1 + _gains(v, np))),
+    wrist=True,
 )

@@ -38,4 +38,6 @@ EFFECT = Effect(
     correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + _delays(v, jnp)),
     forms=(("delay",), ("finger1",), ("finger2",)),
     apply=_apply,
+    wrist=True,
+    played={"delay": 0.15},
 )

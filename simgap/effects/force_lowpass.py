@@ -42,4 +42,6 @@ EFFECT = Effect(
     stage=FILTER,
     correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(smoothing=w.smoothing + _times(v, jnp)),
     apply=_apply,
+    wrist=True,
+    played={"time_constant": 0.15},
 )

@@ -51,4 +51,5 @@ DECOY = Effect(
     stage=FILTER,
     correct=_correct,
     apply=_apply,
+    wrist=True,
 )

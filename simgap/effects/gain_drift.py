@@ -26,4 +26,5 @@ DECOY = Effect(
     stage=SCALE,
     correct=_correct,
     apply=lambda p, v, rng: with_force(p, flat(p) * (1 + v["gain"] + v["rate"] * p.t)[:, None]),
+    wrist=True,
 )

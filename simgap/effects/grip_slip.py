@@ -54,4 +54,5 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=_correct,
     scene=lambda v: {"friction": v["mu"]},
+    played={"mu": 0.12},
 )

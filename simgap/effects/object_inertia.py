@@ -14,4 +14,5 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(inertia=w.inertia + v["scale"] - 1.0),
     chosen=False,
+    wrist=True,
 )

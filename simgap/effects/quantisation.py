@@ -56,4 +56,5 @@ EFFECT = Effect(
     stage=READOUT,
     scatter=_scatter,
     finish=lambda force, v: v["step"] * np.round(force / v["step"]),
+    wrist=True,
 )

@@ -31,4 +31,6 @@ EFFECT = Effect(
     correct=_correct,
     report=_report,
     scene=lambda v: {"support_stiffness": v["stiffness"]},
+    wrist=True,
+    played={"stiffness": 1500.0},
 )

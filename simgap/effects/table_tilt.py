@@ -14,4 +14,6 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),
     scene=lambda v: {"tilt": v["angle"]},
+    wrist=True,
+    played={"angle": 0.06},
 )

@@ -22,7 +22,7 @@ from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import Problem, neutral, problem
 from simgap.gap.realign import moved, realigned
 from simgap.gap.spread import Spread, spreads
-from simgap.gap.wrist_gap import SHOWN, not_compared, of_wrist, shown_forms
+from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
 ROUNDS = 2  # numerics: times at most
@@ -68,7 +68,7 @@ def search(
     keys = shifting(names)
     if of_wrist(trials):
         keys = [key for key in shown_forms(names) if key in keys]
-        names = [name for name in names if name in SHOWN]
+        names = shown(names)
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
         aligned, misled = _insisted(trials, aligned, rig, actual, keys)

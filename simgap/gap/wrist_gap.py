@@ -14,18 +14,10 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
-from simgap.effects import forms_of, free_parameters
+from simgap.effects import catalogue, fitted, forms_of, free_parameters
 
 MADE_UP = ("offset", "shear", "vx", "vy")
 GRIP = ("distance", "grip")  # without a grip force what the pads give is read off the opening itself
-# Effects that act on net forces or on where things are, in the form that does so to both fingers alike.
-# Offsets, drift, drag and the tool's own mass are not among them: free motion takes them out
-# (`hmmseg.hand.tool`).
-SHOWN = (
-    "actual", "cable_force", "clock_jitter", "contact_impact", "force_gain", "force_lag", "force_lowpass",
-    "object_inertia", "quantisation", "table_compliance", "table_tilt",
-    "force_memory", "force_nonlinearity", "gain_drift",
-)  # fmt: skip
 TOLD = (
     "a wrist sensor feels the sum of both fingers: net forces and positions are compared, {absent} are not, "
     "and effects on one finger or inside the grip are not thought of"
@@ -50,17 +42,27 @@ def not_compared(trials: Sequence[Trial]) -> str:
     return TOLD.format(absent=", ".join(missing))
 
 
+def shown(names: Sequence[str]) -> list[str]:
+    """Effects that act on net forces or on where things are.
+
+    Offsets, drift, drag and the tool's own mass are not among them: free motion takes them out
+    (`hmmseg.hand.tool`).
+    """
+    return [n for n in names if fitted()[n].wrist]
+
+
 def shown_forms(names: Sequence[str]) -> list[str]:
     """Keys of those forms of effects that act on both fingers alike."""
-    return [key for n in names for key in forms_of(n)[:1] if n in SHOWN and free_parameters(key)]
+    return [key for n in shown(names) for key in forms_of(n)[:1] if free_parameters(key)]
 
 
 def check_forced(forced: Sequence[str]) -> None:
     """InputError for an effect that a wrist does not show."""
+    known = shown(list(catalogue()))
     for name in forced:
-        if name not in SHOWN:
+        if name not in known:
             problem = "acts in the grip, on one finger or on what free motion takes out, unseen by a wrist"
-            raise InputError(f"effect {name!r}", problem, ", ".join(SHOWN))
+            raise InputError(f"effect {name!r}", problem, ", ".join(known))
 
 
 def as_from_wrist(trial: Trial, like: Trial) -> Trial:

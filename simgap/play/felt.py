@@ -14,16 +14,7 @@ from simgap.effects.base import Effect, Performance
 from simgap.world.properties import Block, Blocks
 from simgap.world.scene import Surroundings, finite_stiffness
 
-# look: what each scene effect is set to where nothing says otherwise: strong enough to be felt
-STRONG = {
-    "fingertip_compliance": {"normal_stiffness": 800.0, "shear_stiffness": 500.0},
-    "grip_slip": {"mu": 0.12},
-    "table_compliance": {"stiffness": 1500.0},
-    "table_tilt": {"angle": 0.06},
-}
 OFTEN = 3.0  # look: prior standard deviations of a sensor's effect: strong enough to be seen
-UNFELT = ("clock_jitter", "force_drift")  # of when samples were taken, or of a recording as a whole
-LATE = {"force_lag": {"delay": 0.15}, "force_lowpass": {"time_constant": 0.15}}  # look
 
 
 def felt_effects() -> dict[str, Effect]:
@@ -31,7 +22,7 @@ def felt_effects() -> dict[str, Effect]:
     return {
         name: effect for name, effect in catalogue().items()
         if effect.scene is not None
-        or (effect.apply is not None and effect.acts_on == "sensing" and name not in UNFELT)
+        or (effect.apply is not None and effect.acts_on == "sensing" and effect.played != {})
     }  # fmt: skip
 
 
@@ -47,7 +38,7 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
     nothing = {p.name: p.neutral if p.log or p.shape else 0.0 for p in parameters}
     first = forms[0] if forms else tuple(nothing)  # forms overlap: a gain of a finger beside that of both
     strong = {p.name: OFTEN * p.sd for p in parameters if p.name in first and not (p.log or p.shape)}
-    usual = STRONG.get(name) or LATE.get(name) or nothing | ({} if given else strong)
+    usual = known[name].played or nothing | ({} if given else strong)
     return dict(usual) | {key: float(value) for key, value in (given or {}).items() if np.isfinite(value)}
 
 
