@@ -29,6 +29,7 @@ from hmmseg_cli import (
     simulate,
     watch,
 )
+from hmmseg_cli.interrupts import heard
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -77,7 +78,8 @@ def main(args: Sequence[str] | None = None) -> int:
     args = diagnose.spread_against(args)
     command = typer.main.get_command(app)
     try:
-        return command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
+        with heard():
+            return command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
     except InputError as error:
         return _at_fault(str(error))
     except UsageError as error:

@@ -6,20 +6,18 @@ import contextlib
 import gc
 import math
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import hmmseg
-from hmmseg.errors import InputError, nearest
-from hmmseg.io.units import LARGEST, si_factor
+from hmmseg.errors import InputError
 from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, SeedOption, TaskOption
+from hmmseg_cli.rows import Rows
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
 
-WHERE = "standard input"
 LagOption = Annotated[float, typer.Option(
     "--lag", metavar="S", min=0.0, help="How long a boundary is waited for [s].")]  # fmt: skip
 PlotOption = Annotated[bool, typer.Option(
@@ -99,94 +97,6 @@ def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out
             flush()
         if show is not None:
             show.update(answer)
-
-
-class Rows:
-    """Rows of a CSV stream as (t, channels in SI units); `next` gives None at its end.
-
-    InputError names the header's column or the row at fault, rows counted as an editor does.
-    """
-
-    def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
-        from hmmseg.io.columns import Column, source_of
-
-        self._stream, self._number = stream, 1
-        header = stream.readline().decode("utf-8-sig", "replace").strip()
-        if not header:
-            raise InputError(WHERE, "is empty", "a CSV header with a column t, then rows")
-        self._separator = max(",;\t", key=header.count)
-        names = [name.strip().strip('"') for name in header.split(self._separator)]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"{WHERE}: column {name}", "appears twice", "one of each name")
-        self._num, self._names, self._picked, self._scales = len(names), names, [], []
-        columns = watcher.filter.rig.columns
-        for ours in ("t", *watcher.channels):
-            theirs = source_of(ours, columns)
-            if theirs not in names:
-                if ours in watcher.optional and ours not in columns:
-                    self._picked.append(-1)
-                    self._scales.append((1.0, 0.0))
-                    continue
-                raise InputError(f"{WHERE}: column {theirs}", "missing", nearest(theirs, names))
-            entry = columns.get(ours, Column())
-            unit = 1.0 if entry.unit is None else si_factor(entry.unit)
-            self._picked.append(names.index(theirs))
-            self._scales.append((entry.sign * unit, entry.offset))
-        self._plain = all(scale == (1.0, 0.0) for scale in self._scales) and -1 not in self._picked
-
-    def next(self) -> tuple[float, Sequence[float]] | None:
-        """The next row; None at the end of the stream."""
-        while True:
-            line = self._stream.readline()
-            if not line:
-                return None
-            self._number += 1
-            cells = line.decode("ascii", "replace").rstrip("\r\n").split(self._separator)
-            if len(cells) > 1 or cells[0].strip():
-                break
-        if len(cells) != self._num:
-            raise InputError(
-                f"{WHERE}: row {self._number}", f"has {len(cells)} cells", f"{self._num} as in the header"
-            )
-        try:
-            values = [float(cells[i]) for i in self._picked]
-        except ValueError:
-            values = [self._number_in(cells, i) for i in self._picked]
-        if -1 in self._picked:
-            values = [math.nan if i < 0 else v for i, v in zip(self._picked, values, strict=True)]
-        if not math.isfinite(sum(values)):
-            self._check(values, cells)
-        if not self._plain:
-            values = [s * v + o for v, (s, o) in zip(values, self._scales, strict=True)]
-        for i, value in enumerate(values):
-            if i and abs(value) > LARGEST:
-                where = f"{WHERE}: row {self._number}, column {self._names[self._picked[i]]}"
-                problem = f"{value:.3g} is no reading of a hand's sensor"
-                raise InputError(where, problem, f"at most {LARGEST:.0g} in SI units")
-        return values[0], values[1:]
-
-    def _number_in(self, cells: list[str], i: int) -> float:
-        text = cells[i].strip().strip('"')
-        if not text:
-            return math.nan
-        try:
-            return float(text)
-        except ValueError:
-            raise self._wrong(i, cells) from None
-
-    def _wrong(self, i: int, cells: list[str]) -> InputError:
-        found = cells[i].strip()[:60]
-        return InputError(f"{WHERE}: row {self._number}, column {self._names[i]}",
-                          f"{found!r} is not a finite number", "a number or an empty cell")  # fmt: skip
-
-    def _check(self, values: list[float], cells: list[str]) -> None:
-        if math.isnan(values[0]):
-            column = self._names[self._picked[0]]
-            raise InputError(f"{WHERE}: row {self._number}, column {column}", "missing", "a time in s")
-        for i, value in zip(self._picked, values, strict=True):
-            if math.isinf(value):
-                raise self._wrong(i, cells)
 
 
 def _warm_up(task: Any, rig: Any, lag: float) -> None:

@@ -18,7 +18,7 @@ from hmmseg.io.trial import Trial, read_trial
 from hmmseg.online.watcher import Watcher
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import load_model, save_model
-from hmmseg_cli.watch import Rows
+from hmmseg_cli.rows import Rows
 from simgap.world.operator import OperatorSettings, read_operator
 from simgap.world.properties import read_properties
 

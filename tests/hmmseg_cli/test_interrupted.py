@@ -1,9 +1,14 @@
 """Ctrl-C while results are put in place, or anywhere: whole or not there; one seed, the same digits."""
 
+import contextlib
 import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +30,7 @@ COMMANDS = {
     "segment": ["segment", "trial.csv", *HAND, "--method", "qualitative", "--json", "out.json", "--write",
                 "labelled.csv"],
     "identify": ["identify", "trial.csv", *HAND, "--method", "paper", "--json", "out.json"],
+    "fit": ["fit", "trial.csv", "--task", "order.toml", "--model", "model.npz", "--json", "out.json"],
     "simulate": ["simulate", *HAND, "--trials", "1", "--output", "made", "--json", "out.json"],
 }  # fmt: skip
 
@@ -33,6 +39,7 @@ COMMANDS = {
 def lab(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "task.toml").write_text(TASK)
+    (tmp_path / "order.toml").write_text('sequence = ["reach", "grip", "leave"]\nchannels = ["fx1", "fy1"]\n')
     shutil.copyfile(STACK / "rig.toml", tmp_path / "rig.toml")
     shutil.copyfile(STACK / "trial_01.csv", tmp_path / "trial.csv")
     header, *rows = (tmp_path / "trial.csv").read_text().splitlines()
@@ -84,8 +91,6 @@ def test_ctrl_c_while_results_are_put_in_place(name, step, lab, monkeypatch, cap
 @pytest.mark.parametrize("name", COMMANDS)
 def test_ctrl_c_at_any_moment(name, lab, capsys):
     """In process, everything loaded: an alarm interrupts at moments drawn from a run's length."""
-    import time
-
     before = files(lab)
     main(COMMANDS[name])
     remove(lab, before)
@@ -114,6 +119,79 @@ def test_ctrl_c_at_any_moment(name, lab, capsys):
     finally:
         signal.signal(signal.SIGALRM, usual)
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_ctrl_c_in_a_callback_is_heard(capsys):
+    """What C calls can raise nothing; the interrupt comes when it has returned."""
+    import ctypes
+
+    from hmmseg_cli.interrupts import heard
+
+    @ctypes.CFUNCTYPE(None)
+    def called():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), heard():
+        called()
+        time.sleep(5)
+    assert capsys.readouterr().err == ""
+
+
+def sent(command, moment, stdin=None):
+    """Standard output and error of a process that gets Ctrl-C after so many seconds, and its exit code."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hmmseg_cli.main", *command], stdin=stdin or subprocess.DEVNULL,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+    try:
+        process.wait(moment)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    return out.decode(), err.decode(), process.returncode
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [4.0, 9.0, 14.0, 21.0, 30.0, 45.0])
+def test_ctrl_c_while_diagnosing(moment, lab):
+    """Whole or not there, and no traceback, wherever in the search for causes it comes."""
+    before = files(lab)
+    for k in (2, 3):
+        shutil.copyfile(STACK / f"trial_0{k}.csv", lab / f"trial_{k}.csv")
+    before = files(lab)
+    trials = ["trial.csv", "trial_2.csv", "trial_3.csv"]
+    _, err, code = sent(["diagnose", *trials, *HAND, "--json", "out.json", "--report", "gap.html"], moment)
+    assert "Traceback" not in err
+    new = files(lab).keys() - before.keys()
+    assert (code, new) in ((0, {"out.json", "gap.html"}), (130, set()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [3.0, 5.0, 8.0, 12.0])
+def test_ctrl_c_while_watching(moment, lab):
+    """Every line is whole, the last one says so, and the document is there or not."""
+    before = files(lab)
+    rows = (lab / "trial.csv").read_text().splitlines(keepends=True)
+    read, write = os.pipe()
+    feeder = threading.Thread(target=_feed, args=(write, rows))
+    feeder.start()
+    out, err, code = sent(["watch", *HAND, "--json", "out.json"], moment, stdin=read)
+    os.close(read)
+    feeder.join()
+    assert "Traceback" not in err
+    lines = [json.loads(line) for line in out.splitlines()]
+    new = files(lab).keys() - before.keys()
+    assert (code, new) in ((0, {"out.json"}), (130, set()))
+    assert code == 130 or lines[-1]["final"]
+
+
+def _feed(write, rows):
+    """Rows into a pipe at the robot's pace, until nobody reads them."""
+    with contextlib.suppress(BrokenPipeError), os.fdopen(write, "w") as pipe:
+        for row in rows:
+            pipe.write(row)
+            pipe.flush()
+            time.sleep(0.02)
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name != "new"])

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import sys
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,25 @@ def test_bad_input_gets_one_line(run, change, message):
     code, _, err = run(change(ROWS[:10]))
     assert code == 2
     assert len(err.splitlines()) == 1 and message in err
+
+
+def test_a_stream_as_a_spreadsheet_has_it(run):
+    """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
+    plain = run(ROWS[:60])[1]
+    table = [row.split(",") for row in ROWS[:60]]
+    units = ["" if name == "t" else "N" if name[0] == "f" else "rad/s" if name[0] == "d" else "rad"
+             for name in table[0]]  # fmt: skip
+    start = datetime.fromisoformat("2026-03-02T10:15:30+01:00")
+    rows = ["# Versuch 3", ";".join(table[0]), ";".join(units), ""]
+    for cells in table[1:]:
+        stamp = (start + timedelta(seconds=float(cells[0]))).isoformat()
+        rows += [";".join([stamp, *(cell.replace(".", ",") for cell in cells[1:])]), "% weiter"]
+    code, lines, err = run(rows)
+    assert (code, err) == (0, "")
+    assert [line["probabilities"] for line in lines] == [line["probabilities"] for line in plain]
+    assert lines[30]["t"] == pytest.approx(plain[30]["t"])
+    code, _, err = run([*rows[:10], rows[10].replace("2026", "morgen"), *rows[11:]])
+    assert code == 2 and "column t: 'morgen" in err
 
 
 def test_bad_rows_can_be_left_out(run):

@@ -124,8 +124,8 @@ def _layout(path: Path, encoding: str) -> Layout:
                                      f"{len(header)} as in the header")  # fmt: skip
                 skipped.append(number)
                 continue
-            if not rows and not units and _units(header, _cells(line, separator)):
-                units = _units(header, _cells(line, separator))
+            if not rows and not units and units_of(header, _cells(line, separator)):
+                units = units_of(header, _cells(line, separator))
                 skipped.append(number)
                 continue
             if decimal == "." and separator != "," and "," in line and _comma_numbers(line, separator):
@@ -166,7 +166,7 @@ def _comma_numbers(line: str, separator: str) -> bool:
     return any(COMMA_NUMBER.fullmatch(cell.strip()) for cell in _cells(line, separator))
 
 
-def _units(header: list[str], cells: list[str]) -> dict[str, str]:
+def units_of(header: list[str], cells: list[str]) -> dict[str, str]:
     """Units of a row that holds nothing else: `s;mm;N`, `[s],[mm],[N]`; empty where it is no such row."""
     if len(cells) != len(header):
         return {}
