@@ -55,7 +55,10 @@ def find_mode(post: Posterior) -> Mode:
 
 @lru_cache
 def _climb() -> Callable[[np.ndarray, Tables], Any]:
-    """From a start (6,) to the density's next maximum (6,); one compiled program for each padded size."""
+    """From a start (6,) to the density's next maximum (6,); one compiled program for each padded size.
+
+    On the processor, whatever accelerator there is: six scales are not worth the way there.
+    """
     import jax  # these are slow to import
     import jax.numpy as jnp
     import optimistix
@@ -68,7 +71,13 @@ def _climb() -> Callable[[np.ndarray, Tables], Any]:
     def climb(start: Any, tables: Tables) -> Any:
         return optimistix.minimise(loss, solver, start, tables, max_steps=MAX_STEPS, throw=False).value
 
-    return jax.jit(climb)
+    program, processor = jax.jit(climb), jax.devices("cpu")[0]
+
+    def on_processor(start: np.ndarray, tables: Tables) -> Any:
+        with jax.default_device(processor):
+            return program(start, tables)
+
+    return on_processor
 
 
 def start_of(post: Posterior) -> np.ndarray:
