@@ -38,8 +38,7 @@ KINDS = {FREE: at.FREE_KIND, ON_GROUND: at.GROUND_KIND, SLIDING: at.SLIDING_KIND
 # hand at rest creeps, and pads' foam gives by tenths of a mm.
 VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
 PRIOR = 4.0  # prior
-# chosen: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; and of no more weight than a
-# few nats.
+# chosen: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; of no more weight than a few nats
 LEAST_SPANS = (0.1, 0.1, 0.03, 0.03)
 LEAST_FORCE = 50.0  # chosen: and of its forces, in sds of their noise
 ROUGH = 3.0  # prior: net and shear force of a held block at first, in sds of the force noise
