@@ -107,58 +107,52 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], least: flo
 
 def _log_shifted(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_shifts) of one squeeze."""
-    grid, out = _grid(s), []
-    clock = s.t[:, None] - SHIFTS
-    for c in compliances:
-        load = _load(s, grid, c)
-        out.append(_log_likelihood(s, c, *(np.interp(clock, grid, x) for x in (load, _pace(load)))))
-    return np.stack(out)
+    clock = np.clip(s.t[:, None] - SHIFTS, s.t[0], s.t[-1])
+    load, pace = (_at(x, clock - s.t[0]) for x in _loads(s, compliances))
+    return _log_likelihood(s, compliances, load, pace)
 
 
 def _log_filtered(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_constants) of one squeeze."""
-    grid, out = _grid(s), []
-    for c in compliances:
-        load = _load(s, grid, c)
-        smooth = [(_smoothed(load, k), _smoothed(_pace(load), k)) for k in CONSTANTS]
-        read = np.array([[np.interp(s.t, grid, x) for x in pair] for pair in smooth])
-        out.append(_log_likelihood(s, c, read[:, 0].T, read[:, 1].T))
-    return np.stack(out)
+    both = np.stack(_loads(s, compliances))
+    smooth = [_at(_smoothed(both, constant), s.t - s.t[0]) for constant in CONSTANTS]
+    load, pace = np.stack(smooth, axis=-1)
+    return _log_likelihood(s, compliances, load, pace)
 
 
-def _grid(s: Squeeze) -> np.ndarray:
-    return np.arange(s.t[0], s.t[-1] + STEP, STEP)
-
-
-def _load(s: Squeeze, grid: np.ndarray, compliance: float) -> np.ndarray:
-    """Load [N] at each time of the grid, of pads of this compliance."""
+def _loads(s: Squeeze, compliances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Loads [N] (num_compliances, num_steps) at each STEP from the first sample on, and their rates."""
     there = np.nan_to_num(s.load)
     holds = there >= HOLD * np.quantile(there, FIRMEST)
-    width = float(np.median(s.distance[holds] + compliance * there[holds]))
-    distance = CubicHermiteSpline(s.t, s.distance, s.rate)(np.minimum(grid, s.t[-1]))
-    return np.maximum(width - distance, 0.0) / compliance
+    width = np.median(s.distance[holds] + compliances[:, None] * there[holds], axis=1, keepdims=True)
+    clock = np.minimum(np.arange(s.t[0], s.t[-1] + STEP, STEP), s.t[-1])
+    distance = CubicHermiteSpline(s.t, s.distance, s.rate)(clock)
+    load = np.maximum(width - distance, 0.0) / compliances[:, None]
+    return load, np.abs(np.gradient(load, STEP, axis=1))
 
 
-def _pace(load: np.ndarray) -> np.ndarray:
-    return np.abs(np.gradient(load, STEP))
+def _at(values: np.ndarray, clock: np.ndarray) -> np.ndarray:
+    """Values (..., num_steps) at times [s] since the first of them, linear between two."""
+    whole = np.minimum((clock / STEP).astype(int), values.shape[-1] - 2)
+    share = clock / STEP - whole
+    return (1 - share) * values[..., whole] + share * values[..., whole + 1]
 
 
 def _smoothed(values: np.ndarray, constant: float) -> np.ndarray:
     if constant == 0:
         return values
     kept = float(np.exp(-STEP / constant))
-    return lfilter([1 - kept], [1, -kept], values, zi=[kept * values[0]])[0]
+    return lfilter([1 - kept], [1, -kept], values, zi=kept * values[..., :1])[0]
 
 
-def _log_likelihood(s: Squeeze, compliance: float, load: np.ndarray, pace: np.ndarray) -> np.ndarray:
-    """Log-likelihood (M,) of the forces of one squeeze, given loads and their rates (N, M); Student-t.
+def _log_likelihood(s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray) -> np.ndarray:
+    """Log-likelihoods (C, M) of the forces of one squeeze, given loads and their rates (C, N, M); Student-t.
 
     What a distance's noise makes of a load counts where there is one.
     """
-    pressed = load > s.sd_load
-    sd = np.sqrt(s.sd_load**2 + (s.sd_distance / compliance * pressed) ** 2
-                 + (FORM * load) ** 2 + (ONSET * pace) ** 2)  # fmt: skip
     there = np.isfinite(s.load)
-    z = (np.nan_to_num(s.load)[:, None] - load) / sd
-    each = -(TAIL + 1) / 2 * np.log1p(z**2 / TAIL) - np.log(sd)
-    return DEPENDENT * each[there].sum(axis=0)
+    load, pace = load[:, there], pace[:, there]
+    noise = (s.sd_distance / compliances[:, None, None]) ** 2 * (load > s.sd_load)
+    variance = s.sd_load**2 + noise + (FORM * load) ** 2 + (ONSET * pace) ** 2
+    apart = (s.load[there][:, None] - load) ** 2 / variance
+    return -DEPENDENT / 2 * ((TAIL + 1) * np.log1p(apart / TAIL) + np.log(variance)).sum(axis=1)
