@@ -30,10 +30,14 @@ SURPRISING = 4.0  # chosen: standard errors of what the rig admits; as with forc
 
 @dataclass(frozen=True)
 class Slope:
-    """Weights (num_timesteps,) whose sum with readings is their slope over the give, and its variance."""
+    """Weights (num_timesteps,) whose sum with readings is their slope over the give, and its variance.
+
+    `change` [m]: what a landing's give changed by; 0 of a slope within a grip.
+    """
 
     weights: np.ndarray
     variance: float
+    change: float = 0.0
 
 
 def unit_pads(rig: Rig) -> Pads:

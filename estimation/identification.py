@@ -16,6 +16,7 @@ from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
 from estimation.sampler import Draws, sample
+from estimation.sliding import with_slides
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
@@ -160,6 +161,7 @@ def identify_aligned(
     rng, rig = np.random.default_rng(seed), aligned.rig
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)
+    weighed = with_slides(weighed, noise, aligned.rig)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(trials, weighed, noise, aligned.task, rig)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
