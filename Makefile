@@ -123,8 +123,8 @@ boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that diff
 	$(BIN)/python -m experiments.calibration_boundaries --trials 8
 	$(BIN)/python -m experiments.table_boundaries
 
-sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL and PANDA: folders; fills docs/sequences.md
-	$(BIN)/python -m experiments.sequences check $(if $(REAL),--real $(REAL)) $(if $(PANDA),--panda $(PANDA))
+sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL, PANDA, HANDS: folders; fills docs/sequences.md
+	$(BIN)/python -m experiments.sequences check $(if $(REAL),--real $(REAL)) $(if $(PANDA),--panda $(PANDA)) $(if $(HANDS),--hands $(HANDS))
 	$(BIN)/python -m experiments.write_tables
 
 paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills docs/reproduction.md

@@ -1,65 +1,82 @@
-"""What makes a reading of plain sequences probable: learned by maximum likelihood on drawn worlds.
+"""What makes a choice among the changes of plain sequences probable: learned on drawn worlds.
 
-The density of a true boundary is a mixture over readings of Laplace distributions about where each
-puts it, plus a uniform share for truths that no reading has; the weights are those of
-hmmseg.sequence.readings.probabilities.
+By maximum likelihood of the true boundaries, whose density is the mixture over courses and choices that
+`hmmseg segment` answers with (hmmseg.sequence.naming.Weighing): first without labels, then, for how far
+boundaries lie off a change once labels have told by how much, of the other trials with one of them labelled.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
+from typing import Any
+
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import expit, logsumexp
+from scipy.optimize import minimize, minimize_scalar
+from scipy.special import expit
 
 from experiments.sequence_worlds import World
+from hmmseg.sequence.courses import COARSE_CELLS, Course, coarse, find_courses
 from hmmseg.sequence.features import feature_map, features
 from hmmseg.sequence.labels import shares
-from hmmseg.sequence.model import optional_states
-from hmmseg.sequence.readings import (
-    COARSE_CELLS,
-    Reading,
-    Weighing,
-    coarse,
-    find_readings,
-    probabilities,
-)
+from hmmseg.sequence.naming import Weighing, naming, probabilities
+
+START = (4.0, -3.0, 0.1, -5.0, -3.0)  # numerics: where the search begins, as `weighing_of` takes it
+
+Known = tuple[
+    list[Course], np.ndarray, np.ndarray
+]  # courses, labels, true boundaries as shares of the trials
 
 
-def readings_of(world: World) -> tuple[list[Reading], np.ndarray]:
-    """Readings without labels, and true boundaries (num_trials, num_boundaries) as shares of the trials."""
+def known(world: World, labelled: int) -> Known:
+    """Courses of a world whose first trials are labelled."""
     mapping = feature_map(world.trials, world.task.channels or tuple(world.trials[0].channels))
     data = [features(trial, mapping) for trial in world.trials]
     factor = max(1, round(float(np.median([len(each.values) for each in data])) / COARSE_CELLS))
     truth = np.array([shares(each, b) for each, b in zip(data, world.boundaries, strict=True)])
-    found = find_readings([coarse(each.values, factor) for each in data], world.task.sequence,
-                          optional_states(world.task, False), np.full(truth.shape, np.nan))  # fmt: skip
-    return found, truth
+    labels = np.where(np.arange(len(truth))[:, None] < labelled, truth, np.nan)
+    found = find_courses(
+        [coarse(each.values, factor) for each in data], len(world.task.sequence), list(labels)
+    )
+    return found, labels, truth
 
 
-def log_score(cases: list[tuple[list[Reading], np.ndarray]], parameters: np.ndarray) -> float:
-    """Mean log density of the true boundaries; `parameters`: log independent, settled, shares, logit of the
-    uniform share, log of the Laplace scale."""
-    weighing = Weighing(float(np.exp(parameters[0])), float(parameters[1]), float(parameters[2]))
-    elsewhere, scale = expit(parameters[3]), np.exp(parameters[4])
+def log_score(cases: list[Known], weighing: Weighing) -> float:
+    """Mean log density of the true boundaries that are not labelled."""
     total = []
-    for readings, truth in cases:
-        distance = np.abs(np.stack([r.ends for r in readings]) - truth)
-        density = np.log((1 - elsewhere) * np.exp(-distance / scale) / (2 * scale) + elsewhere)
-        weights = np.log(probabilities(readings, weighing) + np.finfo(float).tiny)
-        total.append(logsumexp(weights[:, None, None] + density, axis=0).mean())
+    for courses, labels, truth in cases:
+        told = np.isfinite(labels).any(0)
+        scale = np.where(told, weighing.told, weighing.lag)[:, None]
+        open_ = ~np.isfinite(labels)
+        namings = [naming(course, truth.shape[1] + 1, list(labels), weighing) for course in courses]
+        density = np.zeros(truth.shape)
+        for weight, course, found in zip(probabilities(namings), courses, namings, strict=True):
+            off = truth[:, :, None] - course.ends[:, None]
+            shift = np.where(open_[:, :, None], 0.0, off).sum(0) / np.maximum((~open_).sum(0), 1)[:, None]
+            here = np.exp(-np.abs(off - shift) / scale) / (2 * scale)
+            density += weight * (found.probability * here).sum(2)
+        total.append(np.log((1 - weighing.elsewhere) * density + weighing.elsewhere)[open_].mean())
     return float(np.mean(total))
 
 
-def learn(worlds: list[World]) -> dict:
-    """Find and print what weighs readings best."""
-    cases = [readings_of(world) for world in worlds]
-    start = np.array([4.0, -2.0, 1.0, -2.0, -4.6])
-    best = minimize(lambda p: -log_score(cases, p), start, method="BFGS", options={"eps": 1e-4})
+def weighing_of(x: np.ndarray) -> Weighing:
+    """The weighing of parameters without bounds."""
+    return Weighing(
+        independent=float(np.exp(x[0])), settled=float(x[1]), shares=float(x[2]),
+        lag=float(np.exp(x[3])), told=float(np.exp(x[3])), elsewhere=float(expit(x[4])),
+    )  # fmt: skip
+
+
+def learn(worlds: list[World]) -> Weighing:
+    """Find and print what weighs choices best."""
+    worlds = [world for world in worlds if len(world.task.sequence) > 1]
+    cases = [known(world, 0) for world in worlds]
+    best: Any = minimize(lambda x: -log_score(cases, weighing_of(x)), np.array(START), method="BFGS",
+                    options={"eps": 1e-3, "gtol": 2e-3, "maxiter": 25})  # fmt: skip
+    found = weighing_of(best.x)
     sd = np.sqrt(np.diag(best.hess_inv) / len(cases))
-    found = {
-        "worlds": len(worlds), "independent": float(np.exp(best.x[0])), "settled": float(best.x[1]),
-        "shares": float(best.x[2]), "elsewhere": float(expit(best.x[3])), "scale": float(np.exp(best.x[4])),
-        "log_score": float(-best.fun), "sd": sd[:3].tolist(),
-    }  # fmt: skip
-    print(found)
+    cases = [known(world, 1) for world in worlds if len(world.trials) > 1]
+    told: Any = minimize_scalar(lambda x: -log_score(cases, replace(found, told=float(np.exp(x)))),
+                           bounds=(-9.0, -3.0), method="bounded", options={"xatol": 0.05})  # fmt: skip
+    found = replace(found, told=float(np.exp(told.x)))
+    print({"worlds": len(worlds), "log_score": float(-best.fun), "sd": sd.tolist()} | asdict(found))
     return found

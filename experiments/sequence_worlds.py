@@ -16,6 +16,9 @@ from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 
 CELLS = (300, 900)  # chosen: samples of a trial
+STATES = (2, 10)  # chosen: of a task, fewest and most
+TRIALS = (1, 8)  # chosen: fewest and most
+LAG = 0.01  # chosen: of a trial; a controller's labels lie off what its channels show, the same in all trials
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ class World:
 def draw(seed: int, alike: float | None = None) -> World:
     """One world; `alike`: how far neighbouring states differ, in standard deviations of the noise."""
     rng = np.random.default_rng(seed)
-    num_states, num_trials = int(rng.integers(3, 6)), int(rng.integers(3, 9))
+    num_states = int(rng.integers(STATES[0], STATES[1] + 1))
+    num_trials = int(rng.integers(TRIALS[0], TRIALS[1] + 1))
     num_channels = int(rng.integers(1, 7))
     means = rng.lognormal(0.0, rng.uniform(0.3, 1.3), num_states)  # some states take long, some are brief
     total = float(rng.integers(*CELLS))
@@ -59,6 +63,7 @@ def draw(seed: int, alike: float | None = None) -> World:
     }  # fmt: skip
     settle = rng.choice([0.0, rng.uniform(0.003, 0.05)])  # of a trial: first-order response after a change
     pace, crop = rng.uniform(0.03, 0.4), rng.choice([0.0, 0.9])
+    lag = rng.choice([0.0, LAG]) * means.sum() * rng.normal(size=num_states - 1)
     trials, boundaries = [], []
     for i in range(num_trials):
         durations = means * rng.lognormal(0, pace, num_states)
@@ -67,13 +72,15 @@ def draw(seed: int, alike: float | None = None) -> World:
         t = np.arange(t0, ends[-1], 1 / rate)
         values = _course(rng, t, ends, phases, levels, slopes, noise, settle * means.sum())
         trials.append(Trial(f"trial_{i}.csv", t - t0, {f"c{c}": values[:, c] for c in range(num_channels)}))
-        boundaries.append(ends[:-1] - t0)
+        recorded = durations - t0 * (np.arange(num_states) == 0)
+        room = recorded / 3
+        boundaries.append(ends[:-1] - t0 + np.clip(lag, -room[:-1], room[1:]))
     return World(SequenceTask(tuple(f"s{k}" for k in range(num_states))), trials, boundaries)
 
 
 def _phases(rng: np.random.Generator) -> np.ndarray:
     """Shares of a state's duration that its phases take; mostly one."""
-    return rng.dirichlet(np.full(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]), 3.0))
+    return rng.dirichlet(np.full(rng.choice([1, 2, 3], p=[0.5, 0.3, 0.2]), 3.0))
 
 
 def _course(rng, t, ends, phases, levels, slopes, noise, settle) -> np.ndarray:

@@ -6,7 +6,7 @@
 `check` segments drawn worlds (experiments/sequence_worlds.py), and published snap assemblies and a simulated
 arm's wrist signals where their folders are given: without labels; with the one boundary that the tool asks
 for; with one labelled trial. Writes experiments/results/sequences.json. `learn` finds what weighs readings
-(hmmseg.sequence.readings.Weighing) by maximum likelihood on other drawn worlds.
+(hmmseg.sequence.naming.Weighing) by maximum likelihood on other drawn worlds.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from hmmseg.sequence.segment import segment_sequence
 
 OUT = Path(__file__).parent / "results" / "sequences.json"
 WRIST = ("width", "ee_y", "ee_z", "Fx", "Fy", "Fz")
+LEARNED_FROM = 80_000  # chosen: first seed of the worlds that weights are learned from
+MOST_TRIALS = 4  # numerics: of a hand's recordings
 BINS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95, 1.01)
 
 
@@ -80,6 +82,19 @@ def wrists(folder: Path) -> list[Case]:
         task = SequenceTask(tuple(f"subtask {i}" for i in range(truth[0].size + 1)), WRIST)
         world = World(task, [Trial.read(file, task=task) for file in files], truth)
         cases.append(Case(each.name, "arm's wrist", world, tuple(range(truth[0].size))))
+    return cases
+
+
+def hands(folders: list[Path]) -> list[Case]:
+    """A two-finger hand's recordings of blocks, by all their channels as they come, four trials of each."""
+    cases = []
+    for each in folders:
+        files = sorted(each.glob("trial_*.csv"))[:MOST_TRIALS]
+        labels = [each / "truth" / f"{file.stem}.json" for file in files]
+        truth = [np.array(json.loads(path.read_text())["boundaries"]) for path in labels]
+        task = SequenceTask(tuple(f"subtask {i}" for i in range(truth[0].size + 1)))
+        world = World(task, [Trial.read(file, task=task) for file in files], truth)
+        cases.append(Case(each.name, "hand", world, tuple(range(truth[0].size))))
     return cases
 
 
@@ -191,19 +206,21 @@ def main() -> None:
     """Check or learn, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=("check", "learn"))
-    parser.add_argument("--worlds", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=50_000)
+    parser.add_argument("--worlds", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=95_000)
     parser.add_argument("--real", type=Path, help="folder of hiro_snap")
     parser.add_argument("--panda", type=Path, help="folder of a simulated arm's recordings")
+    parser.add_argument("--hands", type=Path, nargs="*", default=[], help="folders of a hand's recordings")
     args = parser.parse_args()
     if args.what == "learn":
         from experiments.sequence_weighing import learn
 
-        learn([draw(seed) for seed in range(args.seed + 10_000, args.seed + 10_000 + args.worlds)])
+        learn([draw(seed) for seed in range(LEARNED_FROM, LEARNED_FROM + args.worlds)])
         return
     cases = drawn(args.seed, args.worlds)
     cases += snaps(args.real) if args.real else []
     cases += wrists(args.panda) if args.panda else []
+    cases += hands(args.hands)
     document = check(cases)
     for group, entry in document["groups"].items():
         for kind in ("none", "before_asked", "asked", "trial"):

@@ -44,6 +44,7 @@ def fit(
                              "a task with `sequence`")  # fmt: skip
         from hmmseg.sequence.fit import fit_sequence
         from hmmseg.sequence.model import save_model
+        from hmmseg.sequence.places import SURE
 
         hand = None
         if rig is not None:
@@ -57,9 +58,14 @@ def fit(
         save_model(learned, out.stage(model))
         out.print(f"learned {len(description.sequence)} states from {len(recordings)} trials, {len(known)} "
                   f"of them labelled; written to {model}")  # fmt: skip
-        if learned.others:
+        doubtful = [
+            f"{name} ({sure:.2f})"
+            for name, sure in zip(description.sequence[1:], learned.sure, strict=False)
+            if sure < SURE
+        ]
+        if doubtful:
             out.warn(
-                f"the trials can be read in {1 + len(learned.others)} ways, the likeliest with probability "
-                f"{learned.readings[0][0]:.2f}; hmmseg segment says where, and which label would decide"
+                "the trials can be read in several ways; the probability of where these begin: "
+                f"{', '.join(doubtful)}; hmmseg segment says where else, and which label would decide"
             )
         out.finish({"model": str(model), "trials": [str(p) for p in paths], "labelled": sorted(known)})

@@ -12,18 +12,18 @@ from hmmseg.hmm.alignment import align_many
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence import misfit as sequence_misfit
+from hmmseg.sequence.courses import COARSE_CELLS, Course, coarse, find_courses
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions, from_weights
 from hmmseg.sequence.features import FeatureMap, Features, feature_map, features
 from hmmseg.sequence.labels import Labels, choose_detectors, forbidden, labelled_path, read_labels, shares
 from hmmseg.sequence.learner import FLOORS, STEPS_PER_FLOOR, Learner
-from hmmseg.sequence.model import Alternative, SequenceModel, optional_states, weights
-from hmmseg.sequence.readings import COARSE_CELLS, coarse, expected_right, find_readings, probabilities
+from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states, weights
+from hmmseg.sequence.naming import WEIGHING, Naming, best_choice, naming, probabilities
 from hmmseg.sequence.transitions import transitions
 
-LEAST_PROBABLE = 0.02  # numerics: readings below are left out
-MOST_KEPT = 8  # numerics: readings in a model
-BOUNDARY_INDEPENDENT = 250.0  # learned: independent observations of one trial that tell of its boundaries
+LEAST_PROBABLE = 0.002  # numerics: courses below are left out
+MOST_KEPT = 16  # numerics: courses in a model
 ENOUGH = (
     2  # numerics: trials with all their labels for boundary templates: one must be left out to weigh them
 )
@@ -66,46 +66,62 @@ def _channels(trials: Sequence[Trial], task: SequenceTask) -> tuple[str, ...]:
 
 def _fit_unlabelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
                     boundaries: list[np.ndarray]) -> SequenceModel:  # fmt: skip
-    """All probable readings of the trials, given what few labels there are."""
-    factor = max(1, round(float(np.median([len(each.values) for each in data])) / COARSE_CELLS))
+    """All courses of the trials with what their changes may be, given what few labels there are."""
+    values, num_states = [each.values for each in data], len(task.sequence)
+    if num_states == 1:
+        learner = Learner(values, task.sequence, optional_states(task, False))
+        start = [np.ones((len(v), 1)) for v in values]
+        return _finish(data, task, mapping, learner, *_settle(learner, start), None)
+    factor = max(1, round(float(np.median([len(v) for v in values])) / COARSE_CELLS))
     known = [shares(each, b) for each, b in zip(data, boundaries, strict=True)]
-    readings = find_readings([coarse(each.values, factor) for each in data], task.sequence,
-                             optional_states(task, False), known)  # fmt: skip
-    probability = probabilities(readings)
-    right = expected_right(readings, probability)
+    courses = find_courses([coarse(v, factor) for v in values], num_states, known)
+    namings = [naming(course, num_states, known) for course in courses]
+    probability = probabilities(namings)
+    choice = best_choice(courses, namings, probability)
+    learner = Learner(values, task.sequence, optional_states(task, choice.settled))
+    learner.allowed = [forbidden(d, b, learner.num_states) for d, b in zip(data, boundaries, strict=True)]
+    stretches = _fine(courses[choice.course], factor, values)
+    start = [np.searchsorted(np.array(choice.ends) - 0.5, p.argmax(1)) for p in stretches]
+    model = _finish(data, task, mapping, learner, *_settle(learner, learner.one_hot(start)), None)
     order = [i for i in np.argsort(-probability) if probability[i] >= LEAST_PROBABLE][:MOST_KEPT]
-    first = max(order, key=lambda i: right[i])
-    order = [first, *[i for i in order if i != first]]
-    total = probability[order].sum()
-    models = []
-    for i in order:
-        reading = readings[i]
-        learner = Learner([each.values for each in data], task.sequence,
-                          optional_states(task, reading.settled))  # fmt: skip
-        learner.allowed = [
-            forbidden(each, b, learner.num_states) for each, b in zip(data, boundaries, strict=True)
-        ]
-        fine = [
-            np.repeat(p, factor, axis=0)[: len(each.values)]
-            for p, each in zip(reading.probability, data, strict=True)
-        ]
-        emissions, fine, _ = learner.run(fine, 1 / learner.stacked.shape[1], FLOORS[-1:])
-        emissions = replace(emissions, temper=_coarsened(learner, emissions, fine))
-        fine = [a.smoothed for a in learner.align(emissions, fine)]
-        models.append(_finish(data, task, mapping, learner, emissions, fine, None))
-    shares_of = [float(probability[i] / total) for i in order]
-    others = tuple(Alternative(p, model) for p, model in zip(shares_of[1:], models[1:], strict=True))
-    return replace(models[0], others=others)
+    total = float(probability[order].sum())
+    named = tuple(
+        _named(data, boundaries, courses[i], namings[i], float(probability[i]) / total, factor) for i in order
+    )
+    scale = np.where(np.isfinite(boundaries).any(0), WEIGHING.told, WEIGHING.lag)
+    lag = scale * float(np.median([len(v) for v in values]))
+    return replace(model, courses=named, lag=lag, sure=choice.right)
 
 
-def _coarsened(learner: Learner, emissions: StudentEmissions, probability: list[np.ndarray]) -> float:
-    """Temper of emissions that nobody taught: the independent share, coarsened (hmmseg.sequence.readings).
+def _settle(learner: Learner, start: list[np.ndarray]) -> tuple[StudentEmissions, list[np.ndarray]]:
+    """EM at the finest scale, with the emissions' own share of independent observations in the end."""
+    emissions, probability, _ = learner.run(start, 1 / learner.stacked.shape[1], FLOORS[-2:])
+    emissions = replace(emissions, temper=learner.independent_share(emissions, probability))
+    return emissions, [a.smoothed for a in learner.align(emissions, probability)]
 
-    Where exactly a gradual change is the boundary, no number of samples of it says.
-    """
-    share = learner.independent_share(emissions, probability)
-    observations = share * learner.stacked.size / len(learner.values)
-    return share * BOUNDARY_INDEPENDENT / (BOUNDARY_INDEPENDENT + observations)
+
+def _fine(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndarray]:
+    """Probabilities [(num_cells, num_stretches), ...] of a course's stretches on the fine grid."""
+    return [np.repeat(p, factor, axis=0)[: len(v)] for p, v in zip(course.probability, values, strict=True)]
+
+
+def _named(data: list[Features], boundaries: list[np.ndarray], course: Course, found: Naming,
+           probability: float, factor: int) -> NamedCourse:  # fmt: skip
+    """A course on the fine grid, and what labels say of how far boundaries lie off its changes."""
+    number = len(course.cost) - 1
+    values = [each.values for each in data]
+    learner = Learner(values, [f"{k}" for k in range(number)], [False] * number)
+    stretches = _fine(course, factor, values)
+    emissions = from_weights(learner.stacked, learner.pooled(stretches), FLOORS[-1], 1.0)
+    emissions = replace(emissions, temper=learner.independent_share(emissions, stretches))
+    mean_cells = np.maximum(np.mean([p.sum(0) for p in stretches], 0), 1.5)
+    lags = np.array([
+        (shares(each, b)[:, None] - ends) * len(each.values)
+        for each, b, ends in zip(data, boundaries, course.ends, strict=True)
+    ])  # fmt: skip
+    told = np.isfinite(lags)
+    shift = np.where(told, lags, 0.0).sum(0) / np.maximum(told.sum(0), 1)
+    return NamedCourse(probability, emissions, mean_cells, found.probability, shift)
 
 
 def _fit_labelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,

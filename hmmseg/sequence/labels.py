@@ -19,7 +19,6 @@ from hmmseg.sequence.detectors import Detectors, learn
 from hmmseg.sequence.emissions import from_weights
 from hmmseg.sequence.features import Features
 from hmmseg.sequence.model import combined
-from hmmseg.sequence.readings import forbidding
 from hmmseg.sequence.transitions import Transitions
 
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
@@ -104,8 +103,19 @@ def shares(trial: Features, boundaries: np.ndarray) -> np.ndarray:
 
 
 def forbidden(trial: Features, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
-    """Log weights (num_cells, num_states) that keep labelled boundaries [s] to a cell; None without any."""
-    return forbidding(len(trial.values), num_states, shares(trial, boundaries), 0.0)
+    """Log weights (num_cells, num_states) that keep labelled boundaries [s] to a cell; None without any.
+
+    -inf where a label forbids a state, 0 elsewhere.
+    """
+    if not np.isfinite(boundaries).any():
+        return None
+    middle = (trial.edges[1:] + trial.edges[:-1]) / 2
+    reach = trial.edges[1] - trial.edges[0]
+    out = np.zeros((len(middle), num_states))
+    for b in np.flatnonzero(np.isfinite(boundaries)):
+        out[middle < boundaries[b] - reach, b + 1 :] = -np.inf
+        out[middle > boundaries[b] + reach, : b + 1] = -np.inf
+    return out
 
 
 def choose_detectors(values: list[np.ndarray], boundaries: list[np.ndarray], edges: list[np.ndarray],

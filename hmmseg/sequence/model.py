@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from hmmseg.sequence.emissions import StudentEmissions
 from hmmseg.sequence.features import FeatureMap, Features
 from hmmseg.sequence.transitions import Transitions, transitions
 
-FORMAT = "hmmseg.sequence-model/2"
+FORMAT = "hmmseg.sequence-model/3"
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,10 @@ class SequenceModel:
     different. `mean_cells`, `presence` (num_states,): mean duration in cells and the probability
     that an optional state occurs. `typical` (num_states,) is the median duration [cells] in the
     trials learned from, `misfit` (2, 2) their median and spread of the two scores of
-    hmmseg.sequence.misfit. `others` are further readings of the same trials where no labels decide
-    (hmmseg.sequence.readings), with what is left of probability for this one.
+    hmmseg.sequence.misfit. Where not all labels of two trials were given, `courses` are the ways to align the
+    trials and to name their changes, and boundaries are as uncertain as all of them together; `lag`
+    (num_boundaries,) [cells] is how far they lie off such a change (the scale of a Laplace law), `sure`
+    (num_boundaries,) the probability that the boundaries of this model are the task's.
     """
 
     task: SequenceTask
@@ -41,13 +43,9 @@ class SequenceModel:
     detectors: Detectors | None
     typical: np.ndarray
     misfit: np.ndarray
-    others: tuple[Alternative, ...] = ()
-
-    @property
-    def readings(self) -> list[tuple[float, SequenceModel]]:
-        """All readings with their probabilities, this one first."""
-        rest = [(other.probability, other.model) for other in self.others]
-        return [(1.0 - sum(p for p, _ in rest), replace(self, others=())), *rest]
+    courses: tuple[NamedCourse, ...] = ()
+    lag: np.ndarray = field(default_factory=lambda: np.empty(0))
+    sure: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
     def transitions(self) -> Transitions:
@@ -67,11 +65,26 @@ class SequenceModel:
 
 
 @dataclass(frozen=True)
-class Alternative:
-    """Another way to read the trials that a model was learned from, as a model without others."""
+class NamedCourse:
+    """A way to align trials, by an ordered model of more stretches than states, and what its changes are.
+
+    `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j of
+    it, which sums to 1 over j. `shift` (num_boundaries, num_changes) [cells]: by how much labels say that
+    boundary b comes after change j.
+    """
 
     probability: float
-    model: SequenceModel
+    emissions: StudentEmissions
+    mean_cells: np.ndarray
+    naming: np.ndarray
+    shift: np.ndarray
+
+    def align(self, trial: Features) -> Alignment:
+        """Posterior alignment; InfeasibleAlignment for a trial with fewer cells than stretches."""
+        count = len(self.mean_cells)
+        law = transitions(self.mean_cells, np.ones(count), [False] * count)
+        ll = self.emissions.log_likelihoods(trial.values)
+        return align_many([ll], [law.bands], log_initial=law.log_initial, log_final=law.log_final)[0]
 
 
 def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
@@ -101,29 +114,27 @@ def combined(log_likelihoods: np.ndarray, log_ratios: np.ndarray, detectors: Det
 
 def save_model(model: SequenceModel, path: str | Path) -> None:
     """Write a model to an NPZ file."""
-    parts = _table(model)
-    for i, other in enumerate(model.others):
-        parts |= {f"others.{i}.{key}": value for key, value in _table(other.model).items()}
+    detectors = {} if model.detectors is None else {
+        f"detectors.{name}": np.asarray(value) for name, value in vars(model.detectors).items()}  # fmt: skip
+    courses = {
+        f"courses.{i}.{key}": value
+        for i, course in enumerate(model.courses)
+        for key, value in {
+            "probability": np.asarray(course.probability), "loc": course.emissions.loc,
+            "spread": course.emissions.scale, "temper": np.asarray(course.emissions.temper),
+            "mean_cells": course.mean_cells, "naming": course.naming, "shift": course.shift,
+        }.items()
+    }  # fmt: skip
     with open(path, "wb") as file:
         np.savez(
             file, format=FORMAT, sequence=np.array(model.task.sequence),
             optional=np.array(model.task.optional, dtype=str), channels=np.array(model.mapping.channels),
             step=model.mapping.step, window=model.mapping.window, center=model.mapping.center,
-            scale=model.mapping.scale, others=np.array([other.probability for other in model.others]),
-            **parts,  # type: ignore[arg-type]
+            scale=model.mapping.scale, loc=model.emissions.loc, spread=model.emissions.scale,
+            temper=model.emissions.temper, mean_cells=model.mean_cells, presence=model.presence,
+            settled=model.settled, typical=model.typical, misfit=model.misfit, lag=model.lag, sure=model.sure,
+            courses=len(model.courses), **detectors, **courses,  # type: ignore[arg-type]
         )  # fmt: skip
-
-
-def _table(model: SequenceModel) -> dict[str, np.ndarray]:
-    """What one reading has of its own."""
-    detectors = {} if model.detectors is None else {
-        f"detectors.{name}": np.asarray(value) for name, value in vars(model.detectors).items()}  # fmt: skip
-    return {
-        "loc": model.emissions.loc, "spread": model.emissions.scale,
-        "temper": np.asarray(model.emissions.temper),
-        "mean_cells": model.mean_cells, "presence": model.presence, "settled": np.asarray(model.settled),
-        "typical": model.typical, "misfit": model.misfit, **detectors,
-    }  # fmt: skip
 
 
 def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
@@ -143,26 +154,13 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
     try:
         model = _from_table(table, task)
         _check(model, table, task, where)
-        others = []
-        for i, probability in enumerate(np.ravel(table["others"])):
-            prefix = f"others.{i}."
-            own = {key.removeprefix(prefix): value for key, value in table.items() if key.startswith(prefix)}
-            shared = {
-                key: table[key]
-                for key in ("sequence", "optional", "channels", "step", "window", "center", "scale")
-            }
-            other = _from_table(shared | own, task)
-            _check(other, shared | own, task, f"{where}, reading {i + 2}")
-            if not 0 <= probability <= 1:
-                raise InputError(where, f"a reading has probability {probability}", "a number from 0 to 1")
-            others.append(Alternative(float(probability), other))
     except KeyError as error:
         raise InputError(where, f"lacks {error.args[0]}", "a complete model") from None
     except InputError:
         raise
     except (TypeError, ValueError):
         raise InputError(where, "holds values that no model has", "a model written by `hmmseg fit`") from None
-    return replace(model, others=tuple(others))
+    return model
 
 
 def _from_table(table: dict[str, np.ndarray], task: SequenceTask) -> SequenceModel:
@@ -175,10 +173,17 @@ def _from_table(table: dict[str, np.ndarray], task: SequenceTask) -> SequenceMod
             int(part["half"]), part["mean"], part["spread"], part["usual"], part["jitter"],
             float(part["weight"]), float(part["state_weight"]),
         )  # fmt: skip
+    courses = []
+    for i in range(int(table["courses"])):
+        part = {name: table[f"courses.{i}.{name}"] for name in
+                ("probability", "loc", "spread", "temper", "mean_cells", "naming", "shift")}  # fmt: skip
+        emissions = StudentEmissions(part["loc"], part["spread"], float(part["temper"]))
+        courses.append(NamedCourse(float(part["probability"]), emissions, part["mean_cells"],
+                                   part["naming"], part["shift"]))  # fmt: skip
     return SequenceModel(
         task, mapping, StudentEmissions(table["loc"], table["spread"], float(table["temper"])),
         table["mean_cells"], table["presence"], bool(table["settled"]), detectors,
-        table["typical"], table["misfit"],
+        table["typical"], table["misfit"], tuple(courses), table["lag"], table["sure"],
     )  # fmt: skip
 
 
@@ -197,11 +202,22 @@ def _check(model: SequenceModel, table: dict[str, np.ndarray], task: SequenceTas
         "spread": (num_states, num_features), "mean_cells": (num_states,), "presence": (num_states,),
         "typical": (num_states,), "misfit": (2, 2),
     }  # fmt: skip
+    boundaries = len(task.sequence) - 1
     if model.detectors is not None:
-        boundaries, channels = len(task.sequence) - 1, num_features // 2
+        channels = num_features // 2
         windows = (boundaries, 2 * model.detectors.half, channels)
         shapes |= {"detectors.mean": windows, "detectors.spread": windows,
                    "detectors.usual": (channels,), "detectors.jitter": (boundaries,)}  # fmt: skip
+    if model.courses:
+        shapes |= {"lag": (boundaries,), "sure": (boundaries,)}
+    for i, course in enumerate(model.courses):
+        count = len(course.mean_cells)
+        shapes |= {f"courses.{i}.{name}": shape for name, shape in {
+            "probability": (), "loc": (count, num_features), "spread": (count, num_features),
+            "mean_cells": (count,), "naming": (boundaries, count - 1), "shift": (boundaries, count - 1),
+        }.items()}  # fmt: skip
+        if not 0 <= course.probability <= 1:
+            raise InputError(where, f"a course has probability {course.probability}", "a number from 0 to 1")
     for key, shape in shapes.items():
         if table[key].shape != shape or not np.isfinite(table[key]).all():
             raise InputError(where, f"{key} has shape {table[key].shape}", f"finite numbers of shape {shape}")

@@ -1,57 +1,103 @@
-"""Where a boundary lies when trials can be read in several ways, and which label would decide.
+"""Where a boundary lies when trials can be aligned and read in several ways, and which label would decide.
 
-Every reading gives a boundary its own posterior; together, weighted by the readings' probabilities, they
-are what is known. Readings whose intervals overlap name the same place.
+Every course gives each of its changes a posterior; together, weighted by the probabilities of the courses and
+that the boundary is that change, they are what is known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import convolve1d, shift
 
 from hmmseg.segmentation.spans import Place, Question, Segmentation
+from hmmseg.sequence.model import NamedCourse
+from hmmseg.sequence.naming import NEAR, WEIGHING
 
 LISTED = 0.05  # chosen: least probability of a place that is told
 SURE = 0.95  # chosen: from here on one place is the answer and no other is told
+FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
+LEAST = 1e-3  # numerics: probability of a naming that makes no difference
 
 
-def mixed(probability: np.ndarray, crossings: Sequence[np.ndarray]) -> np.ndarray:
-    """Crossing probabilities (num_cells - 1, num_boundaries) over all readings."""
-    return np.tensordot(probability, np.stack(crossings), 1)
+@dataclass(frozen=True)
+class Boundaries:
+    """`crossing` (num_cells - 1, num_boundaries): probability that each is at each edge; `gain`
+    (num_boundaries,) [nats]: the expected reduction of entropy, of what is which change, by its label."""
+
+    crossing: np.ndarray
+    gain: np.ndarray
 
 
-def places(
-    medians: Sequence[float], intervals: Sequence[tuple[float, float]], probability: Sequence[float]
-) -> tuple[Place, ...]:
+def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np.ndarray) -> Boundaries:
+    """Posterior over all courses, from `crossings` [(num_cells - 1, num_changes), ...] of each.
+
+    `lag` (num_boundaries,) [cells]. The gain is the mutual information of naming and label: what the
+    entropy of the mixture exceeds that of its parts by.
+    """
+    mixture, gain = [], []
+    for b, scale in enumerate(lag):
+        parts, weights = [], []
+        for crossing, course in zip(crossings, courses, strict=True):
+            weight = course.probability * course.naming[b]
+            for j in np.flatnonzero(course.naming[b] > LEAST):
+                moved = crossing[:, j]
+                if course.shift[b, j]:
+                    moved = shift(moved, course.shift[b, j], order=1)
+                parts.append(moved)
+                weights.append(weight[j])
+        table = _normal(convolve1d(np.array(parts), _laplace(scale), axis=1, mode="constant"))
+        p = np.array(weights) / np.sum(weights)
+        mixed = p @ table
+        gain.append(max(_entropy(mixed) - float(p @ [_entropy(part) for part in table]), 0.0))
+        mixture.append((1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / len(mixed))
+    return Boundaries(np.array(mixture).T, np.array(gain))
+
+
+def _laplace(scale: float) -> np.ndarray:
+    reach = int(np.ceil(FARTHEST * scale))
+    kernel = np.exp(-np.abs(np.arange(-reach, reach + 1)) / max(scale, 1e-9))
+    return kernel / kernel.sum()
+
+
+def _normal(table: np.ndarray) -> np.ndarray:
+    return table / np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
+
+
+def near(edges: np.ndarray, crossing: np.ndarray, time: float) -> float:
+    """Probability within NEAR of `time` of a boundary: `crossing` (num_cells - 1,) at the inner `edges`."""
+    here = np.abs(edges[1:-1] - time) <= NEAR * (edges[-1] - edges[0])
+    return float(crossing[here].sum() / crossing.sum())
+
+
+def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
     """Places [s] of one boundary, most probable first; none where one of them is sure.
 
-    `medians`, `intervals` and `probability` of each reading. A place has the median of its most probable
-    reading.
+    `edges` (num_cells + 1,) [s], `crossing` (num_cells - 1,) the boundary's probability at the inner ones,
+    `answer` [s] the time that is given: the first place. A place is what lies within NEAR of the trial.
     """
-    left = sorted(range(len(medians)), key=lambda i: -probability[i])
-    found = []
-    while left:
-        low, high = intervals[left[0]]
-        same = [i for i in left if intervals[i][0] <= high and intervals[i][1] >= low]
-        found.append(Place(float(medians[left[0]]), float(sum(probability[i] for i in same))))
-        left = [i for i in left if i not in same]
+    inner, left = edges[1:-1], crossing / crossing.sum()
+    reach = NEAR * (edges[-1] - edges[0])
+    low = np.searchsorted(inner, inner - reach)
+    high = np.searchsorted(inner, inner + reach, side="right")
+    found, time = [], answer
+    while True:
+        here = np.abs(inner - time) <= reach
+        found.append(Place(float(time), float(left[here].sum())))
+        left = np.where(here, 0.0, left)
+        total = np.concatenate([[0.0], np.cumsum(left)])
+        window = total[high] - total[low]
+        peak = int(window.argmax())
+        if window[peak] < LISTED:
+            break
+        middle = (total[low[peak]] + total[high[peak]]) / 2
+        time = inner[np.searchsorted(total[1:], middle)]
     found.sort(key=lambda place: -place.probability)
-    if not found or found[0].probability >= SURE:
+    if found[0].probability >= SURE or len(found) == 1:
         return ()
     return tuple(place for place in found if place.probability >= LISTED)
-
-
-def gains(probability: np.ndarray, crossings: Sequence[np.ndarray]) -> np.ndarray:
-    """Expected reduction (num_boundaries,) [nats] of the readings' entropy by a label of each boundary.
-
-    The mutual information of reading and label: what the mixture's entropy exceeds the readings' own by.
-    """
-    table = np.stack(crossings)
-    table = table / np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
-    together = np.tensordot(probability, table, 1)
-    own = np.tensordot(probability, -_xlogx(table).sum(1), 1)
-    return np.maximum(-_xlogx(together).sum(0) - own, 0.0)
 
 
 def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
@@ -60,5 +106,5 @@ def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
     return max(questions, key=lambda question: question.gain, default=None)
 
 
-def _xlogx(p: np.ndarray) -> np.ndarray:
-    return np.where(p > 0, p * np.log(np.where(p > 0, p, 1.0)), 0.0)
+def _entropy(p: np.ndarray) -> float:
+    return float(-(p * np.log(np.where(p > 0, p, 1.0))).sum())

@@ -18,9 +18,9 @@ from hmmseg.sequence.features import Features, features
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.labels import boundary_probabilities
 from hmmseg.sequence.model import SequenceModel, optional_states
-from hmmseg.sequence.places import gains, mixed, places
+from hmmseg.sequence.places import Boundaries, near, places, together
 
-SLOPE_DRAW = 0.75  # prior: standard deviation of a boundary's shift, as a share of a slope's reach
+MAIN = 0.5  # chosen: least probability about a median for it to be the answer, not a time amid several places
 
 _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interval
 
@@ -43,28 +43,31 @@ def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
 
 def _segment(trial: Trial, data: Features, model: SequenceModel) -> Segmentation:
     names = model.task.sequence
-    readings, probability = [], []
-    for p, reading in model.readings:
-        try:
-            alignment = reading.align([data])[0]
-        except InfeasibleAlignment as error:
-            if readings:
-                continue
-            k = min(error.subtask, len(names) - 1)
-            failed = Failure(k, names[k], None, f"has no samples left: {error.reason}")
-            return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
-        readings.append((alignment, _crossing(reading, alignment)))
-        probability.append(p)
-    first = readings[0][0]
-    crossings = [crossing for _, crossing in readings]
-    weights = np.array(probability) / np.sum(probability)
-    spans = _spans(trial, data, model, first, weights, crossings)
+    try:
+        alignment = model.align([data])[0]
+        known = _posterior(data, model, alignment)
+    except InfeasibleAlignment as error:
+        k = min(error.subtask, len(names) - 1)
+        failed = Failure(k, names[k], None, f"has no samples left: {error.reason}")
+        return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
+    spans = _spans(trial, data, model, alignment, known)
     question = None
     if any(span.alternatives for span in spans):
-        gain = gains(weights, crossings)
-        question = Question(trial.file, names[int(gain.argmax()) + 1], float(gain.max()))
-    return Segmentation(trial.file, trial.rate, first.log_evidence, spans, _failure(data, model, first),
-                        recorded=trial, question=question)  # fmt: skip
+        question = Question(trial.file, names[int(known.gain.argmax()) + 1], float(known.gain.max()))
+    return Segmentation(trial.file, trial.rate, alignment.log_evidence, spans,
+                        _failure(data, model, alignment), recorded=trial, question=question)  # fmt: skip
+
+
+def _posterior(data: Features, model: SequenceModel, alignment: Alignment) -> Boundaries:
+    """Of all boundaries: from the model itself where labels taught it, else from all its courses."""
+    if not model.courses:
+        crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1]
+        if model.detectors is not None:
+            for b, jitter in enumerate(model.detectors.jitter):
+                if jitter > 0:
+                    crossing[:, b] = gaussian_filter1d(crossing[:, b], jitter, mode="constant")
+        return Boundaries(crossing, np.zeros(crossing.shape[1]))
+    return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
 
 
 def _failure(data: Features, model: SequenceModel, alignment: Alignment) -> Failure | None:
@@ -78,48 +81,29 @@ def _failure(data: Features, model: SequenceModel, alignment: Alignment) -> Fail
     )  # fmt: skip
 
 
-def _crossing(model: SequenceModel, alignment: Alignment) -> np.ndarray:
-    """Probability (num_cells - 1, num_named - 1) that each boundary is at each edge, jitter included."""
-    crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1]
-    for b, jitter in enumerate(_jitter(model)[: crossing.shape[1]]):
-        if jitter > 0:
-            crossing[:, b] = gaussian_filter1d(crossing[:, b], jitter, mode="constant")
-    return crossing
-
-
 def _spans(trial: Trial, data: Features, model: SequenceModel, alignment: Alignment,
-           probability: np.ndarray, crossings: list[np.ndarray]) -> tuple[Span, ...]:  # fmt: skip
-    """Spans where the first reading has them, as uncertain as all readings together."""
+           known: Boundaries) -> tuple[Span, ...]:  # fmt: skip
+    """Spans where the model itself has them, as uncertain as all courses together."""
     names = model.task.sequence
     visited = _visit_probabilities(alignment)[: len(names)]
     optional = optional_states(model.task, False)
     kept = [k for k in range(len(names)) if not optional[k] or visited[k] >= 0.5]
     first, last = float(trial.t[0]), float(trial.t[-1])
-    together = mixed(probability, crossings)
+    own = boundary_probabilities(alignment)
     starts: list[_Boundary] = [(first, 0.0, (first, first))]
     elsewhere: list[tuple[Place, ...]] = [()]
     for k in kept[1:]:
-        each = [_boundary(data.edges, crossing[:, k - 1], first, last) for crossing in crossings]
-        _, sd, (low, high) = _boundary(data.edges, together[:, k - 1], first, last)
-        median = each[0][0]
+        median, sd, (low, high) = _boundary(data.edges, known.crossing[:, k - 1], first, last)
+        if model.courses and near(data.edges, known.crossing[:, k - 1], median) < MAIN:
+            median = _boundary(data.edges, own[:, k - 1], first, last)[0]
+        median = max(median, starts[-1][0])
         starts.append((median, sd, (min(low, median), max(high, median))))
-        elsewhere.append(places([b[0] for b in each], [b[2] for b in each], probability.tolist()))
+        elsewhere.append(places(data.edges, known.crossing[:, k - 1], median) if model.courses else ())
     ends = [*starts[1:], (last, 0.0, (last, last))]
     return tuple(
         Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2], others)
         for k, start, end, others in zip(kept, starts, ends, elsewhere, strict=True)
     )
-
-
-def _jitter(model: SequenceModel) -> np.ndarray:
-    """Standard deviation [cells] by which each boundary scatters beyond its posterior.
-
-    Measured on labels where there are any. Without, a smoothed slope reaches across a boundary by half
-    its window and may draw it to either side; most of that reach is one standard deviation.
-    """
-    if model.detectors is not None:
-        return model.detectors.jitter
-    return np.full(model.emissions.loc.shape[0] - 1, SLOPE_DRAW * (model.mapping.window // 2 + 1))
 
 
 def _visit_probabilities(alignment: Alignment) -> np.ndarray:

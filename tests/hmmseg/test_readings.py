@@ -2,18 +2,20 @@
 
 import itertools
 import json
+import math
 
 import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
-from hmmseg.hmm import left_to_right, smooth
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
+from hmmseg.sequence.courses import Course
+from hmmseg.sequence.emissions import StudentEmissions
 from hmmseg.sequence.fit import fit_sequence
-from hmmseg.sequence.model import load_model, save_model
-from hmmseg.sequence.places import gains, mixed, most_telling, places
-from hmmseg.sequence.readings import best_groupings
+from hmmseg.sequence.model import NamedCourse, load_model, save_model
+from hmmseg.sequence.naming import NEAR, WEIGHING, best_choice, naming, probabilities
+from hmmseg.sequence.places import most_telling, places, together
 from hmmseg.sequence.segment import segment_sequence
 
 TASK = SequenceTask(("wait", "push", "pull"))
@@ -34,63 +36,124 @@ def ambiguous(count=5, events=(2.0, 4.0, 6.5), levels=(0.0, 3.0, 6.0, 9.0), nois
     return trials, np.array(truth)
 
 
-def test_groupings_are_the_best_of_all():
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        n = int(rng.integers(3, 8))
-        groups = int(rng.integers(1, n))
-        later = np.arange(n + 1)[None] > np.arange(n + 1)[:, None]
-        cost = np.where(later, rng.random((n + 1, n + 1)), np.inf)
-        allowed = rng.random((groups - 1, n + 1)) < 0.8
-        every = {
-            cuts: sum(cost[a, b] for a, b in itertools.pairwise((0, *cuts, n)))
-            for cuts in itertools.combinations(range(1, n), groups - 1)
-            if all(allowed[i, at] for i, at in enumerate(cuts))
-        }
-        found = best_groupings(cost, groups, allowed)
-        for cuts, value in found.items():
-            assert value == pytest.approx(every[cuts])
-        for b, at in itertools.product(range(groups - 1), range(1, n)):
-            with_it = [value for cuts, value in every.items() if cuts[b] == at]
-            if with_it:
-                assert min(v for cuts, v in found.items() if cuts[b] == at) == pytest.approx(min(with_it))
+def drawn_course(rng, stretches, trials=2):
+    later = np.arange(stretches + 1)[None] > np.arange(stretches + 1)[:, None]
+    cost = np.where(later, 20 * rng.random((stretches + 1, stretches + 1)), np.inf)
+    ends = np.sort(rng.uniform(0.05, 0.95, (trials, stretches - 1)), axis=1)
+    return Course([np.zeros((50, stretches))] * trials, ends, cost, share=0.5)
 
 
-def test_mixture_and_gain_against_enumeration_of_readings_and_paths():
+def enumerated(course, states, labels):
+    """Log weight of every choice: (changes that are boundaries, where something settles or None)."""
+    n, w = len(course.cost) - 1, WEIGHING
+    temper = w.independent * 0.5 / (w.independent + course.observations)
+    edges = np.column_stack([np.zeros(len(course.ends)), course.ends, np.ones(len(course.ends))])
+    found = {}
+    for cuts in itertools.combinations(range(1, n), states - 1):
+        for settles in [None, *range(cuts[-1] + 1, n)]:
+            bounds = [0, *cuts, *([] if settles is None else [settles]), n]
+            log = -temper * sum(course.cost[a, b] for a, b in itertools.pairwise(bounds))
+            for a, b in itertools.pairwise([0, *cuts]):
+                log += w.shares * np.log(edges[:, b] - edges[:, a]).mean()
+            log += 0.0 if settles is None else w.settled
+            for i, known in enumerate(labels):
+                for b in np.flatnonzero(np.isfinite(known)):
+                    density = np.exp(-abs(known[b] - edges[i, cuts[b]]) / w.lag) / (2 * w.lag)
+                    log += np.log((1 - w.elsewhere) * density + w.elsewhere)
+            found[cuts, settles] = log
+    return found
+
+
+@pytest.mark.parametrize("labelled", [False, True])
+def test_naming_is_the_sum_over_all_choices(labelled):
+    rng = np.random.default_rng(3)
+    for states in (2, 3, 4):
+        course = drawn_course(rng, 7)
+        labels = [np.full(states - 1, np.nan), np.full(states - 1, np.nan)]
+        if labelled:
+            labels[1][0] = course.ends[1, 2] + 0.003
+        every = enumerated(course, states, labels)
+        total = np.logaddexp.reduce(list(every.values()))
+        probability, settled = np.zeros((states - 1, 6)), np.zeros(6)
+        for (cuts, settles), log in every.items():
+            probability[range(states - 1), np.array(cuts) - 1] += np.exp(log - total)
+            if settles is not None:
+                settled[settles - 1] += np.exp(log - total)
+        found = naming(course, states, labels)
+        np.testing.assert_allclose(found.probability, probability, atol=1e-12)
+        np.testing.assert_allclose(found.settled, settled, atol=1e-12)
+        assert found.log_evidence == pytest.approx(total - np.log(math.comb(6, states - 1)))
+
+
+def test_the_best_choice_has_most_boundaries_right():
+    rng = np.random.default_rng(4)
+    courses = [drawn_course(rng, 6), drawn_course(rng, 8)]
+    none = [np.full(2, np.nan)] * 2
+    namings = [naming(course, 3, none) for course in courses]
+    weights = probabilities(namings)
+    evidence = np.array([each.log_evidence for each in namings])
+    np.testing.assert_allclose(weights, np.exp(evidence) / np.exp(evidence).sum())
+    expected = {}
+    for i, course in enumerate(courses):
+        for cuts in itertools.combinations(range(course.ends.shape[1]), 2):
+            right = 0.0
+            for weight, other, its in zip(weights, courses, namings, strict=True):
+                for b, j in itertools.product(range(2), range(other.ends.shape[1])):
+                    near = np.median(np.abs(course.ends[:, cuts[b]] - other.ends[:, j])) < NEAR
+                    right += weight * its.probability[b, j] * near
+            expected[i, cuts] = right
+    choice = best_choice(courses, namings, weights)
+    assert choice.right.sum() == pytest.approx(max(expected.values()))
+    assert expected[choice.course, tuple(j - 1 for j in choice.ends[:2])] == pytest.approx(choice.right.sum())
+
+
+def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
     rng = np.random.default_rng(1)
-    probability = np.array([0.5, 0.3, 0.2])
-    tables = [rng.normal(size=(7, 3)) * 2 for _ in probability]
-    chain = left_to_right([3, 2, 2])
-    # Every path of every reading, weighed.
-    joint = np.zeros((3, 6, 2))
-    for r, table in enumerate(tables):
-        weights = {}
-        for one, two in itertools.combinations(range(1, 7), 2):
-            path = np.repeat([0, 1, 2], [one, two - one, 7 - two])
-            log = table[np.arange(7), path].sum()
-            for before, after in itertools.pairwise(path):
-                log += chain.bands[0][before] if before == after else chain.bands[1][before]
-            weights[one, two] = np.exp(log)
-        total = sum(weights.values())
-        for (one, two), weight in weights.items():
-            joint[r, one - 1, 0] += probability[r] * weight / total
-            joint[r, two - 1, 1] += probability[r] * weight / total
-    crossings = [smooth(table, chain).boundary for table in tables]
-    np.testing.assert_allclose(mixed(probability, crossings), joint.sum(0), atol=1e-12)
-    # Mutual information of reading and label from the joint table itself.
-    for b in range(2):
-        table = joint[:, :, b]
-        independent = table.sum(1, keepdims=True) * table.sum(0, keepdims=True)
-        expected = (table * np.log(np.where(table > 0, table / np.where(table > 0, independent, 1), 1))).sum()
-        assert gains(probability, crossings)[b] == pytest.approx(expected)
+    lag, cells = np.array([1.5, 1.5]), 200
+    tables, courses = [], []
+    for changes in (3, 4):
+        crossing = np.zeros((cells, changes))
+        for j in range(changes):
+            crossing[60 + 25 * j + rng.choice(5, 3, replace=False), j] = 1 / 3
+        named = rng.dirichlet(np.ones(changes), 2)
+        emissions = StudentEmissions(np.zeros((1, 1)), np.ones((1, 1)))
+        tables.append(crossing)
+        courses.append(
+            NamedCourse(
+                0.5, emissions, np.ones(changes + 1), named, np.array([[0.0], [3.0]] * np.ones(changes))
+            )
+        )
+    found = together(tables, courses, lag)
+    offsets = np.arange(-40, 41)
+    law = np.exp(-np.abs(offsets) / 1.5)
+    law /= law.sum()
+    for b, shift in enumerate((0, 3)):
+        rows, weights = [], []
+        for table, course in zip(tables, courses, strict=True):
+            for j in range(table.shape[1]):
+                row = np.zeros(cells)
+                for at in np.flatnonzero(table[:, j]):
+                    row[at + shift + offsets] += table[at, j] * law
+                rows.append(row)
+                weights.append(0.5 * course.naming[b, j])
+        joint = np.array(weights)[:, None] * np.array(rows)
+        mixed = joint.sum(0)
+        alone = joint.sum(1, keepdims=True) * mixed
+        gain = (joint * np.log(np.where(joint > 0, joint / np.where(joint > 0, alone, 1), 1))).sum()
+        assert found.gain[b] == pytest.approx(gain, rel=1e-3)
+        expected = (1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / cells
+        np.testing.assert_allclose(found.crossing[:, b], expected, atol=1e-4)
 
 
-def test_places_are_those_of_overlapping_readings():
-    found = places(
-        [2.0, 2.1, 5.0, 8.0], [(1.9, 2.15), (2.0, 2.2), (4.9, 5.1), (7, 9)], [0.3, 0.2, 0.46, 0.04]
-    )
-    assert [(p.time, pytest.approx(p.probability)) for p in found] == [(2.0, 0.5), (5.0, 0.46)]
-    assert places([2.0, 5.0], [(1.9, 2.1), (4.9, 5.1)], [0.97, 0.03]) == ()
+def test_places_are_what_lies_near_a_time():
+    edges = np.arange(102.0)
+    crossing = np.zeros(100)
+    crossing[[20, 21, 50, 51, 80]] = [0.3, 0.2, 0.23, 0.23, 0.04]
+    found = places(edges, crossing, 51.2)
+    assert [(p.time, pytest.approx(p.probability)) for p in found] == [(21.0, 0.5), (51.2, 0.46)]
+    crossing = np.zeros(100)
+    crossing[[20, 60]] = [0.97, 0.03]
+    assert places(edges, crossing, 21.0) == ()
 
 
 def test_what_cannot_be_known_is_told_with_the_label_that_would_decide():
@@ -107,7 +170,7 @@ def test_what_cannot_be_known_is_told_with_the_label_that_would_decide():
                 assert 0.5 < sum(place.probability for place in span.alternatives) <= 1 + 1e-9
     question = most_telling(found)
     assert question is not None and question.gain > 0.1
-    assert question.gain == max(s.question.gain for s in found)
+    assert question.gain == max(s.question.gain for s in found if s.question is not None)
     entry = found[0].to_json()
     assert any(segment.get("alternatives") for segment in entry["segments"])
     json.dumps(entry, allow_nan=False)
@@ -137,18 +200,18 @@ def test_one_boundary_decides_where_it_lies(form):
             assert not segmentation.spans[2].alternatives
 
 
-def test_readings_are_saved(tmp_path):
+def test_courses_are_saved(tmp_path):
     trials, _ = ambiguous(noise=2.0)
     model = fit_sequence(trials, TASK)
-    assert model.others
-    assert sum(p for p, _ in model.readings) == pytest.approx(1)
+    assert len(model.courses) > 1 and (model.sure < 0.95).any()
+    assert sum(course.probability for course in model.courses) == pytest.approx(1)
     save_model(model, tmp_path / "m.npz")
     loaded = load_model(tmp_path / "m.npz", TASK)
     assert segment_sequence(trials[:1], TASK, loaded) == segment_sequence(trials[:1], TASK, model)
     with np.load(tmp_path / "m.npz") as file:
         table = dict(file)
-    np.savez(tmp_path / "m.npz", **{k: v for k, v in table.items() if k != "others.0.loc"})
-    with pytest.raises(InputError, match="lacks loc"):
+    np.savez(tmp_path / "m.npz", **{k: v for k, v in table.items() if k != "courses.0.loc"})
+    with pytest.raises(InputError, match=r"lacks courses\.0\.loc"):
         load_model(tmp_path / "m.npz", TASK)
 
 

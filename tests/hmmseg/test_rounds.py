@@ -71,22 +71,24 @@ def test_every_round_is_aligned(moves, repeat):
     assert len(aligned.trials[0].boundaries) == starts.size and aligned.trials[0].present.all()
 
 
-@pytest.mark.parametrize("repeat", ["unknown", 10])
-def test_a_drop_in_one_round_leaves_the_others(repeat):
-    aligned, truth = aligned_session((0,), 10, repeat, dropped=6)
+@pytest.mark.parametrize(
+    ("repeat", "number", "at"), [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56), (100, 100, 56)]
+)
+def test_a_drop_in_one_round_leaves_the_others(repeat, number, at):
+    aligned, truth = aligned_session((0,), number, repeat, dropped=at)
     trial, steps = aligned.trials[0], aligned.subtasks
     found = trial.segmentation
-    assert found.repetitions == 10
+    assert found.repetitions == number
     (failure,) = found.failures
-    assert found.failed == failure and failure.repetition == 7
-    assert failure.index == 4 * 6 + 3 and "let go in mid-air" in failure.reason
-    assert str(failure).startswith("does not fit its task at place block1: repetition 7: ")
-    assert np.flatnonzero(~trial.present).tolist() == [4 * 6 + 3]
+    assert found.failed == failure and failure.repetition == at + 1
+    assert failure.index == 4 * at + 3 and "let go in mid-air" in failure.reason
+    assert str(failure).startswith(f"does not fit its task at place block1: repetition {at + 1}: ")
+    assert np.flatnonzero(~trial.present).tolist() == [4 * at + 3]
     document = json.loads(json.dumps(found.to_json(), allow_nan=False))
-    assert document["failed"]["repetition"] == 7 and len(document["failures"]) == 1
+    assert document["failed"]["repetition"] == at + 1 and len(document["failures"]) == 1
     starts = np.array([b.quantile(0.5) for b in trial.boundaries])
-    others = [k for k in range(len(steps) - 1) if k // 4 != 6]
-    known = np.concatenate([t for r, t in enumerate(truth) if r != 6])
+    others = [k for k in range(len(steps) - 1) if k // 4 != at]
+    known = np.concatenate([t for r, t in enumerate(truth) if r != at])
     assert np.abs(starts[others] - known).max() < 0.05
 
 
