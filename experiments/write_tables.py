@@ -21,6 +21,7 @@ from experiments import (
     table_gap,
     table_sequences,
     table_speed,
+    wrist,
 )
 from experiments.table_misfits import misfits
 from experiments.table_real import real
@@ -181,6 +182,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
     ("docs/benchmarks.md", "solvers", table_speed.solvers, "bench-solvers"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
+    ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
     ("docs/sequences.md", "sequences", table_sequences.table, "sequences"),
     ("docs/before_after.md", "before_after", before_after.table, "before-after"),
 )

@@ -44,6 +44,7 @@ class Signals:
     derived: bool = False  # velocities are differences of positions
     touches: tuple[tuple[float, float], ...] = ()  # times of touch and release known apart, and sds [s]
     timing: np.ndarray | None = None  # sd of when a force changed that changes there [s]
+    free: np.ndarray | None = None  # share of a sample in which nothing is held for sure
 
     @property
     def x(self) -> np.ndarray:
@@ -129,7 +130,7 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
     sds = {f"sd_{name}": np.sqrt(variance) for name, variance in variances.items()}
     force = np.nan if noise.force is None else noise.force
     return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,  # type: ignore[arg-type]
-                   touches=trial.touches, timing=trial.timing)  # fmt: skip
+                   touches=trial.touches, timing=trial.timing, free=trial.free)  # fmt: skip
 
 
 def _square(sd: float | None) -> float:

@@ -28,6 +28,7 @@ from hmmseg.io.trial import Trial
 # chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
 LAG = 0.012
 TILT = 0.01  # chosen: rad; an arm whose orientation is not recorded holds its hand level by about as much
+SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a touch is known to a fifth of it
 CLIPPED = 2.0  # chosen: noise scales
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is told
 NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
@@ -130,11 +131,15 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     sds = [each.width_sd for each in grips]
     touch_sd = float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
     touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
+    surely = np.ones(t.size)
+    for each in grips:
+        last = min(each.stop, t.size) - 1
+        surely[(t > t[each.start] - SURELY) & (t < t[last] + SURELY)] = 0.0
     assert rig.gripper is not None
     wrong = _inertia(t, pose, tool, rig.gripper.turns, rig.gravity)
     timing = _timing(t, pose, np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)), fy, tool.noise)
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
-                   notes=(*_notes(trial, rig, tool), *strays),
+                   free=surely, notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip
 
 

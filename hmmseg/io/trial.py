@@ -36,7 +36,8 @@ class Trial:
     `touches` [s]: times of touch and release known apart from forces, with their standard deviations;
     `timing` (num_timesteps,) [s]: how uncertain it is when a force changed that changes there. Of a sensor
     in the wrist, whose forces are halved between the fingers, `inertia` (num_timesteps, 2) [N]: by how much
-    the tool's own share may be wrong across and up; None of fingertips.
+    the tool's own share may be wrong across and up, and `free` (num_timesteps,): 1 where the opening says
+    that nothing is held, 0 elsewhere; None of fingertips.
     """
 
     file: str
@@ -51,6 +52,7 @@ class Trial:
     touches: tuple[tuple[float, float], ...] = ()
     timing: np.ndarray | None = None
     inertia: np.ndarray | None = None
+    free: np.ndarray | None = None
 
     @staticmethod
     def read(source: Any, rig: Any = None, task: Any = None) -> Trial:

@@ -54,10 +54,9 @@ from hmmseg.online.layout import (
     D,
     Y,
 )
-from hmmseg.segmentation.emissions import ONE_FINGER, STRAY, TOUCHING
+from hmmseg.segmentation.emissions import ONE_FINGER, SHUT, STRAY, TOUCHING
 
 STILL = 0.2  # prior: share of samples at which a hand that may move stands still,
-SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # prior: ... times this while a lift begins: slow, but a motion
 ALIKE = 0.5  # prior: probability that a block not met yet is like one that was

@@ -28,6 +28,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
 
 TAIL = 4.0  # cited: degrees of freedom of the Student-t residuals
+SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's (foam giving late)
 STILL = 0.1  # prior: share of a carry's samples at which the block is held still
@@ -43,7 +44,8 @@ class Features:
     acceleration of the fingers; y: mean height [m]; d: distance of the fingers [m];
     `pads`: their nominal compliances [m/N].
     `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force of a
-    finger and press of both downwards [N]).
+    finger and press of both downwards [N]). `free`: 1 where a gripper's opening says that nothing is held,
+    None where nothing but forces tells.
     """
 
     t: np.ndarray
@@ -60,6 +62,7 @@ class Features:
     pads: Pads
     gravity: float
     span: dict[str, float]
+    free: np.ndarray | None = None
 
     @property
     def grip(self) -> np.ndarray:
@@ -199,6 +202,8 @@ def _log_likelihood(f: Features, subtask: Subtask, p: Parameters, trial: int, st
     grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
     fy, shear = force[:, 1] + force[:, 3], (force[:, 1] - force[:, 3]) / 2
     out = _log_between(grip, 0.0, span["force"], scale["force"])
+    if f.free is not None:
+        out += SHUT * (f.free == 1)
     out += log_student(net_x, scale["net_x"]) + log_student(shear, scale["shear"])
     width = p.width.get(str(subtask.object))
     if width is None:  # the first pass knows neither widths nor where a block rests

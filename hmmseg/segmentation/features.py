@@ -92,7 +92,7 @@ def features(signals: Signals, rig: Rig) -> Features:
         t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y,
         d=s.distance, sd_y=stated(s.sd_y, s.y), sd_d=2 * stated(s.sd_x, s.distance / 2),
         sd_vx=stated(s.sd_vx, s.vx), sd_vy=stated(s.sd_vy, s.vy),
-        pads=pads_of(rig), gravity=rig.gravity, span=span,
+        pads=pads_of(rig), gravity=rig.gravity, span=span, free=s.free,
     )  # fmt: skip
 
 

@@ -114,6 +114,21 @@ def test_the_tool_is_found_from_free_motion(performed):
     assert np.abs(force.mean(axis=0)).max() < 0.01
 
 
+def test_an_open_hand_at_rest_holds_nothing():
+    """It stands as wide open as the other block is for its first second, and forces tell little at 20 Hz."""
+    setup = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))
+    simulated = performances(1, seed=104)[0]
+    trial = read_trial(wrist_recording(simulated, setup, 4), wrist_rig(setup))
+    assert trial.channels["x2"][0] - trial.channels["x1"][0] == pytest.approx(BLOCKS["b"].width, abs=1e-4)
+    held = np.zeros(trial.t.size, bool)
+    for start, _, _, end in simulated.boundaries.reshape(2, 4):
+        held |= (trial.t > start) & (trial.t < end)
+    assert not (trial.free * held).any() and trial.free[~held].mean() > 0.8
+    (found,) = align([trial], TASK, wrist_rig(setup)).segmentations
+    assert found.failed is None
+    assert np.abs([s.end for s in found.spans[:-1]] - simulated.boundaries).max() < 0.05
+
+
 def test_a_missing_sample_is_bridged(performed):
     columns = wrist_recording(performed[0], PLAIN)
     whole = read_trial(columns, wrist_rig(PLAIN))
