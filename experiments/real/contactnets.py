@@ -21,7 +21,7 @@ from experiments.real.robot_gap import asked, published
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.mjcf.load import load_mjcf
 
-SEEN, TOSSES = 16, 24
+SEEN, TOSSES = 16, 20
 SOURCE_UNIT = 0.0524  # m: half of the published side
 POSE = {"x": "x", "y": "y", "z": "z", "qw": "qw", "qx": "qx", "qy": "qy", "qz": "qz"}
 

@@ -1,8 +1,9 @@
 """Real robots' logs against simulators of them: what the diagnosis says, as the docs tell it.
 
-    python -m experiments.real.robot_gap KIND FOLDER [--output FILE.json] [--figures DIR]
+    python -m experiments.real.robot_gap KIND FOLDER [--seconds S] [--output FILE.json] [--figures DIR]
 
-KIND is xl330 or so101, FOLDER that of the logs (see experiments/real/xl330.py, so101.py).
+KIND is xl330 or so101, FOLDER that of the logs (see experiments/real/xl330.py, so101.py). With --seconds, the
+middle S s of every log are taken.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.real.hiro_gap import rounded
 from experiments.saving import save
 from hmmseg_cli.figures.gap_robot import Drawn, draw_before_after, draw_signal
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
-from simgap.simulators.recording import read_recording
+from simgap.simulators.recording import Recording, read_recording
 from simgap.simulators.user import load_simulator
 
 HERE = Path(__file__).resolve().parent
@@ -60,12 +63,22 @@ def summary(found: RobotDiagnosis) -> dict:
     return done
 
 
-def run(kind: str, folder: Path, only: Sequence[str] = ()) -> RobotDiagnosis:
-    """The diagnosis of a kind's logs, or of those of these names alone."""
+def run(kind: str, folder: Path, only: Sequence[str] = (), seconds: float | None = None) -> RobotDiagnosis:
+    """The diagnosis of a kind's logs, or of those of these names alone, or of their middle `seconds`."""
     spec, pattern = KINDS[kind]
     simulator = load_simulator(f"{HERE / spec}")
     paths = [p for p in sorted(folder.glob(pattern)) if not only or p.stem in only]
-    return diagnose(simulator, [read_recording(p, simulator.channels) for p in paths], tell=print)
+    logs = [middle(read_recording(p, simulator.channels), seconds) for p in paths]
+    return diagnose(simulator, logs, tell=print)
+
+
+def middle(log: Recording, seconds: float | None) -> Recording:
+    """The middle `seconds` of a log; all of it by default."""
+    if seconds is None:
+        return log
+    centre = 0.5 * float(log.t[0] + log.t[-1])
+    first, last = np.searchsorted(log.t, [centre - 0.5 * seconds, centre + 0.5 * seconds])
+    return log.window(int(first), int(last))
 
 
 def published(found: RobotDiagnosis, name: str, output: Path | None, figures: Path | None) -> None:
@@ -82,6 +95,7 @@ def asked(doc: str, kinds: Sequence[str] = ()) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     if kinds:
         parser.add_argument("kind", choices=kinds)
+        parser.add_argument("--seconds", type=float, help="of the middle of every log; all of it by default")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--output", type=Path)
     parser.add_argument("--figures", type=Path, help="folder that figures go to, such as docs/figures")
@@ -91,7 +105,7 @@ def asked(doc: str, kinds: Sequence[str] = ()) -> argparse.Namespace:
 def main() -> None:
     """Run on a folder and write the results."""
     given = asked(__doc__ or "", sorted(KINDS))
-    published(run(given.kind, given.folder), given.kind, given.output, given.figures)
+    published(run(given.kind, given.folder, seconds=given.seconds), given.kind, given.output, given.figures)
 
 
 if __name__ == "__main__":

@@ -80,6 +80,7 @@ def main() -> None:
     parser.add_argument("models", type=Path)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cases", type=int, default=24)
+    parser.add_argument("--robots", nargs="+", default=sorted(set(TURNS)), help="cases of these alone")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--score", type=Path)
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -88,7 +89,7 @@ def main() -> None:
         given.out.mkdir(parents=True, exist_ok=True)
         for number in range(given.cases):
             path = given.out / f"{given.seed}_{number:04d}.json"
-            if not path.exists():
+            if TURNS[number % len(TURNS)] in given.robots and not path.exists():
                 found = case(number, given.seed, given.models)
                 path.write_text(json.dumps(found, indent=1), encoding="utf-8")
                 told = found["found"]

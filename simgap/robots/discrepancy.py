@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, lapack, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky, lapack, solve_triangular
 from scipy.optimize import minimize
 
 from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy, Source, total
@@ -69,7 +69,11 @@ def _multipliers(cov: Covariances, residual: np.ndarray, scale: Mapping[str, flo
     for block, number, noise, sources in zip(cov.blocks, cov.window, cov.noise, cov.sources, strict=True):
         own = cost.setdefault(number, 0.5 * (np.array(GRID) / SPREAD) ** 2)
         for i, g in enumerate(GRID):
-            factor = cholesky(total(noise, sources, scale, np.exp(g)), lower=True, check_finite=False)
+            try:
+                factor = cholesky(total(noise, sources, scale, np.exp(g)), lower=True, check_finite=False)
+            except LinAlgError:  # so large that the noise is lost in rounding
+                own[i] = np.inf
+                continue
             white = solve_triangular(factor, residual[block], lower=True, check_finite=False)
             own[i] += float(np.log(np.diag(factor)).sum() + 0.5 * white @ white)
     return {number: float(np.exp(GRID[int(own.argmin())])) for number, own in cost.items()}

@@ -86,11 +86,15 @@ def judge(
     name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
     small = set(causes) - set(kept)
     likely: dict[str, float] = {}
+    nothing = 0.0
     for m, w in zip(models, weight, strict=True):
-        if set(m.effects) - small:
-            key = "+".join(name(set(m.effects) - small))
+        # What takes the place of an effect that is too small to be told is none of the causes either.
+        mine = kept if kept and set(kept) <= set(m.effects) else tuple(set(m.effects) - small)
+        if mine:
+            key = "+".join(name(mine))
             likely[key] = likely.get(key, 0.0) + float(w)
-    nothing = float(sum(w for m, w in zip(models, weight, strict=True) if not set(m.effects) - small))
+        else:
+            nothing += float(w)
     probabilities = {"none": none, "unknown": (1 - none) * (nothing + (1 - nothing) * (1 - known))}
     probabilities |= {k: (1 - none) * known * v for k, v in likely.items() if (1 - none) * known * v > 1e-4}
     probabilities["other"] = max(0.0, 1.0 - sum(probabilities.values()))

@@ -159,9 +159,7 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
         t = since[mine]
         rate = linear.starts.get(f"{name}{RATE}")
         if regime == RESTS and name in linear.starts:
-            # The model starts where the body lies, and has gone to where it would lie itself.
-            column = mine - linear.starts[name][block]
-            out[f"{name}, {LIES}"] = Source(every, np.outer(column, column))
+            out[f"{name}, {LIES}"] = Source(np.flatnonzero(mine), np.ones((t.size, t.size)))
             continue
         if rate is not None and regime == STRIKES:
             response = _propagated(t, since, channel, rate[block])

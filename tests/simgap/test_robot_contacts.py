@@ -189,8 +189,7 @@ def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):
 
 
 def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
-    """The source of rest moves the height, which the board settles, and not the place, which the start
-    does."""
+    """By channel, alike at all samples of a window of rest, and in no other window."""
     from simgap.robots.linear import linearise
     from simgap.robots.model import Composed
     from simgap.robots.whiten import LIES, covariances
@@ -199,8 +198,12 @@ def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
     composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     linear = linearise(composed, {}, [])
     cov = covariances(linear, composed.windows, {n: c.kind for n, c in simulator.channels.items()})
-    still = next(i for i, n in enumerate(cov.window) if composed.windows[n].regime == RESTS)
-    rows = composed.rows.channel[cov.blocks[still]]
-    height, place = (np.diag(cov.sources[still][f"{a}, {LIES}"].covariance) for a in "zx")
-    assert height[rows == 2] == pytest.approx(1.0, abs=0.1)
-    assert np.abs(place[rows == 0]).max() < 0.1
+    for number, block, sources in zip(cov.window, cov.blocks, cov.sources, strict=True):
+        lying = {n: s for n, s in sources.items() if n.endswith(LIES)}
+        assert len(lying) == (len(POSE) if composed.windows[number].regime == RESTS else 0)
+        for name, source in lying.items():
+            column = np.zeros(block.size)
+            column[source.rows] = 1.0
+            channel = composed.rows.channels.index(name.split(",")[0])
+            assert (column == (composed.rows.channel[block] == channel)).all()
+            assert (source.covariance == 1.0).all()
