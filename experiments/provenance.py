@@ -19,7 +19,10 @@ FIGURES = {
     "sequences": ("sequences",),
     "bench-watch": ("watch_lag",),
     "blind-check": ("gap_reliability",),
-    "real": ("hiro_gap", "way_eeg_gal", "xl330_signal", "xl330_before_after"),
+    "real": (
+        "hiro_gap", "way_eeg_gal", "xl330_signal", "xl330_before_after",
+        "contactnets_signal", "contactnets_before_after",
+    ),
     "readme-figures": ("demo_segments", "play"),
 }  # fmt: skip
 

@@ -97,10 +97,6 @@ def diagnose_robot(
     from simgap.robots.diagnose import STAGES, diagnose
     from simgap.simulators.recording import read_recording
 
-    if task is not None:
-        raise InputError(
-            f"--task {task}", "does not go with a simulator of your own yet: phases are told by motion"
-        )
     more: list = []
     length = None
     if own.simulator is not None:
@@ -120,6 +116,12 @@ def diagnose_robot(
         more = loaded.effects(recordings)
         for warning in loaded.warnings:
             out.warn(warning)
+    phases = None
+    if task is not None:
+        from hmmseg.io.task import read_task
+        from simgap.robots.task_phases import phases_by_task
+
+        phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with out.progress("diagnosing", total=STAGES) as advance:
         found = diagnose(
             at_risk,
@@ -128,6 +130,7 @@ def diagnose_robot(
             seed=out.seed,
             more=more,
             length=length,
+            phases=phases,
             tell=lambda text: advance(1),
             warn=out.warn,
         )

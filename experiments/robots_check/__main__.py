@@ -1,6 +1,7 @@
 """Seeded faults in robots that others modelled, diagnosed and scored once.
 
     python -m experiments.robots_check MODELS --seed 1 --cases 24 --out DIR    # resumable: done cases stay
+    python -m experiments.robots_check MODELS --seed 2 --cases 24 --robots reacher --out DIR
     python -m experiments.robots_check MODELS --score DIR                      # writes experiments/results
 
 MODELS is a folder of unzipped wheels (`make robots-models` fetches them). Every case: a package's model with
@@ -15,6 +16,7 @@ import argparse
 import json
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +34,14 @@ COUNT = {"healthy": 0, "single": 1, "pair": 2, "dense": 4, "outside": 1}
 TURNS = ("pendulum", "ur5e", "pendulum", "manipulator", "pendulum")
 
 
-def case(number: int, seed: int, models: Path) -> dict:
+def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> dict:
     """One case: drawn, recorded, diagnosed."""
     from simgap.robots.describe import body
     from simgap.robots.diagnose import diagnose
     from simgap.simulators.mjcf.load import load_mjcf
 
     rng = np.random.default_rng([seed, number])
-    robot = next(r for r in ROBOTS if r.name == TURNS[number % len(TURNS)])
+    robot = next(r for r in ROBOTS if r.name == turns[number % len(turns)])
     kind = KINDS[number % len(KINDS)]
     xml = nominal_xml(robot, models, rng)
     sizes = usual(robot, xml)
@@ -80,7 +82,7 @@ def main() -> None:
     parser.add_argument("models", type=Path)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cases", type=int, default=24)
-    parser.add_argument("--robots", nargs="+", default=sorted(set(TURNS)), help="cases of these alone")
+    parser.add_argument("--robots", nargs="+", default=TURNS, help="that take turns")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--score", type=Path)
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -89,8 +91,8 @@ def main() -> None:
         given.out.mkdir(parents=True, exist_ok=True)
         for number in range(given.cases):
             path = given.out / f"{given.seed}_{number:04d}.json"
-            if TURNS[number % len(TURNS)] in given.robots and not path.exists():
-                found = case(number, given.seed, given.models)
+            if not path.exists():
+                found = case(number, given.seed, given.models, given.robots)
                 path.write_text(json.dumps(found, indent=1), encoding="utf-8")
                 told = found["found"]
                 print(
