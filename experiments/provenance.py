@@ -21,7 +21,7 @@ FIGURES = {
     "blind-check": ("gap_reliability",),
     "real": (
         "hiro_gap", "way_eeg_gal", "xl330_signal", "xl330_before_after",
-        "contactnets_signal", "contactnets_before_after",
+        "contactnets",
     ),
     "readme-figures": ("demo_segments", "play"),
 }  # fmt: skip

@@ -99,6 +99,7 @@ def asked(doc: str, kinds: Sequence[str] = ()) -> argparse.Namespace:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--output", type=Path)
     parser.add_argument("--figures", type=Path, help="folder that figures go to, such as docs/figures")
+    parser.add_argument("--drawn", action="store_true", help="draw what was found before, where that serves")
     return parser.parse_args()
 
 
