@@ -168,8 +168,9 @@ def _finish(data: list[Features], task: SequenceTask, mapping: FeatureMap, learn
     settled = learner.num_states > len(task.sequence)
     model = SequenceModel(task, mapping, emissions, mean_cells, presence, settled, detectors, typical,
                           np.tile([0.0, np.inf], (2, 1)))  # fmt: skip
-    per_trial = [
-        sequence_misfit.scores(emissions.log_likelihoods(each.values), mean_cells, alignment)
-        for each, alignment in zip(data, replace(model, detectors=None).align(data), strict=True)
-    ]
+    per_trial = []
+    for each in data:
+        judge = model.judge(each)
+        ll = judge.emissions.log_likelihoods(each.values)
+        per_trial.append(sequence_misfit.scores(ll, mean_cells, judge.align([each])[0]))
     return replace(model, misfit=sequence_misfit.reference(per_trial))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from hmmseg.sequence.features import FeatureMap, Features
 from hmmseg.sequence.transitions import Transitions, transitions
 
 FORMAT = "hmmseg.sequence-model/3"
+INDEPENDENT = 250.0  # chosen: independent observations that one trial's fit is judged by in the limit of many
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,15 @@ class SequenceModel:
     def weights(self, trial: Features) -> tuple[np.ndarray, Bands]:
         """Log-likelihoods (num_cells, num_states) and transition bands of one trial."""
         return weights(trial.values, self.emissions, self.detectors, self.transitions.bands)
+
+    def judge(self, trial: Features) -> SequenceModel:
+        """The model that tells whether a trial fits: without templates, which have no counterpart in free
+        switching; where no labels taught it, with evidence coarsened (hmmseg.sequence.naming)."""
+        if self.detectors is not None:
+            return replace(self, detectors=None)
+        temper = self.emissions.temper
+        coarsened = temper * INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
+        return replace(self, emissions=replace(self.emissions, temper=coarsened))
 
     def align(self, trials: list[Features]) -> list[Alignment]:
         """Posterior alignments; InfeasibleAlignment for a trial with fewer cells than subtasks."""

@@ -55,7 +55,7 @@ def _segment(trial: Trial, data: Features, model: SequenceModel) -> Segmentation
     if any(span.alternatives for span in spans):
         question = Question(trial.file, names[int(known.gain.argmax()) + 1], float(known.gain.max()))
     return Segmentation(trial.file, trial.rate, alignment.log_evidence, spans,
-                        _failure(data, model, alignment), recorded=trial, question=question)  # fmt: skip
+                        _failure(data, model), recorded=trial, question=question)  # fmt: skip
 
 
 def _posterior(data: Features, model: SequenceModel, alignment: Alignment) -> Boundaries:
@@ -70,14 +70,11 @@ def _posterior(data: Features, model: SequenceModel, alignment: Alignment) -> Bo
     return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
 
 
-def _failure(data: Features, model: SequenceModel, alignment: Alignment) -> Failure | None:
-    names = model.task.sequence
-    plain = alignment
-    if model.detectors is not None:  # templates have no counterpart in free switching
-        plain = type(model)(**{**vars(model), "detectors": None}).align([data])[0]
+def _failure(data: Features, model: SequenceModel) -> Failure | None:
+    judge = model.judge(data)
     return sequence_misfit.find_failure(
-        names, optional_states(model.task, False), model.typical, model.misfit,
-        model.emissions.log_likelihoods(data.values), model.mean_cells, plain,
+        model.task.sequence, optional_states(model.task, False), model.typical, model.misfit,
+        judge.emissions.log_likelihoods(data.values), model.mean_cells, judge.align([data])[0],
     )  # fmt: skip
 
 
