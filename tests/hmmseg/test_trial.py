@@ -192,7 +192,7 @@ def test_readings_that_no_sensor_gives_are_refused():
 def test_files_refused(tmp_path):
     for name, content, message in [
         ("a.doc", b"t\n", r"a\.doc: unknown kind of file '.doc'; expected .csv, .tsv, "),
-        ("a.csv", b"t,\xe9\n", r"a\.csv: cannot be read .*; expected a table with a header row"),
+        ("a.csv", b"t,\x00\xe9\n", r"a\.csv: cannot be read .*; expected a table with a header row"),
         ("a.parquet", b"not parquet", r"a\.parquet: cannot be read "),
         ("a.npz", b"not npz", r"a\.npz: is no archive of NumPy"),
         ("b.npz", b"", r"b\.npz: is no archive of NumPy"),
