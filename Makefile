@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -63,6 +63,14 @@ bench-solvers: $(INSTALLED)  ## optimistix and SciPy beside our own solver on th
 
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
 	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.write_tables
+
+bench-batch: $(INSTALLED)  ## a thousand trials from CSV to segments; fills docs/benchmarks.md
+	$(BIN)/python -m experiments.benchmarks.batch recordings/paper_blocks
+	$(BIN)/python -m experiments.write_tables
+
+bench-haptic: $(INSTALLED)  ## a minute of the virtual model at 4 kHz beside loops that do nothing (real-time priority: as root); fills docs/virtual_model.md
+	$(BIN)/python -m experiments.benchmarks.haptic_loop --seconds 60 --realtime
 	$(BIN)/python -m experiments.write_tables
 
 bench-long: $(INSTALLED)  ## time and memory over four decades of samples; fills docs/benchmarks.md

@@ -91,15 +91,56 @@ def commands() -> str | None:
     found = load("benchmark_commands")
     if found is None:
         return None
-    rows = [
-        [name, f"{1e3 * s['processor']:.0f} ms", percent(s["share"], 0)]
-        for name, s in found["stages"].items()
+    tables = [
+        markdown(
+            [f"stage of `{command}`", "processor", "share"],
+            [[name, f"{1e3 * s['processor']:.0f} ms", percent(s["share"], 0)] for name, s in stages.items()],
+        )
+        for command, stages in found["stages"].items()
     ]
-    told = "; ".join(f"`hmmseg {name}` {v['warm']:.1f} s warm" for name, v in found["commands"].items())
-    return (
-        markdown(["stage of `segment`", "processor", "share"], rows)
-        + f"\n\nWhole commands, processor: {told}."
+    told = "; ".join(
+        f"`hmmseg {name}` {v['warm']:.1f} s warm, {v['first']:.0f} s the first time ever"
+        for name, v in found["commands"].items()
     )
+    return "\n\n".join([*tables, f"Whole commands, processor: {told}."])
+
+
+def batch() -> str | None:
+    """docs/benchmarks.md: many trials, each by itself."""
+    found = load("benchmark_batch")
+    if found is None:
+        return None
+    rows = [
+        [f"{found['trials']:,}", f"{run['workers']}", f"{run['wall']:.0f} s", f"{run['processor']:.0f} s",
+         f"{1e3 * run['processor'] / found['trials']:.0f} ms"]
+        for run in found["runs"]
+    ]  # fmt: skip
+    told = (
+        f"{found['complete']:,} fit their task. Load of the {found['cores']} cores beside it: "
+        f"{found['load']:.0f}. Digits from 1, 2 and 3 workers ({found['compared']} trials): "
+        f"{'the same' if found['same_digits'] else 'NOT the same'}."
+    )
+    return markdown(["trials", "workers", "time", "processor", "a trial"], rows) + f"\n\n{told}"
+
+
+def haptic() -> str | None:
+    """docs/virtual_model.md: the haptic loop beside one that does nothing."""
+    found = load("haptic_loop")
+    if found is None:
+        return None
+    rate = found["rate"]
+    rows = [
+        ["two blocks", f"{rate['median_us']:.0f} µs", f"{rate['p99_9_us']:.0f} µs",
+         f"{rate['worst_us'] / 1e3:.2f} ms", f"{rate['late']} of {rate['steps']:,}"],
+        ["as long, spinning", "", f"{rate['spinning_loop_p99_9_us']:.0f} µs",
+         f"{rate['spinning_loop_worst_us'] / 1e3:.2f} ms", f"{rate['spinning_loop_late']}"],
+        ["empty", "", "", f"{rate['empty_loop_worst_us'] / 1e3:.2f} ms", f"{rate['empty_loop_late']}"],
+    ]  # fmt: skip
+    told = (
+        f"Programs compiled in the loop: {rate['programs_compiled_in_the_loop']}; bytes grown in 10,000 "
+        f"steps: {rate['grown_bytes_in_10000_steps']} (the interpreter's own)."
+    )
+    return markdown(["loop", "median", "99.9 %", "worst", "late"], rows) + f"\n\n{told}"
 
 
 def lengths() -> str | None:
@@ -108,7 +149,7 @@ def lengths() -> str | None:
     if found is None:
         return None
     rows = [
-        [f"{row['rows']:,}", row["from"], f"{row['found']} of {row['rounds']}", f"{row['wall']:.1f} s",
+        [f"{row['rows']:,}", row["from"], f"{row['found']} of {row['rounds']}", _wall(row),
          f"{row['processor']:.1f} s", f"{1e6 * row['processor'] / row['rows']:.1f} µs",
          f"{row['memory_mb']:.0f} MB", {True: "yes", False: "NO", None: ""}[row.get("same_answer")]]
         for row in found["lengths"]
@@ -117,6 +158,12 @@ def lengths() -> str | None:
             "as in one piece"]  # fmt: skip
     _draw_lengths(found["lengths"])
     return markdown(head, rows)
+
+
+def _wall(row: dict) -> str:
+    """Time on the clock, with the load beside which it means little."""
+    busy = row.get("load", 0.0) > row.get("cores", 1)
+    return f"{row['wall']:.1f} s" + (f" (load {row['load']:.0f})" if busy else "")
 
 
 def _draw_lengths(rows: list[dict]) -> None:

@@ -179,6 +179,8 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/benchmarks.md", "smoothing", table_speed.smoothing, "bench"),
     ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),
     ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
+    ("docs/benchmarks.md", "batch", table_speed.batch, "bench-batch"),
+    ("docs/virtual_model.md", "haptic", table_speed.haptic, "bench-haptic"),
     ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
     ("docs/benchmarks.md", "solvers", table_speed.solvers, "bench-solvers"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),

@@ -21,6 +21,9 @@ class InputError(ValueError):
         self.problem = problem
         self.expected = expected
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return type(self), (self.where, self.problem, self.expected)
+
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Phrase naming the known word nearest to `word`, for error messages."""

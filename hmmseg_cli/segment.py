@@ -12,7 +12,8 @@ import typer
 
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask, read_task
-from hmmseg.segmentation.tables import spans_table
+from hmmseg.segmentation.tables import spans_table, trials_table
+from hmmseg_cli.batch import SchedulerOption, WorkersOption, recordings_in, segment_apart
 from hmmseg_cli.console import (
     FiguresOption,
     JsonOption,
@@ -55,26 +56,41 @@ def segment(
     method: Annotated[Method, typer.Option(help="hmm, or the paper's thresholds.")] = Method.HMM,
     force_threshold: ForceThreshold = 0.05, velocity_threshold: VelocityThreshold = 0.05,
     write: WriteOption = None, json: JsonOption = None, figures: FiguresOption = None, seed: SeedOption = 0,
-    quiet: QuietOption = False,
+    quiet: QuietOption = False, workers: WorkersOption = None, scheduler: SchedulerOption = None,
 ) -> None:  # fmt: skip
-    """Segment recordings into the task's subtasks, with the uncertainty of every boundary."""
+    """Segment recordings into the task's subtasks, with the uncertainty of every boundary.
+
+    With --workers or --scheduler each recording is fitted by itself, not pooled with the others, and a folder
+    stands for the recordings in it.
+    """
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
-        paths = distinct_trials(trials)
+        apart = workers is not None or scheduler is not None
+        paths = distinct_trials(recordings_in(trials) if apart else trials)
         check_destination(write, paths)
         description = read_task(task)
         if isinstance(description, SequenceTask):
+            if apart:
+                raise InputError("--workers, --scheduler", "go with tasks of blocks alone")
             recordings, found = _segment_sequence(out, paths, description, rig, model, method)
         else:
             if rig is None:
                 raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
             if model is not None:
                 raise InputError(f"--model {model}", "goes only with a plain ordered task")
-            thresholds = (force_threshold, velocity_threshold)
-            recordings, found = _segment_blocks(
-                out, paths, description, rig, method, thresholds, figures is None and write is None
-            )
+            if apart:
+                if write is not None or figures is not None or method is not Method.HMM:
+                    raise InputError("--workers, --scheduler", "go with --json alone")
+                recordings, found = [], _segment_apart(out, paths, task, rig, workers, scheduler)
+            else:
+                thresholds = (force_threshold, velocity_threshold)
+                recordings, found = _segment_blocks(
+                    out, paths, description, rig, method, thresholds, figures is None and write is None
+                )
+        if apart:
+            out.print(trials_table(found))
         for segmentation in found:
-            out.print(spans_table(segmentation))
+            if not apart:
+                out.print(spans_table(segmentation))
             warn_of_misfit(out, segmentation)
         warn_of_rig(out, found)
         question = ask(out, found)
@@ -111,6 +127,21 @@ def _segment_blocks(
     return recordings, found
 
 
+def _segment_apart(
+    out: Output, paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None
+) -> list[Segmentation]:
+    """Each recording by itself, in other processes."""
+    found = []
+    with out.progress("segmenting", len(paths)) as advance:
+        for each in segment_apart(paths, task, rig, workers, scheduler, advance):
+            for warning in each.warnings:
+                out.warn(warning)
+            for note in each.notes:
+                out.print(note)
+            found.append(each.segmentation)
+    return found
+
+
 def _on_disk(paths: Sequence[Path], task: BlockTask, rig: Rig) -> bool:
     """Whether recordings are of a repeated task and too long to be read at once."""
     from hmmseg.io.long import is_long
@@ -119,7 +150,7 @@ def _on_disk(paths: Sequence[Path], task: BlockTask, rig: Rig) -> bool:
 
 
 def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig) -> list[Segmentation]:
-    """Each recording by itself, from disk; what cannot be is judged by its first piece."""
+    """Each recording by itself, from disk; what cannot be is judged by its beginning."""
     from hmmseg.hand.plausibility import check
     from hmmseg.io.long import LongRecording
     from hmmseg.segmentation.align import segment_long
@@ -127,7 +158,7 @@ def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig)
     found = []
     for path in paths:
         recording = LongRecording(path, rig)
-        for warning in check(recording.rows(0, min(recording.piece, recording.t.size)), rig):
+        for warning in check(recording.beginning(), rig):
             out.warn(warning)
         found.append(segment_long(recording, task, rig))
     return found

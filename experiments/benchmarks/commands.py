@@ -1,25 +1,30 @@
-"""Where the time of a command goes: stages of `segment` and whole commands, processor time, warm.
+"""Where the time of a command goes: stages of `segment` and `identify`, and whole commands, processor time.
 
     python -m experiments.benchmarks.commands RECORDING_FOLDER
 
-Writes experiments/results/benchmark_commands.json. Each figure is the least of five; every run is a
-process of its own, so that imports count.
+Writes experiments/results/benchmark_commands.json. Each figure is the least of three; every run is a
+process of its own, so that imports count. The first run ever is one with an empty cache folder, where all
+kernels and programs are compiled.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
+import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 from experiments.saving import save
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_commands.json"
-REPEATS = 5
-# Each program ends where its stage does; a stage is the difference to the one before.
+REPEATS = 3
+# Each program ends where its stage does; a stage is the difference to the one before. The last is no part of
+# a command: what the stage before would cost where all is loaded.
 STAGES = {
     "Python and the command line": "import hmmseg_cli.main",
     "reading task, rig and trial": (
@@ -33,14 +38,35 @@ STAGES = {
     "first segmentation (kernels from the disk)": "a.segment([trial], task, rig)",
     "one more segmentation": "a.segment([trial], task, rig)",
 }
+IDENTIFY_STAGES = {
+    "Python and the command line": STAGES["Python and the command line"],
+    "reading task, rig and trial": STAGES["reading task, rig and trial"],
+    "loading the segmentation, the estimation and kernels": (
+        STAGES["loading the segmentation and its kernels"] + "; import estimation.identification as e"
+    ),
+    "first segmentation (kernels from the disk)": "found = a.align([trial], task, rig)",
+    "properties": "e.identify_aligned(found)",
+    "properties once more": "e.identify_aligned(found)",
+}
 
 
-def processor(arguments: list[str]) -> float:
-    """Processor time [s] of a process, user and system."""
+def processor(arguments: list[str], cache: str | None = None) -> float:
+    """Processor time [s] of a process, user and system; `cache`: another folder for what is compiled."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+    env = os.environ | ({} if cache is None else {"XDG_CACHE_HOME": cache})
+    subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=env)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def staged(stages: dict[str, str], files: dict[str, str]) -> dict[str, dict[str, float]]:
+    """Processor time [s] of each stage, and its share of what a command does: all but the last."""
+    lines, totals = [], [0.0]
+    for line in stages.values():
+        lines.append(line.format(**files))
+        totals.append(min(processor(["-c", "\n".join(lines)]) for _ in range(REPEATS)))
+    each = [after - before for before, after in pairwise(totals)]
+    return {name: {"processor": s, "share": s / totals[-2]} for name, s in zip(stages, each, strict=True)}
 
 
 def main() -> None:
@@ -50,21 +76,16 @@ def main() -> None:
     folder = parser.parse_args().folder
     files = {name: str(folder / f"{name}.toml") for name in ("rig", "task")}
     files["trial"] = str(sorted(folder.glob("trial_*.csv"))[0])
-    programs, lines = [], []
-    for line in STAGES.values():
-        lines.append(line.format(**files))
-        programs.append("\n".join(lines))
-    totals = [min(processor(["-c", program]) for _ in range(REPEATS)) for program in programs]
-    each = [b - a for a, b in zip([0.0, *totals], totals, strict=False)]
-    # What one command does: all but the segmentation made once more.
-    whole = sum(each[:-1])
-    stages = {name: {"processor": s, "share": s / whole} for name, s in zip(STAGES, each, strict=True)}
+    stages = {"segment": staged(STAGES, files), "identify": staged(IDENTIFY_STAGES, files)}
     commands = {}
-    for name in ("segment", "identify"):
+    for name in stages:
         given = ["--task", files["task"], "--rig", files["rig"], "--quiet"]
         arguments = ["-m", "hmmseg_cli.main", name, files["trial"], *given]
+        with tempfile.TemporaryDirectory() as empty:
+            first = processor(arguments, cache=empty)
         processor(arguments)
-        commands[name] = {"warm": min(processor(arguments) for _ in range(REPEATS))}
+        warm = min(processor(arguments) for _ in range(REPEATS))
+        commands[name] = {"warm": warm, "first": first}
     document = {"repeats": REPEATS, "stages": stages, "commands": commands}
     save(OUT, document)
     print(json.dumps(document, indent=1))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -35,6 +36,7 @@ from hmmseg.segmentation.align import segment, segment_long
 OUT = Path(__file__).parents[1] / "results" / "benchmark_long.json"
 ROUNDS = (1, 10, 100, 360, 1000)  # an hour of 10 s rounds among them
 SAME = 1e-9  # numerics: s; what the order of sums may change from process to process
+KINDS = (".parquet", ".npz")
 IN_MEMORY = 100  # numerics: rounds up to which the same is done in one piece
 
 
@@ -97,6 +99,7 @@ def main() -> None:
     parser.add_argument("--file", type=Path, help="measure this recording alone, as JSON")
     parser.add_argument("--in-memory", action="store_true")
     parser.add_argument("--rounds", type=int, nargs="+", default=ROUNDS)
+    parser.add_argument("--kinds", nargs="+", default=KINDS, help="of files; what is not measured stays")
     args = parser.parse_args()
     if args.file is not None:
         print(json.dumps(measure(args.case, args.file, args.in_memory)))
@@ -105,7 +108,7 @@ def main() -> None:
     _, rig = performed(args.case)
     with tempfile.TemporaryDirectory() as folder:
         for rounds in args.rounds:
-            for kind in (".parquet", ".npz"):
+            for kind in args.kinds:
                 path = Path(folder) / f"long{kind}"
                 write(args.case, rig, rounds, path)
                 row = _row(args.case, path, rounds, False)
@@ -120,7 +123,10 @@ def main() -> None:
                 rows.append(row)
                 print(row, flush=True)
                 path.unlink()
-    save(OUT, {"lengths": rows})
+    measured = {(row["rows"], row["from"]): row for row in rows}
+    kept = json.loads(OUT.read_text())["lengths"] if OUT.exists() else []
+    merged = {(row["rows"], row["from"]): row for row in kept} | measured
+    save(OUT, {"lengths": [merged[key] for key in sorted(merged, key=lambda key: key[0])]})
 
 
 def _row(case: Path, path: Path, rounds: int, in_memory: bool) -> dict:
@@ -128,7 +134,8 @@ def _row(case: Path, path: Path, rounds: int, in_memory: bool) -> dict:
     done = subprocess.run(command + ["--in-memory"] * in_memory, check=True, capture_output=True, text=True)
     count = rows_of(path, kind_of(path))
     kind = "in one piece" if in_memory else {".parquet": "Parquet", ".npz": "NPZ"}[path.suffix]
-    return {"rows": count, "rounds": rounds, "from": kind} | json.loads(done.stdout)
+    load = {"load": os.getloadavg()[0], "cores": os.cpu_count()}
+    return {"rows": count, "rounds": rounds, "from": kind} | load | json.loads(done.stdout)
 
 
 if __name__ == "__main__":

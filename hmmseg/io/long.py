@@ -14,7 +14,8 @@ from hmmseg.io.formats import kind_of, pieces_of, rows_of, split_part
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import MIN_SAMPLES, Trial, channels_of, trial_of
 
-PIECE = 50_000  # numerics: rows of one piece
+PIECE = 20_000  # numerics: rows of one piece; a piece of 50,000 rows and what is made of it takes 20 MB more
+JUDGED = 50_000  # numerics: rows at the beginning by which a recording's habits are judged
 LONG = 1_000_000  # chosen: rows from which on a recording is read in pieces: 13 columns of it are 100 MB
 
 
@@ -65,6 +66,10 @@ class LongRecording:
             {n: np.concatenate([e.channels[n] for e in trials])[start - first : stop - first] for n in names},
             self._origin,
         )  # fmt: skip
+
+    def beginning(self) -> Trial:
+        """As many rows as its habits are judged by."""
+        return self.rows(0, min(JUDGED, self.t.size))
 
     @property
     def _last(self) -> int:

@@ -51,7 +51,7 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     lifted = fy[moving & np.isfinite(fy)]
     span = max(f.span["force"] for f in features)
     weight = max(float(np.median(lifted)) if lifted.size else 0.0, 3 * noise, 0.01 * span)
-    names = {str(s.object) for s in subtasks if s.state != FREE}
+    names = [str(s.object) for s in subtasks if s.state != FREE]  # in order: sums depend on it
     scale = {
         "force": max(noise, 1e-6), "carry": 0.3 * weight, "net_x": 0.1 * span, "shear": 0.1 * span,
         "velocity": 0.01, "level": 1e-3, "width": 1e-3,

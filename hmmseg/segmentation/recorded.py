@@ -51,13 +51,12 @@ class InMemory:
 class OnDisk:
     """Signals read anew whenever they are asked for.
 
-    Whether velocities come late is judged by the first piece: a drive does not change its habits.
+    Whether velocities come late is judged by its beginning: a drive does not change its habits.
     """
 
     def __init__(self, recording: LongRecording, rig: Rig) -> None:
         self.recording, self.rig = recording, rig
-        first = recording.rows(0, min(recording.piece, recording.t.size))
-        self._late = come_late(first, rig)
+        self._late = come_late(recording.beginning(), rig)
 
     @property
     def t(self) -> np.ndarray:

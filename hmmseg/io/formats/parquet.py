@@ -39,7 +39,8 @@ def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator
     """Tables of at most `rows` rows each, in order: a long file in bounded memory."""
     with pq.ParquetFile(path, pre_buffer=False) as file:  # which would hold all of the file
         names, first = file.schema_arrow.names, 1
-        for batch in file.iter_batches(batch_size=rows, columns=_chosen(names, wanted)):
+        chosen = _chosen(names, wanted)  # by one thread: each has a memory of its own
+        for batch in file.iter_batches(batch_size=rows, columns=chosen, use_threads=False):
             columns = to_columns(pa.Table.from_batches([batch]))
             numbers = np.arange(first, first + batch.num_rows)
             first += batch.num_rows
@@ -60,6 +61,9 @@ def to_columns(table: pa.Table) -> dict[str, np.ndarray]:
 
 def _array(column: pa.ChunkedArray) -> np.ndarray:
     kind = column.type
+    if len(column) and column.num_chunks == 1 and not column.null_count and pa.types.is_float64(kind):
+        numbers = column.chunk(0)  # as they lie there: to_numpy imports pandas, some 50 MB
+        return np.frombuffer(numbers.buffers()[1], np.float64, len(numbers), 8 * numbers.offset)
     if pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind):
         if column.null_count:
             return np.array(column.to_pylist(), dtype=object)

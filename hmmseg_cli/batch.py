@@ -1,0 +1,148 @@
+"""Many recordings, each fitted by itself: in processes of this machine, or on a Dask cluster.
+
+What comes of a recording depends on nothing but it, its task and its rig: so neither on how many
+processes there are nor on who is done first.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hmmseg.errors import InputError
+
+if TYPE_CHECKING:
+    from hmmseg.io.rig import Rig
+    from hmmseg.io.task import BlockTask
+    from hmmseg.segmentation.spans import Segmentation
+
+WorkersOption = Annotated[int | None, typer.Option(
+    "--workers", metavar="N", min=1, help="Fit each recording by itself, in so many processes.")]  # fmt: skip
+SchedulerOption = Annotated[str | None, typer.Option(
+    "--scheduler", metavar="ADDRESS",
+    help="The same on a Dask cluster, as tcp://host:8786; local: one of this machine.")]  # fmt: skip
+LOCAL = "local"
+CHUNK = 4  # numerics: recordings that a process is handed at once
+PATIENCE = 10.0  # limit: s; how long a cluster is waited for
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """What a worker found in one recording."""
+
+    segmentation: Segmentation
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def recordings_in(paths: Sequence[Path]) -> list[Path]:
+    """The paths, plain folders replaced by the recordings in them, in the order of their names.
+
+    A recording in a .txt file has to be named: in a folder it might be notes.
+    """
+    from hmmseg.io.formats import KINDS, kind_of
+
+    out: list[Path] = []
+    for path in paths:
+        try:
+            data_set = not path.is_dir() or bool(kind_of(path))
+        except InputError:
+            data_set = False
+        if data_set:
+            out.append(path)
+            continue
+        kinds = [kind for kind in KINDS if kind != ".txt"]
+        inside = sorted(p for p in path.iterdir() if p.suffix.lower() in kinds and p.is_file())
+        if not inside:
+            raise InputError(str(path), "no recordings in this folder", ", ".join(kinds))
+        out += inside
+    return out
+
+
+@functools.cache
+def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
+    from hmmseg.io.rig import read_rig
+    from hmmseg.io.task import BlockTask, read_task
+
+    description = read_task(task)
+    assert isinstance(description, BlockTask)
+    return description, read_rig(rig)
+
+
+def segment_each(paths: Sequence[Path], task: Path, rig: Path) -> list[Segmented]:
+    """Segmentations of recordings that have nothing to do with each other; runs in a worker."""
+    from hmmseg.io.trial import read_trial
+    from hmmseg.segmentation.align import segment
+
+    description, hand = _lab(task, rig)
+    found = []
+    for path in paths:
+        trial = read_trial(path, hand)
+        segmentation = replace(segment([trial], description, hand)[0], recorded=None)
+        found.append(Segmented(segmentation, tuple(trial.warnings), tuple(trial.notes)))
+    return found
+
+
+def segment_apart(
+    paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
+    advance: Callable[[int], None],
+) -> Iterator[Segmented]:  # fmt: skip
+    """What `segment_each` finds, in the order of the paths; `advance` is told how many more are done.
+
+    InputError where a recording or the cluster is at fault; what has not begun then is not begun.
+    """
+    given = [paths[i : i + CHUNK] for i in range(0, len(paths), CHUNK)]
+    lab = task.absolute(), rig.absolute()
+    with _executor(workers, scheduler) as executor:
+        futures = [executor.submit(segment_each, [p.absolute() for p in part], *lab) for part in given]
+        try:
+            for part, future in zip(given, futures, strict=True):
+                found = future.result()
+                advance(len(part))
+                for path, each in zip(part, found, strict=True):
+                    yield replace(each, segmentation=replace(each.segmentation, file=str(path)))
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+@contextmanager
+def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
+    """Processes of this machine, or a cluster's workers."""
+    if scheduler is None:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
+            yield pool
+        return
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        raise InputError("--scheduler", "needs Dask, which is not installed",
+                         "pip install 'hmmseg[cluster]'") from None  # fmt: skip
+    settings: dict[str, Any] = {"address": scheduler, "timeout": PATIENCE}
+    if scheduler == LOCAL:
+        settings = {"n_workers": workers or os.cpu_count(), "threads_per_worker": 1, "processes": True,
+                    "dashboard_address": None, "silence_logs": logging.ERROR}  # fmt: skip
+    try:
+        client = Client(**settings)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--scheduler {scheduler}", "no scheduler answers there",
+                         "an address as tcp://host:8786, or local") from error  # fmt: skip
+    with client:
+        yield client.get_executor()
+
+
+def _one_thread() -> None:
+    """Before NumPy is imported in a worker: as many threads as there are workers are enough."""
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")

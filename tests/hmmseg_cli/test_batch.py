@@ -1,0 +1,108 @@
+"""Recordings segmented apart: the same digits from any number of workers and from a cluster."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hmmseg.errors import InputError
+from hmmseg.example import example_folder
+from hmmseg_cli.batch import recordings_in
+from hmmseg_cli.main import main
+
+STACK = Path(__file__).parents[1] / "data/stack"
+TRIALS = sorted(STACK.glob("trial_*.csv"))[:3]
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(example_folder() / "task.toml", tmp_path / "task.toml")
+    shutil.copyfile(STACK / "rig.toml", tmp_path / "rig.toml")
+    (tmp_path / "many").mkdir()
+    for i in range(6):  # more than a worker takes at once; no two of them the same
+        lines = TRIALS[i % len(TRIALS)].read_text().splitlines(keepends=True)
+        (tmp_path / f"many/{i}.csv").write_text("".join(lines[: len(lines) - i]))
+    (tmp_path / "many/notes.txt").write_text("of the day")
+    return tmp_path
+
+
+def segmented(lab, *arguments, trials="many"):
+    """The JSON of a process: workers start from a program of its own, as users' do."""
+    command = [sys.executable, "-W", "error", "-m", "hmmseg_cli.main", "segment", trials, "--task",
+               "task.toml", "--rig", "rig.toml", "--json", "out.json", "--quiet", *arguments]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, cwd=lab)
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads((lab / "out.json").read_text())
+
+
+def test_digits_do_not_depend_on_who_works(lab):
+    one, three = segmented(lab, "--workers", "1"), segmented(lab, "--workers", "3")
+    assert one == three
+    assert [Path(t["file"]).as_posix() for t in one["trials"]] == [f"many/{i}.csv" for i in range(6)]
+    # Each is what the command finds in that recording alone.
+    for name in ("many/0.csv", "many/5.csv"):
+        alone = segmented(lab, trials=name)["trials"]
+        assert alone == [t for t in one["trials"] if t["file"] == name]
+
+
+def test_a_cluster_finds_the_same(lab):
+    pytest.importorskip("dask.distributed", reason="dask is not installed (extra cluster)")
+    assert segmented(lab, "--scheduler", "local", "--workers", "2") == segmented(lab, "--workers", "1")
+
+
+def test_what_is_wrong_with_one_recording_is_one_line(lab, capfd):
+    (lab / "many/3.csv").write_text("t,x1\n0,1\n")
+    arguments = ["segment", "many", "--task", "task.toml", "--rig", "rig.toml", "--json", "out.json"]
+    assert main([*arguments, "--workers", "2"]) == 2
+    assert "3.csv: " in (said := capfd.readouterr().err)
+    assert said.count("\n") == 1
+    assert not (lab / "out.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--workers", "1", "--figures", "f"], "--workers, --scheduler: go with --json alone"),
+        (["--workers", "1", "--method", "qualitative"], "--workers, --scheduler: go with --json alone"),
+        (["--workers", "0"], "Invalid value for '--workers'"),
+        (["--scheduler", "nowhere"], "--scheduler nowhere: no scheduler answers there"),
+    ],
+)
+def test_refusals(lab, more, said, capfd, monkeypatch):
+    monkeypatch.setattr("hmmseg_cli.batch.PATIENCE", 0.5)
+    if "--scheduler" in more:
+        pytest.importorskip("dask.distributed", reason="dask is not installed (extra cluster)")
+    assert main(["segment", "many", "--task", "task.toml", "--rig", "rig.toml", *more]) == 2
+    assert said in capfd.readouterr().err
+
+
+def test_plain_sequences_are_pooled(lab, capfd):
+    (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
+    assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
+    assert "go with tasks of blocks alone" in capfd.readouterr().err
+
+
+def test_a_folder_stands_for_its_recordings(tmp_path):
+    for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
+        (tmp_path / name).touch()
+    (tmp_path / "inner").mkdir()
+    found = recordings_in([tmp_path / "b.csv", tmp_path])
+    assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
+    with pytest.raises(InputError, match="no recordings in this folder"):
+        recordings_in([tmp_path / "inner"])
+
+
+def test_the_order_of_a_set_of_names_moves_no_digit(lab):
+    """Python's hashes of names differ from process to process, and with them the order of sets."""
+    found = set()
+    for seed in ("0", "1", "2"):
+        command = [sys.executable, "-m", "hmmseg_cli.main", "segment", "many/0.csv", "--task", "task.toml",
+                   "--rig", "rig.toml", "--json", "-", "--quiet"]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONHASHSEED": seed})
+        found.add(done.stdout)
+    assert len(found) == 1
