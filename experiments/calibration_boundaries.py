@@ -1,6 +1,6 @@
 """Do 90 % boundary intervals hold in worlds that differ? A row a world, each trial by itself.
 
-    python -m experiments.calibration_boundaries [--worlds NAME...] [--trials 16] [--first 70000]
+    python -m experiments.calibration_boundaries [--worlds NAME...] [--trials 16] [--first 76000]
     python -m experiments.calibration_boundaries --folders RECORDINGS...
 
 The second form scores recordings with answers, cases pooled as they lie. Writes
@@ -27,7 +27,7 @@ from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.spans import Segmentation
 
 RESULTS = Path(__file__).parent / "results"
-FIRST, TRIALS = 70_000, 16
+FIRST, TRIALS = 76_000, 16
 Scored = tuple[Segmentation, np.ndarray]
 
 
