@@ -11,6 +11,7 @@ from hmmseg.errors import nearest
 from hmmseg.io.columns import Columns
 from hmmseg.io.gripper import Gripper
 from hmmseg.io.schema import (
+    LARGEST,
     Deviation,
     Finite,
     FinitePositive,
@@ -59,6 +60,8 @@ def _per_entry(names: tuple[str, ...]) -> BeforeValidator:
         if isinstance(value, bool):
             raise ValueError("must be a number")
         if isinstance(value, int | float):
+            if abs(value) > LARGEST:
+                raise ValueError(f"must be at most {LARGEST:.0e}")
             return (float(value),) * len(names)
         if isinstance(value, dict):
             for key in value:

@@ -21,6 +21,7 @@ from hmmseg.io.units import LARGEST, si_factor
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
 CARTESIAN_OPTIONAL = ("vx1", "vy1", "vx2", "vy2")
+LATEST = 1e25  # limit: of times before anything is known of their unit; ns since 1970 are 1e18
 MIN_SAMPLES = 8  # limit: fewer show no task
 MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
@@ -212,6 +213,11 @@ def _check_times(t: np.ndarray, table: Table) -> None:
     missing = np.flatnonzero(~np.isfinite(t))
     if missing.size:
         raise InputError(f"{where}: row {rows[missing[0]]}, column t", "missing", "a time in s")
+    beyond = np.flatnonzero(np.abs(t) > LATEST)
+    if beyond.size:
+        raise InputError(
+            f"{where}: row {rows[beyond[0]]}, column t", f"{t[beyond[0]]:.3g} is no time", "a time in s"
+        )
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         i = back[0] + 1

@@ -85,3 +85,8 @@ def test_refused_with_its_message(table, message):
 def test_a_file_that_is_absent(tmp_path):
     with pytest.raises(InputError, match=r"absent\.toml: no such file; expected a TOML file"):
         read_rig(tmp_path / "absent.toml")
+
+
+def test_a_number_beyond_all_floats_is_refused():
+    with pytest.raises(InputError, match=r"key systematic.force_bias: must be at most 1e\+12"):
+        parse_rig({"systematic": {"force_bias": 10**400}})

@@ -189,6 +189,14 @@ def test_readings_that_no_sensor_gives_are_refused():
         read_trial(frame, CARTESIAN)
 
 
+def test_times_beyond_all_clocks_are_refused():
+    frame = table(CARTESIAN_CHANNELS)
+    frame["t"] = frame["t"].astype(float)
+    frame.loc[len(frame) - 1, "t"] = 1e200
+    with pytest.raises(InputError, match=r"column t: 1e\+200 is no time; expected a time in s"):
+        read_trial(frame, CARTESIAN)
+
+
 def test_files_refused(tmp_path):
     for name, content, message in [
         ("a.doc", b"t\n", r"a\.doc: unknown kind of file '.doc'; expected .csv, .tsv, "),
