@@ -130,7 +130,8 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
         if j in scattering or (p >= least and same[j].log_bayes_factor > POSITIVE)
     )  # fmt: skip
     shifting = [same[j] for j in causes if j not in scattering]
-    sure = known(explained.inside if shifting else 0.0, shifting) if causes else 0.0
+    left = explained.inside if shifting else 0.0
+    sure = known(left, 1 - explained.remainder, shifting) if causes else 0.0
     return _Judged(effects, model, explained, same, causes, sure)
 
 

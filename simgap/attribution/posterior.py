@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from simgap.attribution.background import Background
+from simgap.attribution.carried import of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Spectrum, spectrum
 from simgap.bounded import least
 
@@ -96,10 +97,9 @@ def forms(gap: Gap, background: Background | None = None) -> Forms:
     """The quadratic forms that all sets of candidates share."""
     s = spectrum(gap)
     count = np.bincount(s.group).astype(float)
-    product = np.zeros((count.size, s.columns.shape[1], s.columns.shape[1]))
-    order = np.argsort(s.group, kind="stable")
-    for g, mine in enumerate(np.split(order, np.cumsum(count)[:-1].astype(int))):
-        product[g] = s.columns[mine].T @ s.columns[mine]
+    product = products(s.columns, s.group)
+    if gap.carried is not None:
+        product -= of_noise(gap, s)
     return Forms(gap, s, background or Background.usual(), product, count)
 
 

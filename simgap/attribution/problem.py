@@ -21,7 +21,8 @@ class Rows:
 
     A part is a subtask, or any stretch of a trial. Rows of one cell (a channel in a part of a trial) are in
     the order of time. `bands` [Hz]: lower edges of the frequency bands that are told apart. `sd` (n,): the
-    noise's in the cosine coefficients of the cells, one where it is not given.
+    noise's in the cosine coefficients of the cells, one where it is not given; `shape` (n,): what of it white
+    noise of the sensors has by itself, their level and colour left out.
     """
 
     trial: Int[np.ndarray, " n"]
@@ -33,12 +34,14 @@ class Rows:
     parts: tuple[str, ...]
     bands: tuple[float, ...] = (0.0, 1.0, 5.0)
     sd: np.ndarray | None = None
+    shape: np.ndarray | None = None
 
     def taken(self, chosen: np.ndarray) -> Rows:
         """The rows of a mask (n,) or of indices; names stay."""
         return Rows(self.trial[chosen], self.channel[chosen], self.part[chosen], self.time[chosen],
                     self.trials, self.channels, self.parts, self.bands,
-                    None if self.sd is None else self.sd[chosen])  # fmt: skip
+                    None if self.sd is None else self.sd[chosen],
+                    None if self.shape is None else self.shape[chosen])  # fmt: skip
 
     @property
     def cell(self) -> Int[np.ndarray, " n"]:
@@ -93,7 +96,8 @@ class Gap:
     """Residuals (n,) at the nominal, derivatives by nuisances whose prior is N(0, 1), and candidates.
 
     `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
-    trials tell nothing.
+    trials tell nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
+    from the same recording as the residual.
     """
 
     rows: Rows
@@ -102,16 +106,39 @@ class Gap:
     candidates: tuple[Candidate, ...]
     expected: float = 1.0
     own: tuple[int, ...] = ()
+    carried: Float[np.ndarray, "d n m"] | None = None
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
         return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
-                   tuple(c.taken(rows) for c in self.candidates), self.expected, self.own)  # fmt: skip
+                   tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
+                   None if self.carried is None else self.carried[:, rows])  # fmt: skip
 
-    def without(self, names: tuple[str, ...]) -> Gap:
-        """The gap with some candidates not thought of."""
-        kept = tuple(c for c in self.candidates if c.name not in names)
-        return Gap(self.rows, self.residual, self.nuisance, kept, self.expected, self.own)
+    @property
+    def raw_columns(self) -> Float[np.ndarray, "n m"]:
+        """Residual, nuisances, and each candidate's shift and derivatives by deviations over scale."""
+        parts = [self.residual[:, None], self.nuisance]
+        for c in self.candidates:
+            parts += [c.shift[:, None], c.jacobian * c.scale]
+        return np.concatenate(parts, 1)
+
+    @property
+    def own_columns(self) -> tuple[np.ndarray, ...]:
+        """Places of each candidate's columns, that of its shift first."""
+        out, at = [], 1 + self.nuisance.shape[1]
+        for c in self.candidates:
+            out.append(np.arange(at, at + 1 + c.at.size))
+            at += 1 + c.at.size
+        return tuple(out)
+
+    @property
+    def to_constant(self) -> Float[np.ndarray, "m m"]:
+        """Turns raw columns, from their right, into those with each shift as it is at no deviation."""
+        own = self.own_columns
+        out = np.eye(1 + self.nuisance.shape[1] + sum(mine.size for mine in own))
+        for c, mine in zip(self.candidates, own, strict=True):
+            out[mine[1:], mine[0]] = -(c.at - c.neutral) / c.scale
+        return out
 
 
 @dataclass(frozen=True)
@@ -132,20 +159,17 @@ class Spectrum:
 
 def spectrum(gap: Gap) -> Spectrum:
     """The gap's columns under an orthonormal cosine transform of every cell (white noise stays white)."""
-    parts, own, at = [gap.residual[:, None], gap.nuisance], [], 1 + gap.nuisance.shape[1]
-    for c in gap.candidates:
-        constant = c.shift - c.jacobian @ (c.at - c.neutral)
-        parts += [constant[:, None], c.jacobian * c.scale]
-        own.append(np.arange(at, at + 1 + c.at.size))
-        at += 1 + c.at.size
-    columns, (band,) = cosines(gap.rows, np.concatenate(parts, 1))
+    columns, (band,) = cosines(gap.rows, gap.raw_columns @ gap.to_constant)
     key = (gap.rows.channel * len(gap.rows.parts) + gap.rows.part) * len(gap.rows.bands) + band
-    return Spectrum(columns, np.unique(key, return_inverse=True)[1], band, tuple(own), gap.nuisance.shape[1])
+    group = np.unique(key, return_inverse=True)[1]
+    return Spectrum(columns, group, band, gap.own_columns, gap.nuisance.shape[1])
 
 
-def cosines(rows: Rows, columns: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray]]:
-    """Columns (n, M) under an orthonormal cosine transform of every cell, over the noise's sd there, and the
-    coefficients' bands."""
+def cosines(
+    rows: Rows, columns: np.ndarray, variance: np.ndarray | None = None
+) -> tuple[np.ndarray, tuple[np.ndarray]]:
+    """Columns (n, M) under an orthonormal cosine transform of every cell, over the noise's sd there (the root
+    of `variance` (n,) instead, where that is given), and the coefficients' bands."""
     out, band = np.empty_like(columns, float), np.zeros(len(columns), int)
     order = np.argsort(rows.cell, kind="stable")
     starts = np.flatnonzero(np.diff(rows.cell[order], prepend=-1))
@@ -155,4 +179,5 @@ def cosines(rows: Rows, columns: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarr
         if mine.size > 1:
             step = float(np.median(np.diff(rows.time[mine])))
             band[mine] = np.searchsorted(edges, np.arange(mine.size) / (2 * mine.size * step), side="right")
-    return out if rows.sd is None else out / rows.sd[:, None], (band,)
+    sd = rows.sd if variance is None else np.sqrt(variance)
+    return out if sd is None else out / sd[:, None], (band,)

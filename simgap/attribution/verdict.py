@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import expit
 
 from simgap.attribution.invariance import Invariance
 from simgap.attribution.posterior import Forms, Model
 
 MOST = 0.5  # cited: share of the gap left from which on it is unknown (the interface's definition)
 WIDTH = 0.25  # chosen: of that share's logarithm, logistic
+MINOR = 0.1  # chosen: share of the whole gap; causes that explain less leave it unknown, wherever they act
 LEAST = 0.02  # chosen: share of the explained gap below which an effect is told but is no cause
 # cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
 POSITIVE = float(np.log(3.0))
@@ -19,15 +21,16 @@ def named_part(f: Forms, model: Model) -> tuple[int, ...]:
     return tuple(j for j in model.effects if f.gap.candidates[j].named)
 
 
-def known(left: float, same: list[Invariance]) -> float:
+def known(left: float, explained: float, same: list[Invariance]) -> float:
     """Probability that a set's effects are the cause: they leave little, and are the same everywhere.
 
-    `left`: share of the gap that the set leaves. Logistic in its logarithm; an effect whose parameters
-    wander is as likely an imitation as the Bayes factor says.
+    `left`: share of the gap that the set leaves where it acts, `explained`: what it explains of all of it.
+    Logistic in their logarithms; an effect whose parameters wander is as likely an imitation as the Bayes
+    factor says.
     """
-    odds = np.log(MOST / max(left, 1e-6)) / WIDTH
-    one = [1 / (1 + np.exp(-np.clip(i.log_bayes_factor, -50, 50))) for i in same]
-    return float(1 / (1 + np.exp(-np.clip(odds, -50, 50))) * (min(one) if one else 1.0))
+    most = expit(np.log(MOST / max(left, 1e-6)) / WIDTH)
+    enough = expit(np.log(max(explained, 1e-6) / MINOR) / WIDTH)
+    return float(most * enough * min((expit(i.log_bayes_factor) for i in same), default=1.0))
 
 
 def alike(f: Forms, models: list[Model], weights: np.ndarray, causes: tuple[int, ...]) -> tuple[int, ...]:

@@ -9,10 +9,11 @@ import numpy as np
 
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.effects import catalogue, decoys, fitted, name_of
+from simgap.gap.carried import again, carried
 from simgap.gap.evaluation import residual_at
 from simgap.gap.fit import Fitted
 from simgap.gap.frame import subtask_name
-from simgap.gap.noise_model import coefficient_sd
+from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.spread import Spread
 from simgap.gap.trial_arrays import CHANNELS
@@ -30,33 +31,72 @@ def rows_of(given: Problem) -> Rows:
     )  # fmt: skip
 
 
-def gap_of(given: Problem, healthy: Fitted, fits: Sequence[Fitted], spreads: Sequence[Spread] = ()) -> Gap:
+def gap_of(
+    given: Problem,
+    healthy: Fitted,
+    fits: Sequence[Fitted],
+    spreads: Sequence[Spread] = (),
+    redrawn: Sequence[Problem] = (),
+) -> Gap:
     """The gap with a candidate for every fit (of one effect each), every spread, and the properties that were
-    measured apart."""
-    k = given.num_properties
-    start = healthy.residual - healthy.push @ healthy.u[:k]
-    nuisance = np.concatenate([-healthy.push, given.nuisances.columns], 1)
-    rows = rows_of(given)
-    rows = replace(rows, sd=coefficient_sd(given, rows, given.nuisances.left(healthy.residual)))
-    candidates = [_shifting(given, f, start, healthy.push) for f in fits]
-    candidates += [_spreading(s, rows) for s in spreads]
-    candidates += _measured(given, healthy.push)
-    return Gap(rows, start, nuisance, tuple(candidates))
+    measured apart. What sensors' noise makes of them is seen on `redrawn` recordings."""
+    rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
+    scattering = [_spreading(s, rows) for s in spreads]
+
+    def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
+        k = problem.num_properties
+        start = healthy.residual - healthy.push @ healthy.u[:k]
+        nuisance = np.concatenate([-healthy.push, problem.nuisances.columns], 1)
+        shifting = [_shifting(problem, f, start, healthy.push) for f in fits]
+        return Gap(rows, start, nuisance, (*shifting, *scattering, *_measured(problem, healthy.push)))
+
+    gap = at(given, healthy, fits)
+    if not redrawn:
+        return gap
+    noise = carried(
+        gap.raw_columns,
+        redrawn,
+        lambda other: at(other, again(other, healthy), [again(other, f) for f in fits]).raw_columns,
+    )
+    return replace(gap, carried=noise)
 
 
-def together(given: Problem, gap: Gap, healthy: Fitted, joint: Fitted, left: Sequence[Spread] = ()) -> Gap:
+def together(
+    given: Problem,
+    gap: Gap,
+    healthy: Fitted,
+    joint: Fitted,
+    left: Sequence[Spread] = (),
+    redrawn: Sequence[Problem] = (),
+) -> Gap:
     """The gap with further candidates: the effects of a joint fit, linearised where they are together.
 
     Each shifts the residual by what leaving it out changes; what they do only together is parted evenly.
     What scatters is as large as it is in what they leave (`left`).
     """
-    k = given.num_properties
-    again = {s.effect: _spreading(s, gap.rows) for s in left}
-    gap = replace(gap, candidates=tuple(again.get(c.name, c) for c in gap.candidates))
+    anew = {s.effect: _spreading(s, gap.rows) for s in left}
+    gap = replace(gap, candidates=tuple(anew.get(c.name, c) for c in gap.candidates))
     if len(joint.effects) < 2:
         return gap
-    there = given.whitening.weight > 0
-    start = gap.residual - (joint.residual - healthy.push @ joint.u[:k])  # what all of them take off
+    own = _joint(given, healthy, joint)
+    more = replace(gap, candidates=(*gap.candidates, *own))
+    if gap.carried is None:
+        return more
+    kept = gap.carried.shape[2]
+
+    def on(other: Problem) -> np.ndarray:
+        shaken = _joint(other, again(other, healthy), again(other, joint))
+        return replace(more, candidates=(*gap.candidates, *shaken)).raw_columns[:, kept:]
+
+    noise = carried(more.raw_columns[:, kept:], redrawn, on)
+    return replace(more, carried=np.concatenate([gap.carried, noise], 2))
+
+
+def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
+    """The effects of a joint fit as candidates of their own."""
+    k, there = given.num_properties, given.whitening.weight > 0
+    # What all of them take off.
+    all_of_them = healthy.residual - joint.residual - healthy.push @ (healthy.u[:k] - joint.u[:k])
     alone = []
     for key in joint.effects:
         u = joint.u.copy()
@@ -64,14 +104,14 @@ def together(given: Problem, gap: Gap, healthy: Fitted, joint: Fitted, left: Seq
         u[own] = neutral(given)[own]
         rest = tuple(e for e in joint.effects if e != key)
         alone.append(residual_at(given, rest, u)[there] - joint.residual)
-    both = (start - sum(alone)) / len(alone)
-    more, at = [], k
+    both = (all_of_them - sum(alone)) / len(alone)
+    out, at = [], k
     for key, shift in zip(joint.effects, alone, strict=True):
         free = free_of(key)
-        more.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
-                               joint.push[:, at : at + len(free)], joint.doubts / len(alone)))  # fmt: skip
+        out.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
+                              joint.push[:, at : at + len(free)], joint.doubts / len(alone)))  # fmt: skip
         at += len(free)
-    return Gap(gap.rows, gap.residual, gap.nuisance, (*gap.candidates, *more), gap.expected)
+    return out
 
 
 def _shifting(given: Problem, f: Fitted, start: np.ndarray, push: np.ndarray) -> Candidate:

@@ -165,7 +165,7 @@ def attributed(
         left = spreads(
             found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.spreads]
         )
-        gap, models = together(found.problem, gap, found.healthy, joint, left), None
+        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, twins, tolerance, forced, seed, models=models, absorbed=absorbed)
 

@@ -25,7 +25,8 @@ class Arrays(NamedTuple):
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): its sensor noise
     in units of the channel; `kind` (T, N): 2 * phase, + 1 beside a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
-    `sample` (T, N, C): noise of one sample of a channel itself.
+    `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
+    forces as they stand in `World`.
     """
 
     there: np.ndarray
@@ -37,6 +38,7 @@ class Arrays(NamedTuple):
     rises: np.ndarray
     phase: np.ndarray
     sample: np.ndarray
+    sensor: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         rises,
         stack["phase"],
         stack["sample"],
+        stack["sensor"],
     )
     lengths = tuple(r["t"].size for r in rows)
     return Frame(

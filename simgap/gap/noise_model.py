@@ -10,6 +10,8 @@ places.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from simgap.attribution.problem import Rows, cosines
@@ -27,8 +29,9 @@ FEWEST = 12  # numerics: coefficients of a band
 MEDIAN = 0.4549  # physics: of the square of a standard normal number
 
 
-def coefficient_sd(given: Problem, rows: Rows, residual: np.ndarray) -> np.ndarray:
-    """Standard deviation (n,) of each cosine coefficient of the rows' cells, in units of the stated noise."""
+def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
+    """The rows with the noise's standard deviation in each cosine coefficient of their cells, in units of the
+    stated noise, and with the shape of white noise there."""
     turn, frequency = _places(rows)
     shape = _shape(given, rows, turn)
     square = cosines(rows, residual[:, None])[0][:, 0] ** 2 / shape
@@ -42,7 +45,7 @@ def coefficient_sd(given: Problem, rows: Rows, residual: np.ndarray) -> np.ndarr
         seen = mine & (frequency > SLOWEST) & (True if at is None else np.isin(phase, at))
         level, colour = _likeliest(turn[seen], square[seen])
         variance[mine] *= level**2 * _density(turn[mine], colour)
-    return np.sqrt(variance)
+    return replace(rows, sd=np.sqrt(variance), shape=shape)
 
 
 def _places(rows: Rows) -> tuple[np.ndarray, np.ndarray]:

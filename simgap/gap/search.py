@@ -16,6 +16,7 @@ from simgap.attribution.problem import Gap
 from simgap.effects import decoys, name_of
 from simgap.gap.assemble import gap_of
 from simgap.gap.candidates import best_fit, candidate_names, shifting
+from simgap.gap.carried import noise_gained, redrawn
 from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
@@ -35,7 +36,8 @@ Progress = Callable[[str], None]
 @dataclass(frozen=True)
 class Search:
     """Aligned `trials`, their `problem`, the fit without any effect, and every candidate's own; `gap`: all of
-    that as an attribution takes it, its first candidates those of `fits`."""
+    that as an attribution takes it, its first candidates those of `fits`; `redrawn`: the problem with more
+    noise on the recordings."""
 
     trials: tuple[Trial, ...]
     aligned: AlignedTrials
@@ -44,6 +46,7 @@ class Search:
     fits: tuple[Fitted, ...]
     spreads: tuple[Spread, ...]
     gap: Gap
+    redrawn: tuple[Problem, ...]
     warnings: tuple[str, ...]
 
 
@@ -77,27 +80,38 @@ def search(
     given = with_nuisances(problem(build(trials, aligned, rig), actual))
     healthy = fit(given, Start((), neutral(given)))
     fits = [best_fit(given, key, healthy) for key in keys]
+    others = redrawn(given)
     for _ in range(ROUNDS):
-        again = _anew(trials, aligned, given, healthy, fits, actual)
+        again = _anew(trials, aligned, given, healthy, fits, actual, others)
         if again is None:
             break
         tell("aligning again without the best explanation")
         aligned, given, healthy, fits = again
+        others = redrawn(given)
     spread = spreads(given, given.nuisances.left(healthy.residual), names)
-    gap = gap_of(given, healthy, fits, spread)
+    gap = gap_of(given, healthy, fits, spread, others)
     if of_wrist(trials):
         warnings = [not_compared(trials), *warnings]
-    return Search(tuple(trials), aligned, given, healthy, tuple(fits), tuple(spread), gap,
+    return Search(tuple(trials), aligned, given, healthy, tuple(fits), tuple(spread), gap, others,
                   (*misled, *warnings))  # fmt: skip
 
 
-def _anew(trials, aligned, given: Problem, healthy: Fitted, fits: Sequence[Fitted], actual):
+def _anew(
+    trials,
+    aligned,
+    given: Problem,
+    healthy: Fitted,
+    fits: Sequence[Fitted],
+    actual,
+    others: Sequence[Problem],
+):
     """Everything once more with boundaries from forces without the best explanation, if that fits better.
 
     Late, slow or soft contacts displace boundaries.
     """
     best = _known(fits)[0]
-    if healthy.cost - best.cost < WORTHY:
+    gained = healthy.cost - best.cost
+    if gained < WORTHY or gained - noise_gained(others, healthy, best) < WORTHY:
         return None
     again = realigned(trials, given, best)
     if not SHIFT < moved(aligned, again) < np.inf:

@@ -44,6 +44,21 @@ def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
+def sensor_sd(
+    joints: np.ndarray, rates: np.ndarray, one: dict[str, np.ndarray], rig: Rig, group: int
+) -> np.ndarray:
+    """Noise (N, 3) of what was recorded, means over `group` samples: an angle [rad] (a coordinate [m] of a
+    Cartesian hand), its rate and a force [N]. `joints`, `rates` (N, 4); `one` of `sample_noise`."""
+    if not rig.jointed:
+        return np.stack([one["x"], one["vx"], one["force"]], 1)
+    out = np.empty((len(joints), 3))
+    for k, (stated, values) in enumerate(((rig.noise.angle, joints), (rig.noise.velocity, rates))):
+        learned = np.median([noise_sd(column) for column in values.T])
+        out[:, k] = learned if stated is None else stated / np.sqrt(group)
+    out[:, 2] = one["force"]
+    return np.nan_to_num(out)
+
+
 def channel_noise(one: dict[str, np.ndarray]) -> np.ndarray:
     """Noise (N, C) of one sample of x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
     root2 = np.sqrt(2.0)

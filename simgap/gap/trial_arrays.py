@@ -10,7 +10,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import TrialAlignment
 from simgap.effects.base import FORCES
-from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise
+from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise, sensor_sd
 from simgap.gap.wrist_gap import absent
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
@@ -89,6 +89,7 @@ def trial_arrays(
         "events": boundaries,
         "there": there,
         "sd": sd,
+        "sensor": sensor_sd(joints, rates, sample, rig, group),
         "sample": channel_noise(sample) * np.sqrt(group),  # of one as it was recorded
         "kind": (2 * phase + edge).astype(float),
         "subtask": subtask.astype(float),

@@ -13,7 +13,7 @@ from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
 from simgap.gap.frame import build
 from simgap.gap.marginal import Nuisances
-from simgap.gap.noise_model import _density, _likeliest, coefficient_sd
+from simgap.gap.noise_model import _density, _likeliest, with_noise
 from simgap.gap.nuisances import _settling, _turning
 from simgap.gap.problem import problem
 from simgap.gap.trial_arrays import CHANNELS
@@ -55,7 +55,8 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
     trial, sample, channel = np.nonzero(there)
     rows = Rows(trial, channel, given.frame.arrays.subtask[trial, sample], given.frame.world.t[trial, sample],
                 given.frame.files, CHANNELS, tuple(map(str, range(len(given.frame.steps)))))  # fmt: skip
-    sd = coefficient_sd(given, rows, np.random.default_rng(2).standard_normal(trial.size))
+    sd = with_noise(given, rows, np.random.default_rng(2).standard_normal(trial.size)).sd
+    assert sd is not None
     for c, name in enumerate(CHANNELS):
         low, high = (0.55, 1.5) if name in ("vx", "vy") else (0.9, 1.1)
         assert low < np.sqrt(np.mean(sd[channel == c] ** 2)) < high, name

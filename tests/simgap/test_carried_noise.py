@@ -1,0 +1,141 @@
+"""Noise that effects carry along, taken off the products of columns: closed forms and planted effects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.trial import read_trial
+from hmmseg.jaxconfig import double_precision
+from hmmseg.segmentation.align import align
+from simgap.attribution.carried import of_noise, products
+from simgap.attribution.posterior import fitted, forms
+from simgap.attribution.problem import Candidate, Gap, Rows, spectrum
+from simgap.gap.carried import SIZES, again, carried, noise_gained, redrawn
+from simgap.gap.fit import Start, fit
+from simgap.gap.frame import build
+from simgap.gap.nuisances import with_nuisances
+from simgap.gap.problem import neutral, problem
+
+GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
+
+
+def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
+    """A place that a force moves through a pad, place = (GIVE + true) force, both with noise; the effect is
+    another give. `swing`: sd of the true force; `error`: sd of what moves the place besides."""
+    rng = np.random.default_rng(seed)
+    n = TRIALS * SAMPLES
+    trial, k = np.divmod(np.arange(n), SAMPLES)
+    nothing = np.zeros(n, int)
+    rows = Rows(trial, nothing, nothing, k / 20.0, tuple(f"t{i}" for i in range(TRIALS)), ("c",), ("p",))
+    force = swing * rng.standard_normal(n)
+    place = (GIVE + true) * force + error * rng.standard_normal(n)
+    sd = np.hypot(PLACE_SD, GIVE * FORCE_SD)
+    draws, columns = [], None
+    for kept in (True, False, False, False, False):
+        f_noise, p_noise = FORCE_SD * rng.standard_normal(n), PLACE_SD * rng.standard_normal(n)
+        one = (
+            np.stack([p_noise - GIVE * f_noise, np.zeros(n), f_noise], 1) / sd
+        )  # residual, shift, derivative
+        if kept:
+            columns = np.stack([place - GIVE * force, np.zeros(n), force], 1) / sd + one
+        else:
+            draws.append(one)
+    assert columns is not None
+    far, zero = np.full(1, np.inf), np.zeros(1)
+    pad = Candidate("softer", ("give",), zero, zero, np.ones(1), columns[:, 1], columns[:, 2:], -far, far)
+    return Gap(rows, columns[:, 0], np.zeros((n, 0)), (pad,), carried=np.stack(draws))
+
+
+def linearised(gap: Gap) -> Gap:
+    """The gap about the effect's own least squares, as a fit would give it."""
+    (pad,) = gap.candidates
+    own = pad.jacobian[:, 0]
+    at = np.array([own @ gap.residual / (own @ own)])
+    more = replace(pad, at=at, shift=own * at[0])
+    assert gap.carried is not None
+    noise = gap.carried.copy()
+    noise[:, :, 1] = at[0] * noise[:, :, 2]
+    return replace(gap, candidates=(more,), carried=noise)
+
+
+def test_products_of_noise_are_their_expectations():
+    gap = linearised(softer(0.0, 0.0))
+    s, (pad,) = spectrum(gap), gap.candidates
+    found = of_noise(gap, s)[:, :, :].sum(0)
+    variance = np.hypot(PLACE_SD, GIVE * FORCE_SD) ** 2
+    n, at = gap.residual.size, pad.at[0]
+    with_residual, square = -GIVE * FORCE_SD**2 / variance * n, FORCE_SD**2 / variance * n
+    # About `at`: d0'J stays, the constant part is at J - at J, and no curvature is taken off.
+    assert found[0, 0] == 0 and found[2, 2] == 0
+    assert found[0, 2] == pytest.approx(with_residual, rel=0.15)
+    assert found[0, 1] == pytest.approx(0.0, abs=0.02 * n)
+    assert found[1, 2] == pytest.approx(at * square, rel=0.15)
+    assert found[1, 1] == pytest.approx(-(at**2) * square, rel=0.15)
+    assert products(s.columns, s.group).sum(0)[0, 0] == pytest.approx(gap.residual @ gap.residual)
+
+
+@pytest.mark.parametrize("error", [0.0, 1.0])
+def test_noise_alone_is_no_effect(error):
+    gap = linearised(softer(0.0, 1.0, error=error))
+    blind, told = forms(replace(gap, carried=None)), forms(gap)
+    gained = [fitted(f, (0,)).score - fitted(f, ()).score for f in (blind, told)]
+    assert gained[0] > 25.0  # stiffer pads leave less of the force's noise
+    assert gained[1] < 2.0
+
+
+@pytest.mark.parametrize("error", [0.0, 1.0])
+def test_an_effect_has_its_own_size(error):
+    found = []
+    for seed in range(6):
+        gap = linearised(softer(0.5, 4.0, seed, error))
+        found.append([fitted(forms(g), (0,)).x[0] for g in (replace(gap, carried=None), gap)])
+    blind, told = np.mean(found, axis=0)
+    assert blind < 0.45  # 1.5 / (1 + 1/16) - 1
+    assert told == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def given(shared):
+    folder = shared / "recordings/none_1"
+    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+    assert isinstance(task, BlockTask)
+    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2, 3, 4)]
+    frame = double_precision(lambda: build(trials, align(trials, task, rig), rig))()
+    return double_precision(lambda: with_nuisances(problem(frame)))()
+
+
+@double_precision
+def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
+    healthy = fit(given, Start((), neutral(given)))
+    noise = carried(
+        healthy.residual[:, None], redrawn(given), lambda other: again(other, healthy).residual[:, None]
+    )
+    channel = np.nonzero(given.whitening.weight > 0)[2]
+    square = np.square(noise[..., 0]).mean(0)
+    for c in (1, 2, 3, 6, 7, 8, 9):  # x may be pushed, and speeds jump: both have doubts of their own
+        assert square[channel == c].mean() == pytest.approx(1.0, abs=0.2)
+
+
+@double_precision
+def test_pads_that_swallow_noise_gain_what_they_swallow(given):
+    healthy = fit(given, Start((), neutral(given)))
+    stiff = fit(given, Start(("fingertip_compliance",), neutral(given)), 0)
+    u = stiff.u.copy()
+    own = stiff.columns[given.num_properties :]
+    u[own[-1]] -= 2.0  # stiffer in shear by two usual deviations
+    stiff = fit(given, Start(("fingertip_compliance",), u), 0)
+    others = redrawn(given)
+    assert noise_gained(others, healthy, stiff) > 1.0
+    assert noise_gained(others, healthy, healthy) == 0.0
+
+
+def test_where_noise_does_not_act_in_proportion_nothing_is_said():
+    force = np.array([[0.5], [-0.9], [3.0]])
+    contact = lambda step: np.maximum(force + step, 0.0)  # noqa: E731 - noise makes the second contact, at full size
+    noise = carried(contact(0.0), SIZES * 2, contact)
+    np.testing.assert_allclose(noise[0][:, 0], [1.0, 0.0, 1.0])
