@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import expit
 
 from simgap.attribution.cells import significant
-from simgap.attribution.detection import detected, statistic
+from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder
 from simgap.attribution.heldout import how_far
 from simgap.attribution.invariance import Invariance, invariance, residual_left
@@ -28,7 +28,6 @@ LISTED = 1e-4  # look: probability below which a set is one of the others
 def attribute(
     gap: Gap,
     twins: Iterable[float] | Callable[[float], Iterable[float]] | None = None,
-    tolerance: np.ndarray | None = None,
     forced: tuple[str, ...] = (),
     seed: int = 0,
     nested: bool = True,
@@ -38,10 +37,9 @@ def attribute(
     """Attribute a gap to its candidates.
 
     `twins`: the `statistic` of healthy twins, taken one by one, or what gives them for the gap's own; without
-    them stated noise is the null. `tolerance` (n,): smallest shift of each row that matters, in sds of its
-    noise; `absorbed`: by how much the first nuisances may be off without it mattering. `forced` names effects
-    that act for certain, and no others. `nested`: whether how far the gap shrinks is asked. `models`: the
-    sets that `sought` finds, where they are known already.
+    them stated noise is the null. `absorbed`: by how much the first nuisances may be off without it
+    mattering. `forced` names effects that act for certain, and no others. `nested`: whether how far the gap
+    shrinks is asked. `models`: the sets that `sought` finds, where they are known already.
     """
     rng = np.random.default_rng(seed)
     f = forms(gap)
@@ -54,7 +52,7 @@ def attribute(
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
     # A set's probability to be the cause, decoys being what no name explains.
-    parts = {m.effects: named_part(f, m) for m in models}
+    parts = _by_name(f, models, by_group, rng)
     likely: dict[tuple[int, ...], float] = {}
     for m, weight in zip(models, w, strict=True):
         likely[parts[m.effects]] = likely.get(parts[m.effects], 0.0) + float(weight)
@@ -63,12 +61,15 @@ def attribute(
     probability = _probabilities(f, likely, judged, found.p_value)
     causes_of = _leading(f, ranked, judged, likely) or _judged(f, (), by_group, rng)
     gone = bool(found.p_value >= ALARM) and not forced
-    small = (
-        None if tolerance is None or gone else small_gap(f, models[0], np.minimum(by_group, 1.0), tolerance)
-    )
-    if small is not None and absorbed is not None:
-        moved = np.abs(models[0].x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
-        small = None if (moved > absorbed).any() else small
+    small = None
+    if gap.tolerance is not None and not gone:
+        small = small_gap(f, np.minimum(by_group, 1.0), gap.tolerance)
+        matters = small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM
+        if absorbed is not None:  # by causes that have a name: what has none says nothing of properties
+            told = fitted(f, parts[models[0].effects])
+            moved = np.abs(told.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+            matters = matters or bool((moved > absorbed).any())
+        small = None if matters else small
     if small is not None:
         probability = _probabilities(f, likely, judged, 1.0)
     verdict, causes, partners = "none", (), ()
@@ -78,7 +79,7 @@ def attribute(
         verdict = "unknown"
         if probability["unknown"] <= 0.5 and causes_of.causes:
             causes = causes_of.causes
-            partners = alike(f, models, w, causes)
+            partners = alike(f, models, w, causes, parts)
             verdict = "set" if partners else "named"
     name = lambda effects: tuple(sorted({gap.candidates[j].name for j in effects}))  # noqa: E731
     told = fitted(f, causes)
@@ -97,6 +98,27 @@ def attribute(
         tuple(models), explained,
         before, left,
     )  # fmt: skip
+
+
+def _by_name(
+    f: Forms, models: list[Model], by_group: np.ndarray, rng: np.random.Generator
+) -> dict[tuple[int, ...], tuple[int, ...]]:
+    """The effects of each set that have a name.
+
+    What has none explains a gap only where names do not: a set with it counts as the likeliest set of names
+    alone where that explains as much but for LEAST of the gap.
+    """
+    parts = {m.effects: named_part(f, m) for m in models}
+    nameless = [m for m in models if len(parts[m.effects]) < len(m.effects)]
+    if not nameless:
+        return parts
+    best = next((m for m in sought(f, named=True) if m.effects), None)
+    if best is not None:
+        names = shares(f, best, by_group, rng)
+        for m in nameless:
+            if names.after - shares(f, m, by_group, rng).after < LEAST * (names.before - names.floor):
+                parts[m.effects] = best.effects
+    return parts
 
 
 def _forced(f: Forms, names: tuple[str, ...]) -> Model:

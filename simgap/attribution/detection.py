@@ -48,6 +48,17 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
     return float(np.logaddexp.reduce(scores) - np.log(len(RARE) + 1) - null)
 
 
+def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
+    """The same with what is below the tolerance as likely as not: whether there is a gap that matters."""
+    other = replace(f, lenient=True)
+
+    def score(m: Model) -> float:
+        now, then = (each.marginal(m.effects, m.energy)[0].sum() for each in (f, other))
+        return m.score + float(then - now)
+
+    return other, [replace(m, score=score(m)) for m in models]
+
+
 def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
     """The chance of a healthy recording to show so large a statistic.
 

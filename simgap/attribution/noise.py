@@ -43,8 +43,8 @@ def stated(rows: Rows) -> np.ndarray:
     return out
 
 
-def small_gap(f: Forms, model: Model, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap | None:
-    """The gap's size where it exceeds what matters least of all, None where it matters."""
+def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap:
+    """The gap's size, over what matters least, where it is largest."""
     before = residual_left(f, fitted(f, ()))
     rows = f.gap.rows
     key, inverse = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
@@ -57,8 +57,6 @@ def small_gap(f: Forms, model: Model, by_group: np.ndarray, tolerance: np.ndarra
     amount, least = amount * sd, np.bincount(inverse, tolerance) / count
     size = amount / least
     most = int(size.argmax())
-    if size[most] >= 1.0:
-        return None
     channel, part = divmod(int(key[most]), len(rows.parts))
     return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]),
                     float(least[most]))  # fmt: skip

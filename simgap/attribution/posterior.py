@@ -43,13 +43,17 @@ class Model:
 
 @dataclass(frozen=True)
 class Forms:
-    """Quadratic forms of a gap by group: products (G, M, M) of the spectrum's columns, counts (G,)."""
+    """Quadratic forms of a gap by group: products (G, M, M) of the spectrum's columns, counts (G,).
+
+    `lenient`: a group is as likely as not off by what does not matter.
+    """
 
     gap: Gap
     spectrum: Spectrum
     background: Background
     product: np.ndarray
     count: np.ndarray
+    lenient: bool = False
 
     @cached_property
     def extra(self) -> np.ndarray:
@@ -78,12 +82,26 @@ class Forms:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Log density (G,) of groups with these squares under a set of effects, and expected precisions."""
         shift = self.shift(effects)
-        density, precision = (background or self.background).marginal(energy, self.count, shift)
+        density, precision = (background or self.background).marginal(energy, self.count, shift, self.most)
         freed = self.freed[list(effects)].any(0)
         if freed.any():
-            own = Background.usual(off=FREED).marginal(energy, self.count, shift)
+            own = Background.usual(off=FREED).marginal(energy, self.count, shift, self.most)
             density, precision = np.where(freed, own[0], density), np.where(freed, own[1], precision)
         return density, precision
+
+    @cached_property
+    def most(self) -> np.ndarray | None:
+        """The variance (G,) of groups that does not matter, where that is allowed for.
+
+        A channel's part may be off by its tolerance throughout, all of it in one band.
+        """
+        rows, group = self.gap.rows, self.spectrum.group
+        if self.gap.tolerance is None or not self.lenient:
+            return None
+        _, place = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
+        square = np.square(self.gap.tolerance / (1.0 if rows.sd is None else rows.sd))
+        whole = np.bincount(place, square)[place]
+        return 1 + np.bincount(group, whole) / self.count**2
 
     @cached_property
     def log_odds(self) -> float:

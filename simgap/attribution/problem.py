@@ -97,7 +97,8 @@ class Gap:
 
     `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
     trials tell nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
-    from the same recording as the residual.
+    from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
+    of its noise.
     """
 
     rows: Rows
@@ -107,12 +108,14 @@ class Gap:
     expected: float = 1.0
     own: tuple[int, ...] = ()
     carried: Float[np.ndarray, "d n m"] | None = None
+    tolerance: Float[np.ndarray, " n"] | None = None
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
         return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
                    tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
-                   None if self.carried is None else self.carried[:, rows])  # fmt: skip
+                   None if self.carried is None else self.carried[:, rows],
+                   None if self.tolerance is None else self.tolerance[rows])  # fmt: skip
 
     @property
     def raw_columns(self) -> Float[np.ndarray, "n m"]:

@@ -16,17 +16,14 @@ BEAM = 5  # numerics: sets of each size that are extended
 MOST = 6  # chosen: effects of a set at most
 
 
-def sought(f: Forms, beam: int = BEAM) -> list[Model]:
+def sought(f: Forms, beam: int = BEAM, named: bool = False) -> list[Model]:
     """All sets found within the window of the best, best first; the empty set is always one.
 
     Neighbours of a set are screened from its mode in a few steps; those that lead are fitted to the end.
-    `beam`: how many sets of the window are extended.
+    `beam`: how many sets of the window are extended. `named`: of candidates that have a name alone.
     """
-    empty = fitted(f, ())
-    seen: dict[tuple[int, ...], Model] = {
-        (): empty,
-        **{(j,): fitted(f, (j,)) for j in range(len(f.gap.candidates))},
-    }
+    among = [j for j, c in enumerate(f.gap.candidates) if c.named or not named]
+    seen: dict[tuple[int, ...], Model] = {(): fitted(f, ()), **{(j,): fitted(f, (j,)) for j in among}}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
     while True:
@@ -39,7 +36,7 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
             break
         for m in todo:
             opened.add(m.effects)
-            new = [e for e in _neighbours(f, m.effects) if e not in seen and e not in rough]
+            new = [e for e in _neighbours(f, m.effects, among) if e not in seen and e not in rough]
             first = sorted(
                 new, key=lambda e: -mode(f, quadratic_forms(f, e), m.precision, steps=SCREEN).score
             )
@@ -50,15 +47,15 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     return sorted(kept, key=lambda m: -m.score)
 
 
-def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
+def _neighbours(f: Forms, effects: tuple[int, ...], among: list[int]) -> list[tuple[int, ...]]:
     """Sets with one effect more, one left out, or one exchanged; of one name's forms only one acts."""
     names = [c.name for c in f.gap.candidates]
     fewer = [tuple(j for j in effects if j != out) for out in effects]
     more = [
         tuple(sorted({*e, j}))
         for e in (effects, *fewer)
-        for j, name in enumerate(names)
-        if j not in effects and name not in {names[i] for i in e}
+        for j in among
+        if j not in effects and names[j] not in {names[i] for i in e}
     ]
     return list(dict.fromkeys([*more, *fewer]))
 

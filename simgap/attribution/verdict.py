@@ -33,14 +33,23 @@ def known(left: float, explained: float, same: list[Invariance]) -> float:
     return float(most * enough * min((expit(i.log_bayes_factor) for i in same), default=1.0))
 
 
-def alike(f: Forms, models: list[Model], weights: np.ndarray, causes: tuple[int, ...]) -> tuple[int, ...]:
-    """Effects that take a cause's place in sets that are one in twenty as likely, or more."""
+def alike(
+    f: Forms,
+    models: list[Model],
+    weights: np.ndarray,
+    causes: tuple[int, ...],
+    parts: dict[tuple[int, ...], tuple[int, ...]],
+) -> tuple[int, ...]:
+    """Effects that take a cause's place in sets that are one in twenty as likely, or more.
+
+    `parts`: the effects of each set that have a name.
+    """
     first = max(
-        (w for m, w in zip(models, weights, strict=True) if set(causes) <= set(m.effects)), default=0.0
+        (w for m, w in zip(models, weights, strict=True) if set(causes) <= set(parts[m.effects])), default=0.0
     )
     known_names, found = {f.gap.candidates[j].name for j in causes}, set[int]()
     for m, w in zip(models, weights, strict=True):
-        mine = set(named_part(f, m))
+        mine = set(parts[m.effects])
         others = {j for j in mine if f.gap.candidates[j].name not in known_names}
         if w > first / 20 and others and len(mine) <= len(causes):
             found |= others

@@ -16,6 +16,7 @@ from simgap.gap.frame import subtask_name
 from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.spread import Spread
+from simgap.gap.tolerance import tolerated
 from simgap.gap.trial_arrays import CHANNELS
 
 BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of those that are told apart
@@ -41,14 +42,15 @@ def gap_of(
     """The gap with a candidate for every fit (of one effect each), every spread, and the properties that were
     measured apart. What sensors' noise makes of them is seen on `redrawn` recordings."""
     rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
-    scattering = [_spreading(s, rows) for s in spreads]
+    scattering, tolerance = [_spreading(s, rows) for s in spreads], tolerated(given)
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
         k = problem.num_properties
         start = healthy.residual - healthy.push @ healthy.u[:k]
         nuisance = np.concatenate([-healthy.push, problem.nuisances.columns], 1)
         shifting = [_shifting(problem, f, start, healthy.push) for f in fits]
-        return Gap(rows, start, nuisance, (*shifting, *scattering, *_measured(problem, healthy.push)))
+        every = (*shifting, *scattering, *_measured(problem, healthy.push))
+        return Gap(rows, start, nuisance, every, tolerance=tolerance)
 
     gap = at(given, healthy, fits)
     if not redrawn:

@@ -32,7 +32,7 @@ from simgap.gap.located import Tally, tallies
 from simgap.gap.problem import Problem
 from simgap.gap.search import Search, search
 from simgap.gap.spread import spreads
-from simgap.gap.tolerance import properties_tolerated, tolerated
+from simgap.gap.tolerance import properties_tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.gap.wrist_gap import check_forced, of_wrist
 from simgap.report.finding import sentence
@@ -157,7 +157,6 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    tolerance = tolerated(found.problem)
     models: list[Model] | None = sought(forms(gap))
     leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
@@ -167,7 +166,7 @@ def attributed(
         )
         gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
-    return gap, attribute(gap, twins, tolerance, forced, seed, models=models, absorbed=absorbed)
+    return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 
 
 def _together(found: Search, which: Sequence[int]) -> Fitted:

@@ -12,12 +12,13 @@ from scipy.stats import multivariate_normal
 from simgap.attribution.attribute import attribute
 from simgap.attribution.background import Background
 from simgap.attribution.cells import significant
-from simgap.attribution.detection import detected, statistic
+from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.heldout import how_far
-from simgap.attribution.invariance import WANDER, invariance
+from simgap.attribution.invariance import WANDER, Invariance, invariance
 from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import sought, weights
+from simgap.attribution.verdict import known
 
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
@@ -243,9 +244,51 @@ def test_what_no_effect_explains_is_unknown_and_told_where():
 def test_a_gap_below_what_matters_is_none_and_told_with_its_size():
     gap = gap_of({1: 3.0})
     n = gap.residual.size
-    small = attribute(gap, tolerance=np.full(n, 10.0), nested=False)
+    small = attribute(replace(gap, tolerance=np.full(n, 10.0)), nested=False)
     assert small.verdict == "none" and small.small_gap is not None and 0 < small.small_gap.size < 1
-    assert attribute(gap, tolerance=np.full(n, 0.05), nested=False).verdict == "named"
+    assert attribute(replace(gap, tolerance=np.full(n, 0.05)), nested=False).verdict == "named"
+
+
+def test_a_prior_that_tolerates_is_a_prior_and_leaves_what_matters_as_likely():
+    b = Background.usual()
+    prior = b.tolerant(np.array([1.0, 1.5, 10.0, 1e4]))
+    np.testing.assert_allclose(np.logaddexp.reduce(prior, axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(prior[:, 0], b.log_prior)  # nothing is tolerated
+    far = b.log_phi > np.log(1e4)
+    np.testing.assert_allclose(prior[far, 3], b.log_prior[far])
+    assert (
+        prior[b.log_phi.searchsorted(np.log(5.0)), 2] > b.log_prior[b.log_phi.searchsorted(np.log(5.0))] + 2
+    )
+
+
+def test_what_is_below_the_tolerance_speaks_less_for_a_gap():
+    rng, gap = np.random.default_rng(13), gap_of({}, seed=12)
+    gap = replace(gap, residual=gap.residual + 1.5 * rng.standard_normal(gap.residual.size))
+    f = forms(replace(gap, tolerance=np.full(gap.residual.size, 2.0)))
+    models = sought(f)
+    other = forms(replace(gap, tolerance=np.full(gap.residual.size, 0.01)))
+    assert statistic(*leniently(f, models)) < 0.5 * statistic(f, models)
+    assert statistic(*leniently(other, models)) == pytest.approx(statistic(other, models))
+
+
+def test_what_has_no_name_explains_only_what_names_do_not():
+    gap = gap_of({0: 12.0, 3: 1.0}, seed=5)
+    a, b, c, d = gap.candidates
+    both = np.concatenate([a.jacobian, d.jacobian], 1)
+    anything = linear("anything", both, named=False)  # has the cause within it, and a little more
+    told = attribute(replace(gap, candidates=(a, b, c, anything)), nested=False)
+    assert told.models[0].effects == (3,)  # more likely than the cause alone
+    assert told.verdict == "named" and told.causes == ("a",)
+    # Where names leave most of the gap it is unknown.
+    rest = attribute(replace(gap, candidates=(b, c, anything)), nested=False)
+    assert rest.verdict == "unknown" and rest.causes == ()
+
+
+def test_a_cause_of_a_sliver_of_the_gap_leaves_it_unknown():
+    steady = [Invariance(3.0, 1.0, 0.0, np.zeros((2, 1)), np.zeros((2, 1)))]
+    assert known(0.05, 0.9, steady) > 0.9
+    assert known(0.05, 0.01, steady) < 0.01
+    assert known(0.9, 0.9, steady) < 0.1
 
 
 def test_a_noise_stated_too_low_is_no_gap():
