@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -80,6 +80,11 @@ bench-long: $(INSTALLED)  ## time and memory over four decades of samples; fills
 gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_recordings $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.patch_heldout $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.write_tables
+
+gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn anew (build/gap_drawn); fills docs/gap_results.md
+	$(BIN)/python -m experiments.blind_check open --cases 30 --tiers healthy single --seed 740211 --fastest 200 --out build/gap_drawn
+	$(BIN)/python -m experiments.gap_drawn build/gap_drawn --seed 740211
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
