@@ -13,10 +13,10 @@ import typer
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, SeedOption, TaskOption
-from hmmseg_cli.rows import Rows
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
+    from hmmseg_cli.rows import Rows
 
 LagOption = Annotated[float, typer.Option(
     "--lag", metavar="S", min=0.0, help="How long a boundary is waited for [s].")]  # fmt: skip
@@ -39,6 +39,7 @@ def watch(
 ) -> None:  # fmt: skip
     """Follow a task while it runs: a CSV header then rows on standard input, one JSON line out per row."""
     from hmmseg.online.watcher import Watcher
+    from hmmseg_cli.rows import Rows
 
     destination = None if json == "-" else json  # standard output has the lines, the last one included
     with Output("watch", json=destination, seed=seed, quiet=quiet) as out:
