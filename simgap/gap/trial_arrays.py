@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
@@ -16,6 +18,7 @@ from simgap.gap.wrist_gap import absent
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
 PHASES = ("free", "pickup", "carry", "place", "slide")
+LOST = 0.05  # chosen: share of the grip on either side below which all forces of a sample are nothing
 MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
 TOUCHING = 5.0  # chosen: sds of a force by which a touch shows
 # chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
@@ -23,8 +26,30 @@ EITHER_SIDE = 0.02
 FIRST_TOUCH = 0.2  # chosen: s; one finger touches no earlier before the other, nor lets go later
 
 
+def without_dropouts(trial: Trial) -> Trial:
+    """The trial with forces missing where all of them are nothing for one sample in the midst of a grip.
+
+    A block cannot be let go and gripped again from one sample to the next: the reading was lost.
+    """
+    force = np.stack([trial.channels[c] for c in FORCES], 1)
+    grip = np.minimum(force[:, 0], -force[:, 2])
+    before, here, after = grip[:-2], np.abs(force[1:-1]).max(1), grip[2:]
+    least = np.minimum(before, after)
+    lost = (here < LOST * least) & (np.maximum(before, after) < 2 * least)
+    if not lost.any():
+        return trial
+    gone = np.flatnonzero(lost) + 1
+    channels = {k: np.where(np.isin(np.arange(v.size), gone), np.nan, v) if k in FORCES else v
+                for k, v in trial.channels.items()}  # fmt: skip
+    return replace(trial, channels=channels)
+
+
 def thinned(trial: Trial) -> tuple[Trial, int]:
-    """The trial averaged down to MAX_RATE at most, and how many samples went into one."""
+    """The trial averaged down to MAX_RATE at most, and how many samples went into one.
+
+    Lost readings are left out.
+    """
+    trial = without_dropouts(trial)
     group = int(np.ceil(trial.rate / MAX_RATE - 1e-6))
     if group <= 1:
         return trial, 1

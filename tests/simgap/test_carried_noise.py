@@ -9,7 +9,7 @@ import pytest
 
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import read_trial
+from hmmseg.io.trial import Trial, read_trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.carried import of_noise, products
@@ -20,6 +20,7 @@ from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import neutral, problem
+from simgap.gap.trial_arrays import without_dropouts
 
 GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 
@@ -139,3 +140,13 @@ def test_where_noise_does_not_act_in_proportion_nothing_is_said():
     contact = lambda step: np.maximum(force + step, 0.0)  # noqa: E731 - noise makes the second contact, at full size
     noise = carried(contact(0.0), SIZES * 2, contact)
     np.testing.assert_allclose(noise[0][:, 0], [1.0, 0.0, 1.0])
+
+
+def test_a_reading_lost_in_a_grip_is_missing_and_a_gap_between_two_taps_is_not():
+    t = np.arange(12) / 100
+    grip = np.array([0, 0, 2.0, 2.1, 0.01, 2.0, 2.0, 0, 0, 0.5, 0, 3.0])
+    channels = {"fx1": grip, "fy1": 0.2 * grip, "fx2": -grip, "fy2": 0.2 * grip, "x1": t}
+    found = without_dropouts(Trial("trial.csv", t, channels))
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.channels["fx1"])), [4])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.channels["fy2"])), [4])
+    np.testing.assert_array_equal(found.channels["x1"], t)
