@@ -28,7 +28,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
 from hmmseg.online.watcher import Watcher
-from hmmseg_cli.watch import Rows
+from hmmseg_cli.rows import Rows
 
 OUT = Path(__file__).parents[1] / "results" / "watch.json"
 FIGURE = Path(__file__).parents[2] / "docs" / "figures" / "watch_lag.png"
