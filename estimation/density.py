@@ -17,7 +17,7 @@ from estimation import priors
 from estimation.observations import CHANNELS
 
 NUM_CHANNELS = len(CHANNELS)
-NUM_SHARES = 2 * NUM_CHANNELS
+NUM_SHARES = 2 * NUM_CHANNELS  # numerics: a normal and a shear give of each, by their definition
 STEP = 0.25  # numerics: of the table, in log r: cubic interpolation is then exact to some 1e-5
 FARTHEST = 9.0  # limit: of any scale from its prior median, all logarithms
 REACH = (-18.0, 26.0)  # numerics: of the table about the prior median of log r; priors leave nothing beyond

@@ -57,7 +57,10 @@ def summary() -> str | None:
         k: sum(r[k]["causes"] == r["effects"] and r[k]["verdict"] == "named" for r in affected)
         for k in ("blind", "actual")
     }
-    sets = sum(r["blind"]["verdict"] == "set" and r["effects"][0] in r["blind"]["causes"] for r in affected)
+    sets = sum(
+        r["blind"]["verdict"] == "set" and r["effects"][0] in [*r["blind"]["causes"], *r["blind"]["partners"]]
+        for r in affected
+    )
     quiet = sum(r["blind"]["verdict"] == "none" and r["actual"]["verdict"] == "none" for r in healthy)
     blind = table_blind_check.fresh()
     check = "" if blind is None else _blind(blind)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from hmmseg.hand.signals import task_space
-from hmmseg.io.plausibility import Finding, changed
+from hmmseg.io.plausibility import Finding, exchanged
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
@@ -33,18 +31,8 @@ def check_axes(trial: Trial, rig: Rig) -> list[Finding]:
     stems = (*(CARTESIAN if places else ()), *(FORCES if forces else ()))
     told = " and ".join(["press against each other"] * forces + ["stand apart in a grip"] * places)
     problem = f"and y are exchanged: the fingers {told} along y"
-    return [Finding("fx1" if forces and not places else "x1", problem, _exchanged(stems, trial, rig))]
-
-
-def _exchanged(stems: tuple[str, ...], trial: Trial, rig: Rig) -> dict[str, dict[str, Any]]:
-    """Each channel of x from where that of y comes from now, and the other way round."""
-    out: dict[str, dict[str, Any]] = {}
-    for stem in stems:
-        for ours, theirs in (("x", "y"), ("y", "x")):
-            name, other = stem.format(ours), stem.format(theirs)
-            if name in trial.channels and other in trial.channels:
-                out[name] = changed(other, rig)[other]
-    return out
+    first = "fx1" if forces and not places else "x1"
+    return [Finding(first, problem, exchanged(stems, ("x", "y"), trial, rig))]
 
 
 def _strong(difference: np.ndarray) -> float:

@@ -8,12 +8,11 @@ fx2 < 0, and a carry fy1 + fy2 > 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from hmmseg.hand.signals import task_space
-from hmmseg.io.plausibility import Finding, all_changed, changed
+from hmmseg.io.plausibility import Finding, all_changed, changed, exchanged
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
@@ -82,7 +81,8 @@ def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial
     """
     if apart < 0 and towards < 0:
         problem = "finger 1 holds from the right, finger 2 from the left: the fingers are swapped"
-        return [Finding("x1", problem, _exchanged(trial, rig))]
+        stems = JOINT_STEMS if rig.jointed else CARTESIAN_STEMS
+        return [Finding("x1", problem, exchanged(stems, ("1", "2"), trial, rig))]
     if apart > 0 and towards < 0:
         if carried < 0:
             problem = "is negative in a grip and fy1 + fy2 in a lift: forces on the finger, not by it"
@@ -177,15 +177,3 @@ def _agreed(values: np.ndarray, share: float = ALL) -> int:
     """The sign that so many samples have, 0 where they disagree."""
     positive = float((values > 0).mean())
     return 1 if positive >= share else -1 if positive <= 1 - share else 0
-
-
-def _exchanged(trial: Trial, rig: Rig) -> dict[str, dict[str, Any]]:
-    """Each finger's channels from where the other's come from now."""
-    stems = JOINT_STEMS if rig.jointed else CARTESIAN_STEMS
-    out: dict[str, dict[str, Any]] = {}
-    for stem in stems:
-        for ours, theirs in (("1", "2"), ("2", "1")):
-            name, other = stem.format(ours), stem.format(theirs)
-            if name in trial.channels and other in trial.channels:
-                out[name] = changed(other, rig)[other]
-    return out

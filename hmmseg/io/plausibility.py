@@ -53,6 +53,22 @@ def entry_text(channel: str, fields: dict[str, Any]) -> str:
     return f"{json.dumps(channel) if not channel.isidentifier() else channel} = {{{', '.join(quoted)}}}"
 
 
+def exchanged(
+    stems: tuple[str, ...], pair: tuple[str, str], trial: Trial, rig: Rig | None
+) -> dict[str, dict[str, Any]]:
+    """Each channel of one of a pair (of fingers, of axes) from where the other's comes from now.
+
+    `stems` are the channels' names with {} for what the pair names.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    for stem in stems:
+        for ours, theirs in (pair, pair[::-1]):
+            name, other = stem.format(ours), stem.format(theirs)
+            if name in trial.channels and other in trial.channels:
+                out[name] = changed(other, rig)[other]
+    return out
+
+
 def changed(channel: str, rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
     """The entry of a channel with this change: what the rig already says of it is kept."""
     now = Column() if rig is None else (rig.columns | rig.topics).get(channel, Column())

@@ -23,8 +23,7 @@ class Posed:
     by_log = {"shift": Parameter(0.0, 0.3, "s"), "offset": Parameter(0.0, 0.01, "m")}  # noqa: RUF012
 
     def simulate(self, parameters, recording, start=None):
-        """Never run here."""
-        raise NotImplementedError
+        raise AssertionError("only read, never run")
 
 
 def tumbling(name: str = "log.csv") -> Recording:
