@@ -14,7 +14,6 @@ from experiments.paper.sources import PRINTED, recorded, save
 from experiments.recordings import Case
 from hmmseg.io.rig import Rig
 from simgap.gap.diagnose import Diagnosis, diagnose
-from simgap.generic.verdict import joined
 
 TRIALS = 4
 SLIP = "grip_slip"
@@ -31,7 +30,7 @@ def rigid(rig: Rig, shear: bool = False) -> Rig:
 def entry(found: Diagnosis, case: Case) -> dict[str, Any]:
     """Verdict, parameters, shrinkage, and every property before and after beside the true and printed one."""
     body = found.body
-    best = joined(body["causes"]) if body["causes"] else next(iter(body["effects"]))
+    best = "+".join(body["causes"]) if body["causes"] else next(iter(body["effects"]))
     shifts = {}
     for name, shift in body["effects"][best]["property_shift"].items():
         block, prop = name.split(".")

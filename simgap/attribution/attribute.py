@@ -7,22 +7,20 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.special import expit
 
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
-from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder
+from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder, SmallGap
 from simgap.attribution.heldout import how_far
-from simgap.attribution.invariance import Invariance, invariance, residual_left
+from simgap.attribution.invariance import POSITIVE, Invariance, invariance, residual_left
 from simgap.attribution.noise import channel_of, noise_of, small_gap, stated
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought, weights
 from simgap.attribution.shares import Shares, shares
-from simgap.attribution.verdict import LEAST, POSITIVE, alike, known, named_part
+from simgap.attribution.verdict import ALARM, LEAST, Explanation, acting, conclude, known
 
-ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
-LISTED = 1e-4  # look: probability below which a set is one of the others
+JUDGED = 6  # numerics: sets of which it is asked whether they are the cause
 
 
 def attribute(
@@ -51,37 +49,21 @@ def attribute(
     w = weights(models)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
-    # A set's probability to be the cause, decoys being what no name explains.
+    # A set's probability to be the cause, what has no name being what no name explains.
     parts = _by_name(f, models, by_group, rng)
     likely: dict[tuple[int, ...], float] = {}
     for m, weight in zip(models, w, strict=True):
         likely[parts[m.effects]] = likely.get(parts[m.effects], 0.0) + float(weight)
     ranked = sorted((p for p in likely if p), key=lambda p: -likely[p])
-    judged = {part: _judged(f, part, by_group, rng) for part in ranked[:6]}
-    probability = _probabilities(f, likely, judged, found.p_value)
-    causes_of = _leading(f, ranked, judged, likely) or _judged(f, (), by_group, rng)
-    gone = bool(found.p_value >= ALARM) and not forced
+    judged = {part: _judged(f, part, by_group, rng) for part in ranked[:JUDGED]}
+    sets = [_explanation(f, parts[m.effects], float(x), judged) for m, x in zip(models, w, strict=True)]
     small = None
-    if gap.tolerance is not None and not gone:
-        small = small_gap(f, np.minimum(by_group, 1.0), gap.tolerance)
-        matters = small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM
-        if absorbed is not None:  # by causes that have a name: what has none says nothing of properties
-            told = fitted(f, parts[models[0].effects])
-            moved = np.abs(told.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
-            matters = matters or bool((moved > absorbed).any())
-        small = None if matters else small
-    if small is not None:
-        probability = _probabilities(f, likely, judged, 1.0)
-    verdict, causes, partners = "none", (), ()
-    if forced:
-        verdict, causes = "named", causes_of.effects
-    elif not gone and small is None:
-        verdict = "unknown"
-        if probability["unknown"] <= 0.5 and causes_of.causes:
-            causes = causes_of.causes
-            partners = alike(f, models, w, causes, parts)
-            verdict = "set" if partners else "named"
-    name = lambda effects: tuple(sorted({gap.candidates[j].name for j in effects}))  # noqa: E731
+    if gap.tolerance is not None and (found.p_value < ALARM or forced):
+        small = _small(f, models, parts, by_group, absorbed)
+    first = next(iter(judged), ())
+    verdict = conclude(sets, found.p_value, small is None, _names(f, first) if forced else ())
+    causes = next((j.causes for j in judged.values() if _names(f, j.causes) == verdict.causes), ())
+    causes = first if forced else causes
     told = fitted(f, causes)
     left, before = residual_left(f, told), residual_left(f, fitted(f, ()))
     sd = noise[gap.rows.channel]
@@ -89,15 +71,53 @@ def attribute(
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, told, by_group, rng)
     far = how_far(gap, noise**2) if nested and causes else None
+    chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
+                    found.p_value)  # fmt: skip
+    somewhere = verdict.verdict != "none" or small is not None
     return Attribution(
-        verdict, name(causes), name(partners), probability,
-        _effects(f, models, w, judged, rng, by_group), found,
-        Remainder(explained.remainder, p_rest, rest),
-        significant(gap.rows, f.spectrum.band, before, sd) if verdict != "none" or small is not None else (),
-        far, small, dict(zip(gap.rows.channels, (noise * stated(gap.rows)).tolist(), strict=True)),
-        tuple(models), explained,
-        before, left,
-    )  # fmt: skip
+        **vars(verdict),
+        effects=_effects(f, models, chance, judged, rng, by_group),
+        detection=found,
+        remainder=Remainder(explained.remainder, p_rest, rest),
+        where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
+        how_far=far,
+        small_gap=small,
+        noise=dict(zip(gap.rows.channels, (noise * stated(gap.rows)).tolist(), strict=True)),
+        models=tuple(models),
+        shares=explained,
+        before=before,
+        left=left,
+    )
+
+
+def _names(f: Forms, effects: Iterable[int]) -> tuple[str, ...]:
+    return tuple(sorted({f.gap.candidates[j].name for j in effects}))
+
+
+def _explanation(
+    f: Forms, part: tuple[int, ...], weight: float, judged: dict[tuple[int, ...], _Judged]
+) -> Explanation:
+    one = judged.get(part)
+    if one is None:
+        return Explanation(_names(f, part), weight)
+    return Explanation(_names(f, part), weight, _names(f, one.causes), one.known)
+
+
+def _small(
+    f: Forms, models: list[Model], parts: dict[tuple[int, ...], tuple[int, ...]], by_group: np.ndarray,
+    absorbed: np.ndarray | None,
+) -> SmallGap | None:  # fmt: skip
+    """The gap's size where neither residuals, nor what is likely, nor the properties it moves matter."""
+    assert f.gap.tolerance is not None
+    small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
+    if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
+        return None
+    if absorbed is not None:  # by causes that have a name: what has none says nothing of properties
+        told = fitted(f, parts[models[0].effects])
+        moved = np.abs(told.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+        if (moved > absorbed).any():
+            return None
+    return small
 
 
 def _by_name(
@@ -108,7 +128,7 @@ def _by_name(
     What has none explains a gap only where names do not: a set with it counts as the likeliest set of names
     alone where that explains as much but for LEAST of the gap.
     """
-    parts = {m.effects: named_part(f, m) for m in models}
+    parts = {m.effects: tuple(j for j in m.effects if f.gap.candidates[j].named) for m in models}
     nameless = [m for m in models if len(parts[m.effects]) < len(m.effects)]
     if not nameless:
         return parts
@@ -153,48 +173,13 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
     )  # fmt: skip
     shifting = [same[j] for j in causes if j not in scattering]
     left = explained.inside if shifting else 0.0
-    sure = known(left, 1 - explained.remainder, shifting) if causes else 0.0
+    factors = [i.log_bayes_factor for i in shifting]
+    sure = known(left, 1 - explained.remainder, factors) if causes else 0.0
     return _Judged(effects, model, explained, same, causes, sure)
 
 
-def _leading(
-    f: Forms, ranked: list[tuple[int, ...]], judged: dict[tuple[int, ...], _Judged],
-    likely: dict[tuple[int, ...], float],
-) -> _Judged | None:  # fmt: skip
-    """The likeliest set of those whose causes, together, are likeliest."""
-    chance: dict[tuple[str, ...], float] = {}
-    names = {
-        part: tuple(sorted(f.gap.candidates[j].name for j in one.causes)) for part, one in judged.items()
-    }
-    for part, one in judged.items():
-        chance[names[part]] = chance.get(names[part], 0.0) + one.known * likely[part]
-    if not judged:
-        return None
-    best = max(chance, key=lambda name: chance[name])
-    return next(judged[part] for part in ranked if part in judged and names[part] == best)
-
-
-def _probabilities(
-    f: Forms, likely: dict[tuple[int, ...], float], judged: dict[tuple[int, ...], _Judged], p_value: float
-) -> dict[str, float]:
-    """Of none, unknown and every set of causes; they sum to one. Sets with the same causes are one."""
-    none = float(expit((np.log(max(p_value, 1e-300)) - np.log(ALARM)) / 0.5))
-    out = {"none": none, "unknown": 0.0}
-    for part, weight in likely.items():
-        found = judged.get(part)
-        right = found.known * weight if found is not None else 0.0
-        out["unknown"] += (weight - right) * (1 - none)
-        if found is not None and right > 0:
-            name = "+".join(sorted(f.gap.candidates[j].name for j in found.causes))
-            out[name] = out.get(name, 0.0) + right * (1 - none)
-    out["other"] = sum(v for n, v in out.items() if v < LISTED and n not in ("none", "unknown"))
-    out = {n: v for n, v in out.items() if v >= LISTED or n in ("none", "unknown", "other")}
-    total = sum(out.values())
-    return {name: value / total for name, value in out.items()}
-
-
 def _effects(
-    f: Forms, models: list[Model], w: np.ndarray, judged: dict[tuple[int, ...], _Judged],
+    f: Forms, models: list[Model], chances: dict[str, float], judged: dict[tuple[int, ...], _Judged],
     rng: np.random.Generator, by_group: np.ndarray,
 ) -> dict[str, EffectPosterior]:  # fmt: skip
     """The posterior of every candidate: from the best set that holds it, or by itself."""
@@ -203,28 +188,26 @@ def _effects(
     for j, c in enumerate(f.gap.candidates):
         forms_of.setdefault(c.name, []).append(j)
     for name, mine in forms_of.items():
-        inside = [(m, float(p)) for m, p in zip(models, w, strict=True) if {*mine} & {*m.effects}]
-        chance = min(sum(p for _, p in inside), 1.0)  # a sum of many is rounded
+        inside = [m for m in models if {*mine} & {*m.effects}]
         found = next((one for part, one in judged.items() if {*mine} & {*part}), None)
         if found is not None:
             model = found.model
         elif inside:
-            model = inside[0][0]
+            model = inside[0]
         else:
             model = max((fitted(f, (j,)) for j in mine), key=lambda m: m.score)
         j = next(iter({*mine} & {*model.effects}))
         c = f.gap.candidates[j]
-        share, low, high = 0.0, 0.0, 0.0
+        share, interval = 0.0, (0.0, 0.0)
         if found is not None:
-            each = found.shares.each[:, found.effects.index(j)]
-            share, (low, high) = float(each.mean()), np.percentile(each, (5, 95))
+            share, interval = found.shares.of_effect(found.effects.index(j))
         z = f.spectrum.num_nuisances + sum(f.gap.candidates[i].at.size for i in model.effects if i < j)
         sd = c.scale * np.sqrt(np.diag(model.covariance)[z : z + c.at.size])
         mean = c.neutral + c.scale * model.x[z : z + c.at.size]
         same = None if found is None else found.invariance[j]
         wide = np.hypot(sd, _wander(same) * np.abs(mean - c.neutral))
         out[name] = EffectPosterior(
-            chance, share, (float(low), float(high)),
+            chances.get(name, 0.0), share, interval,
             {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))
              for n, m, s in zip(c.parameters, mean, wide, strict=True)}, same, j)  # fmt: skip
     return out

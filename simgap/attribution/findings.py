@@ -12,6 +12,7 @@ from simgap.attribution.heldout import HowFar
 from simgap.attribution.invariance import Invariance
 from simgap.attribution.posterior import Model
 from simgap.attribution.shares import Shares
+from simgap.attribution.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -59,14 +60,13 @@ class SmallGap:
 
 
 @dataclass(frozen=True)
-class Attribution:
-    """Everything found; see the fields' own classes. `left` (n,): residual that the causes leave, `before`
-    (n,): with nuisances alone, both as cosines of each cell; `nuisances` (K,) and their covariance."""
+class Attribution(Verdict):
+    """The verdict, and everything found beside it; see the fields' own classes.
 
-    verdict: str
-    causes: tuple[str, ...]
-    indistinguishable: tuple[str, ...]
-    probabilities: dict[str, float]
+    `left` (n,): residual that the causes leave, `before` (n,): with nuisances alone, both as cosines of each
+    cell.
+    """
+
     effects: dict[str, EffectPosterior]
     detection: Detection
     remainder: Remainder

@@ -16,6 +16,8 @@ from simgap.attribution.posterior import Forms, Model
 
 WANDER = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5])  # prior: shares of the parameters
 OTHER = 0.5  # chosen: wander from which on it is not one cause
+# cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
+POSITIVE = float(np.log(3.0))
 
 
 @dataclass(frozen=True)

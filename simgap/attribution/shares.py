@@ -23,17 +23,32 @@ class Shares:
     each: np.ndarray
     inside: float
 
+    @classmethod
+    def of(
+        cls, before: float, after: float, floor: float, lost: np.ndarray, rng: np.random.Generator,
+        inside: float = 1.0,
+    ) -> Shares:  # fmt: skip
+        """Each effect has what is `lost` (J,) by leaving it out, in proportion: they and the remainder sum to
+        one. Noise around what is left, and around what there was, makes the interval."""
+        part = lost / max(float(lost.sum()), 1e-12)
+        scatter = np.sqrt(2 * floor + 4 * max(after - floor, 0.0))
+        drawn = after + scatter * rng.standard_normal(DRAWS)
+        told = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
+        return cls(before, after, floor, told[:, None] * part, inside)
+
     @property
     def remainder(self) -> float:
         """Share of the gap that the set leaves."""
         return float(np.clip((self.after - self.floor) / max(self.before - self.floor, 1e-9), 0.0, 1.0))
 
+    def of_effect(self, k: int) -> tuple[float, tuple[float, float]]:
+        """The share of the k-th effect, and its 90 % interval."""
+        low, high = np.percentile(self.each[:, k], (5, 95))
+        return float(self.each[:, k].mean()), (float(low), float(high))
+
 
 def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) -> Shares:
-    """Shares of a set's effects; `noise` (G,): variance of each group's noise.
-
-    Each has what is lost by leaving it out, in proportion, so that they and the remainder sum to one.
-    """
+    """Shares of a set's effects; `noise` (G,): variance of each group's noise."""
     weight, count = 1 / noise, np.append(f.count, f.spectrum.num_nuisances)
     floor, by_group = float(count.sum()), squares_left(f, (), weight)
     before = float(by_group.sum())
@@ -47,12 +62,7 @@ def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) 
         max(float(squares_left(f, tuple(j for j in model.effects if j != out), weight).sum()) - after, 0.0)
         for out in model.effects
     ])  # fmt: skip
-    part = lost / max(float(lost.sum()), 1e-12)
-    # Noise around what is left, and around what there was, makes the interval.
-    scatter = np.sqrt(2 * floor + 4 * max(after - floor, 0.0))
-    drawn = after + scatter * rng.standard_normal(DRAWS)
-    told = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
     gone = np.maximum(by_group - at_mode, 0.0)
     left = np.clip((at_mode - count) / np.maximum(by_group - count, np.sqrt(2 * count + 1)), 0.0, 1.0)
     inside = float(gone @ left / gone.sum()) if gone.sum() > 0 else 1.0
-    return Shares(before, after, floor, told[:, None] * part, inside)
+    return Shares.of(before, after, floor, lost, rng, inside)

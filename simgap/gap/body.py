@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from simgap.attribution.document import entries
 from simgap.attribution.findings import Attribution, EffectPosterior
 from simgap.effects import catalogue
 from simgap.effects.base import Effect
@@ -39,30 +40,11 @@ def body(
         }
     elif told.causes and causes is not None:
         effects[told.causes[0]]["property_shift"] = _shifts(found, causes)
-    far = told.how_far
-    share = lambda e: {"probability": e.probability, "share": e.share, "interval_90": list(e.share_90)}  # noqa: E731
-    out = {
-        "verdict": told.verdict,
-        "causes": list(told.causes),
-        "indistinguishable": list(told.indistinguishable),
-        "probabilities": told.probabilities,
-        "detection": {
-            "p_value": told.detection.p_value,
-            "statistic": told.detection.statistic,
-            "resolution": told.detection.resolution,
-        },
-        "remainder": {
-            "share": told.remainder.share,
-            "p_value": told.remainder.p_value,
-            "where": where(given, told.remainder.where, None) if told.verdict != "none" else [],
-        },
-        "attribution": {n: share(e) for n, e in sorted(named.items(), key=lambda i: -i[1].probability)},
-        "where": where(given, told.where, causes) if told.verdict != "none" else [],
-        "effects": effects,
-        "noise": told.noise,
-        "shrinkage": None,
-        "next_experiment": following,
-    }
+    rest, far = told.remainder, told.how_far
+    attribution = {n: (e.probability, e.share, e.share_90) for n, e in named.items()}
+    out = entries(told, told.detection, (rest.share, rest.p_value, where(given, rest.where, None)),
+                  attribution, where(given, told.where, causes))  # fmt: skip
+    out |= {"effects": effects, "noise": told.noise, "shrinkage": None, "next_experiment": following}
     if far is not None:
         ends = [x if np.isfinite(x) else None for x in far.interval_90]
         out["shrinkage"] = {

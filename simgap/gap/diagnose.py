@@ -17,11 +17,12 @@ from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import as_html, as_text
-from simgap.attribution.attribute import ALARM, attribute
+from simgap.attribution.attribute import attribute
 from simgap.attribution.findings import Attribution
 from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
+from simgap.attribution.verdict import ALARM
 from simgap.effects import free_parameters, name_of
 from simgap.gap.assemble import together
 from simgap.gap.body import body, parameters

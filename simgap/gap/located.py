@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.attribution.cells import Cell
+from simgap.attribution.document import rows
 from simgap.effects import fitted, name_of
 from simgap.effects.base import World, tips
 from simgap.gap.evaluation import raw_residual_at, world_without
@@ -29,20 +30,17 @@ def where(given: Problem, found: Sequence[Cell], causes: Fitted | None) -> list[
     Shares are of the excess that residuals show: a shift that the properties absorb has none.
     """
     frame = given.frame
-    rows = [
-        {"trial": c.trial, "channel": c.channel, "subtask": c.part.partition(":")[2], "band": list(c.band),
-         "share": c.share, "z": c.z} for c in found
-    ]  # fmt: skip
+    out = [{**row, "subtask": row["subtask"].partition(":")[2]} for row in rows(found)]
     if causes is None or not causes.effects:
-        return rows
+        return out
     known = {(c.trial, c.channel, c.part) for c in found}
     mean = shifts(given, causes)
     for r, s, c in np.argwhere(mean >= SHIFTED):
         name = subtask_name(frame.steps[s])
         if (frame.files[r], CHANNELS[c], f"{s}:{name}") not in known:
-            rows.append({"trial": frame.files[r], "channel": CHANNELS[c], "subtask": name,
+            out.append({"trial": frame.files[r], "channel": CHANNELS[c], "subtask": name,
                          "band": [0.0, 1.0], "share": 0.0, "z": float(mean[r, s, c])})  # fmt: skip
-    return rows
+    return out
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.verdict import POSITIVE
+from simgap.attribution.invariance import POSITIVE
 from simgap.effects import fitted
 from simgap.gap.problem import Problem
 

@@ -13,6 +13,10 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.model import SequenceModel
+from simgap.attribution.detection import Detection
+from simgap.attribution.document import entries
+from simgap.attribution.shares import Shares
+from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles
 from simgap.generic.effects import CANDIDATES, Scene, scene
@@ -22,16 +26,14 @@ from simgap.generic.locate import Located, locate
 from simgap.generic.report import effect_entry, listed_cells
 from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
 from simgap.generic.shrinkage import fraction, heldout, shrinkage, sizes
-from simgap.generic.verdict import joined, probabilities
 
-ALARM = 0.01  # chosen: chance that two ensembles alike are called different
 MOST = 6  # chosen: effects that may act together
 GAIN = 5.0  # chosen: nats that a further effect must add
 WORTH = 0.98  # chosen: it must leave no more than this share of the excess square
-TIE = 3.0  # chosen: nats (tempered): candidates this near the best cannot be told from it
 TEMPERATURE = 1.5  # chosen: least; covariances come from a few trials
-UNKNOWN = 0.15  # chosen: share of the gap left at which it is as likely of another cause
+PRIOR = -4.0  # prior: log prior of a candidate against none
 RINGS = 0.2  # chosen: share of the square after an event that an oscillation must explain
+LISTED = 8  # look: explanations that are described
 SHORTEST = 16  # numerics: samples of a window in which an oscillation is looked for
 Progress = Callable[[str], None]
 
@@ -128,7 +130,7 @@ def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Prog
     temperature = _temperature(min(f.square for f in found), difference.size)
     found.sort(key=lambda f: -f.evidence(temperature))
     tell("held-out trials")
-    return _conclude(given, parts, located, real, sim, found, ring, temperature, bool(forced), seed)
+    return _conclude(given, parts, located, real, sim, found, ring, temperature, bool(forced), seed, fitted)
 
 
 def _temperature(left: float, size: int) -> float:
@@ -177,62 +179,55 @@ def _ring(given: Scene, real: np.ndarray, sim: np.ndarray) -> Ring | None:
 def _conclude(
     given: Scene, parts: list[Block], located: Located, real: np.ndarray, sim: np.ndarray,
     found: list[Fitted], ring: Ring | None, temperature: float, forced: bool, seed: int,
+    fitted: Callable[[Sequence[str]], Fitted],
 ) -> GenericDiagnosis:  # fmt: skip
     """Verdict, probabilities, place, shrinkage and parameters from the fitted candidates."""
     lay, best = given.layout, found[0]
     counts = np.bincount(lay.cell)
-    held = {f.effects: heldout(given, parts, real, sim, f) for f in found[:8]}
+    held = {f.effects: heldout(given, parts, real, sim, f) for f in found[:LISTED]}
     # Judged where there is a gap: elsewhere a small excess would drown in the floor's own scatter.
     apart = counts * (located.z > min(located.threshold, located.z.max() - 1e-9))
     before, after, _, floor = sizes(held[best.effects], apart)
     left = 1 - fraction(before, after, floor)
     left = float(np.clip(left, 0, 1)) if np.isfinite(left) else 0.0
-    rest = locate(lay, real - best.shift, sim, seed).p_value
-    evidence = {joined(f.effects): f.evidence(temperature) for f in found}
-    probability = probabilities(evidence, left, rest, UNKNOWN)
-    p, gap = located.p_value, located.p_value < ALARM
-    if gap:
-        excess = max(probability["none"] - p, 0.0)
-        probability["none"] -= excess
-        probability["unknown"] += excess
-    else:
-        none = 1 - 0.1 * (1 - p) ** 4  # what the threshold calls alike is alike, more or less surely
-        rest_of = 1 - probability["none"]
-        probability = {k: v * (1 - none) / max(rest_of, 1e-12) for k, v in probability.items() if k != "none"}
-        probability["none"] = 1 - sum(probability.values())
-    partners: list[str] = []
-    if forced:
-        verdict = "named"
-    elif not gap:
-        verdict = "none"
-    elif probability["unknown"] > 0.5:
-        verdict = "unknown"
-    else:
-        near = [f for f in found[1:] if len(f.effects) == len(best.effects)
-                and evidence[joined(best.effects)] - evidence[joined(f.effects)] < TIE]  # fmt: skip
-        partners = sorted({e for f in near for e in f.effects} - set(best.effects))
-        verdict = "set" if partners else "named"
-    chosen = best if verdict in ("named", "set") else None
+    rest = locate(lay, real - best.shift, sim, seed)
+    # What noise leaves as often as a healthy comparison shows a gap is not left by the effects.
+    sure = known(left if rest.p_value < ALARM else 0.0, 1.0)
+    score = np.array([0.0, *(f.evidence(temperature) + PRIOR for f in found)])
+    weights = np.exp(score - np.logaddexp.reduce(score)).tolist()
+    sets = [Explanation((), weights[0])]
+    sets += [Explanation(f.effects, w, f.effects, sure) for f, w in zip(found, weights[1:], strict=True)]
+    told = conclude(sets, located.p_value, forced=best.effects if forced else ())
+    chosen = best if told.causes else None
+    gap, chance = located.p_value < ALARM, acting(sets, located.p_value)
+    detection = Detection(float(located.z.max()), located.p_value, located.resolution)
+    remains = left, rest.p_value, listed_cells(lay, rest, real - best.shift, sim) if gap else []
     warnings = [*lay.ensembles.warnings]
-    if not located.exchanged:
+    if not located.exchanges:
         warnings.append("too few trials to exchange: p rests on the F distribution and Bonferroni's bound")
     if len(real) == 1:
         warnings.append("one trial: held out by subtasks, which is weaker than by trials")
     shrunk, trials = shrinkage(given, held[best.effects], seed), len(real) + len(sim)
-    shown = {k: v for k, v in probability.items() if k in ("none", "unknown") or v > 1e-3}
-    body = {
-        "verdict": verdict,
-        "causes": list(best.effects) if chosen is not None else [],
-        "indistinguishable": partners,
-        "probabilities": {**shown, "other": max(0.0, 1 - sum(shown.values()))},
-        "detection": {"p_value": p, "statistic": float(located.z.max())},
-        "where": listed_cells(lay, located, real, sim) if gap else [],
+    shares = _shares(best, fitted, seed) if gap else {}
+    attribution = {n: (p, *shares.get(n, (0.0, (0.0, 0.0)))) for n, p in chance.items()}
+    where = listed_cells(lay, located, real, sim) if gap else []
+    body = entries(told, detection, remains, attribution, where) | {
         "effects": {
-            joined(f.effects): effect_entry(given, f, ring, temperature, held[f.effects].score, trials)
-            for f in found[:8]
+            "+".join(f.effects): effect_entry(given, f, ring, temperature, held[f.effects].score, trials)
+            for f in found[:LISTED]
         },
         "shrinkage": None if chosen is None else shrunk,
         "best_explanation": {"effects": list(best.effects), "shrinkage": shrunk} if gap else None,
         "next_experiment": None,
     }  # fmt: skip
     return GenericDiagnosis(body, given, located, real, sim, chosen, best, ring, tuple(warnings))
+
+
+def _shares(
+    best: Fitted, fitted: Callable[[Sequence[str]], Fitted], seed: int
+) -> dict[str, tuple[float, tuple[float, float]]]:
+    """Each effect's share of the gap of all trials, and its 90 % interval."""
+    without = [fitted([n for n in best.effects if n != out]).square for out in best.effects]
+    lost = np.maximum(np.array(without) - best.square, 0.0)
+    shares = Shares.of(best.before, best.square, best.shift.size, lost, np.random.default_rng(seed))
+    return {n: shares.of_effect(k) for k, n in enumerate(best.effects)}

@@ -31,14 +31,20 @@ Z_LARGEST = 37.0  # numerics: beyond, probabilities underflow
 @dataclass(frozen=True)
 class Located:
     """`z` (cells,): normal scores of the difference; `trial_z` (R, cells): of each real trial;
-    `p_value` of any gap; `threshold`: score that a healthy comparison reaches in 5 %.
+    `p_value` of any gap; `threshold`: score that a healthy comparison reaches in 5 %;
+    `exchanges` of labels that this rests on, 0 where there are too few to make.
     """
 
     z: np.ndarray
     trial_z: np.ndarray
     p_value: float
     threshold: float
-    exchanged: bool
+    exchanges: int
+
+    @property
+    def resolution(self) -> float:
+        """The smallest p-value that so many exchanges can show; 0 where none were made."""
+        return 1 / (self.exchanges + 1) if self.exchanges else 0.0
 
 
 def variances(given: Layout, values: np.ndarray) -> np.ndarray:
@@ -123,13 +129,13 @@ def locate(given: Layout, real: np.ndarray, sim: np.ndarray, seed: int = 0) -> L
     exchanges = _exchanges(len(everything), count, seed)
     if exchanges is None:
         p = min(1.0, float(ndtr(-z.max())) * z.size)
-        return Located(z, trial_z, p, -float(ndtri(LEVEL / z.size)), False)
+        return Located(z, trial_z, p, -float(ndtri(LEVEL / z.size)), 0)
     null = _exchanged(given, everything, count, exchanges, first)
     both = np.vstack([[z.max(), z.mean()], null])
     # Share of exchanges at least as large, for either statistic; the smaller one counts.
     ranks = np.array([(both[:, k][None] >= both[:, k][:, None]).mean(1) for k in range(2)]).min(0)
     p = float((ranks <= ranks[0]).mean())
-    return Located(z, trial_z, p, float(np.quantile(null[:, 0], 1 - LEVEL)), True)
+    return Located(z, trial_z, p, float(np.quantile(null[:, 0], 1 - LEVEL)), len(exchanges))
 
 
 def _exchanged(

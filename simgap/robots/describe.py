@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from simgap.attribution.document import entries, rows
 from simgap.attribution.posterior import Model, fitted
 from simgap.robots.diagnose import RobotDiagnosis
 
@@ -13,24 +14,13 @@ from simgap.robots.diagnose import RobotDiagnosis
 def body(found: RobotDiagnosis) -> dict[str, Any]:
     """The document: verdict, causes, probabilities, where, effects, shrinkage, and what cannot be told."""
     v = found.verdict
-    return {
-        "verdict": v.verdict,
-        "causes": list(v.causes),
-        "indistinguishable": list(v.indistinguishable),
-        "probabilities": v.probabilities,
-        "detection": {
-            "p_value": v.detection.p_value,
-            "statistic": v.detection.statistic,
-            "resolution": v.detection.resolution,
-        },
-        "remainder": {
-            "share": v.remainder if v.causes else (0.0 if v.verdict == "none" else 1.0),
-            "p_value": None if v.verdict == "none" else _remainder_p(found),
-            "where": _cells(v.remainder_where),
-            "regimes": dict(v.left),
-        },
-        "attribution": _attribution(found),
-        "where": _cells(v.where),
+    shares = {n: v.shares.of_effect(k) for k, n in enumerate(v.shared)}
+    attribution = {n: (p, *shares.get(n, (0.0, (0.0, 0.0)))) for n, p in v.chance.items()}
+    rest = v.remainder
+    p_value = None if v.verdict == "none" else rest.p_value
+    out = entries(v, v.detection, (rest.share, p_value, rows(rest.where)), attribution, rows(v.where))
+    out["remainder"]["regimes"] = dict(v.left)
+    return out | {
         "effects": _effects(found),
         "fitted": _fitted(found),
         "discrepancy": dict(found.discrepancy),
@@ -44,27 +34,6 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
             "expected_gain_nats": found.next_log.gain,
         },
     }
-
-
-def _cells(cells) -> list[dict[str, Any]]:
-    return [
-        {
-            "trial": c.trial,
-            "channel": c.channel,
-            "subtask": c.part,
-            "band": list(c.band),
-            "share": c.share,
-            "z": c.z,
-        }
-        for c in cells
-    ]
-
-
-def _remainder_p(found: RobotDiagnosis) -> float:
-    """The chance of sensors' noise alone to leave as much as the causes do."""
-    from scipy.stats import chi2
-
-    return float(chi2.sf(found.verdict.shares.after, found.verdict.shares.floor))
 
 
 def parameters(found: RobotDiagnosis, model: Model, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
@@ -86,20 +55,6 @@ def parameters(found: RobotDiagnosis, model: Model, effects: tuple[str, ...]) ->
             m, s = float(mean[k]), float(sd[k])
             low, high = max(m - 1.645 * s, float(c.low[k])), min(m + 1.645 * s, float(c.high[k]))
             out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": unit}
-    return out
-
-
-def _attribution(found: RobotDiagnosis) -> dict[str, Any]:
-    v = found.verdict
-    each = v.shares.each
-    names = v.shared
-    out = {}
-    for name, chance in sorted(v.chance.items(), key=lambda item: -item[1]):
-        share, interval = 0.0, [0.0, 0.0]
-        if name in names and each.size:
-            own = each[:, names.index(name)]
-            share, interval = float(own.mean()), [float(q) for q in np.percentile(own, (5, 95))]
-        out[name] = {"probability": chance, "share": share, "interval_90": interval}
     return out
 
 

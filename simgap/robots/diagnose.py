@@ -23,7 +23,7 @@ from simgap.robots.explained import explained
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
-from simgap.robots.judge import Verdict, judge
+from simgap.robots.judge import RobotVerdict, judge
 from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
@@ -53,7 +53,7 @@ class RobotDiagnosis:
     linear: Linear
     found: Found
     forms: Forms
-    verdict: Verdict
+    verdict: RobotVerdict
     shrinkage: Shrinkage | None
     identifiable: Identifiability
     next_log: NextLog | None

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simgap.attribution.invariance import residual_left
 from simgap.attribution.posterior import Forms, fitted
-from simgap.robots.judge import Verdict
+from simgap.attribution.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -29,14 +30,14 @@ def next_log(f: Forms, verdict: Verdict, logs: Sequence[str]) -> NextLog | None:
         return None
     names = [c.name for c in f.gap.candidates]
     causes = tuple(sorted(names.index(n) for n in verdict.causes))
-    best = f.spectrum.columns[:, 0] - _left(f, causes)
+    best = f.spectrum.columns[:, 0] - residual_left(f, fitted(f, causes))
     gains = np.zeros(len(logs))
     trial = f.gap.rows.trial
     smallest = np.inf
     for rival in verdict.indistinguishable:
         for out in causes:
             other = tuple(sorted({*(j for j in causes if j != out), names.index(rival)}))
-            apart = best - (f.spectrum.columns[:, 0] - _left(f, other))
+            apart = best - (f.spectrum.columns[:, 0] - residual_left(f, fitted(f, other)))
             each = 0.5 * np.bincount(trial, apart**2, len(logs))
             if each.sum() < smallest:
                 smallest, gains = float(each.sum()), each
@@ -44,9 +45,3 @@ def next_log(f: Forms, verdict: Verdict, logs: Sequence[str]) -> NextLog | None:
     if gains[at] < 1.0:
         return None
     return NextLog(logs[at], (*verdict.causes, *verdict.indistinguishable), float(gains[at]))
-
-
-def _left(f: Forms, effects: tuple[int, ...]) -> np.ndarray:
-    from simgap.attribution.invariance import residual_left
-
-    return residual_left(f, fitted(f, effects))

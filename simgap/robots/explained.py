@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.shares import DRAWS, Shares
+from simgap.attribution.shares import Shares
 from simgap.robots.gap import fitted_along
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
@@ -67,17 +67,12 @@ class Explained:
         lost = self.lost.sum(2)
         return lost / np.maximum(lost.sum(0), 1e-12)
 
-    def shares(self, kept: Sequence[int], rng: np.random.Generator) -> Shares:
-        """All regimes together, with draws of each kept cause's share."""
+    def shares(self, rng: np.random.Generator) -> Shares:
+        """All regimes together."""
         before, floor = float(self.before.sum()), float(self.floor.sum())
         after = min(float(self.after.sum()), before)
         lost = np.maximum(self.without.sum((1, 2)) - after, 0.0)
-        part = lost / max(float(lost.sum()), 1e-12)
-        # Noise around what is left, and around what there was, makes the interval.
-        drawn = after + np.sqrt(2 * floor + 4 * max(after - floor, 0.0)) * rng.standard_normal(DRAWS)
-        told = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
-        left = float(np.clip((after - floor) / max(before - floor, 1e-9), 0.0, 1.0))
-        return Shares(before, after, floor, told[:, None] * part[list(kept)], left)
+        return Shares.of(before, after, floor, lost, rng)
 
 
 def _left(before: np.ndarray, after: np.ndarray, floor: np.ndarray) -> np.ndarray:

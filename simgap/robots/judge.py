@@ -1,40 +1,36 @@
-"""The verdict on a robot's logs: none, named, a set, or unknown."""
+"""The verdict on a robot's logs: what held-out rows bore out, judged by what it leaves where it acts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit
 
-from simgap.attribution.attribute import ALARM
 from simgap.attribution.cells import Cell, significant
-from simgap.attribution.detection import Detection, statistic
+from simgap.attribution.detection import Detection, detected, statistic
+from simgap.attribution.findings import Remainder
+from simgap.attribution.invariance import residual_left
 from simgap.attribution.posterior import Forms, Model, fitted
+from simgap.attribution.search import weights
 from simgap.attribution.shares import Shares
-from simgap.attribution.verdict import LEAST, MOST, WIDTH
+from simgap.attribution.verdict import LEAST, MOST, RULED_OUT, Explanation, Verdict, acting, conclude, known
 from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
 from simgap.robots.explained import Explained
 
 RIVALS = 8  # numerics: sets that are compared on held-out rows
-TWENTY = 20.0  # chosen: to one: odds from which on a rival is ruled out
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What was found; `models` and `weights` are the sets compared, `noise` 1 as whitened by sensors."""
+class RobotVerdict(Verdict):
+    """The verdict, and what it rests on: the gap's `detection`, what is left (`remainder`), `where` the gap
+    is; `left`: share of it that is left, by regime."""
 
-    verdict: str
-    causes: tuple[str, ...]
-    indistinguishable: tuple[str, ...]
-    probabilities: dict[str, float]
     detection: Detection
-    remainder: float
+    remainder: Remainder
     where: tuple[Cell, ...]
-    remainder_where: tuple[Cell, ...]
     shares: Shares
-    left: dict[str, float]  # share of the gap that is left, by regime
+    left: dict[str, float]
     shared: tuple[str, ...]  # effects that the shares are of, in their order
     model: Model  # of all that was borne out, too small to be told or not, discrepancies whitened
     chance: dict[str, float]  # of each candidate to act
@@ -59,90 +55,61 @@ def judge(
     every: Forms,
     forced: bool = False,
     fold: np.ndarray | None = None,
-) -> Verdict:
+) -> RobotVerdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
     `causes` were borne out by held-out rows, and explain what `told_by` says, in that order; `every` is the
     gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
     statistics.
 
     A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
-    channels that it moves. What is left in others is the remainder, which is told."""
-    gap = f.gap
+    channels that it moves, and the gap of these is the one that it explains. What is left in others is the
+    remainder, which is told."""
+    names = [c.name for c in f.gap.candidates]
     models = rivals(f, causes)
-    score = np.array([m.score for m in models])
-    weight = np.exp(score - np.logaddexp.reduce(score))
-    value = statistic(sensor, [fitted(sensor, causes), fitted(sensor, ())])
-    p = float(np.exp(min(0.0, -value)))
-    exceed = sum(t >= value for t in twins)
-    p = max(p, exceed / len(twins)) if twins else p
-    detection = Detection(value, p, 1 / (len(twins) + 1) if twins else 0.0)
+    detection = detected(statistic(sensor, [fitted(sensor, causes), fitted(sensor, ())]), twins or None)
     # Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it.
     least = np.where(told_by.part >= LEAST, told_by.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
     kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
-    parts = told_by.shares([causes.index(j) for j in kept], rng)
     left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
-    none = float(expit((np.log(max(p, 1e-300)) - np.log(ALARM)) / 0.5))
-    known = float(expit(np.log(MOST / max(left, 1e-6)) / WIDTH)) if kept else 0.0
-    name = lambda effects: tuple(sorted(gap.candidates[j].name for j in effects))  # noqa: E731
-    small = set(causes) - set(kept)
-    likely: dict[str, float] = {}
-    nothing = 0.0
-    for m, w in zip(models, weight, strict=True):
-        # What takes the place of an effect that is too small to be told is none of the causes either.
-        mine = kept if kept and set(kept) <= set(m.effects) else tuple(set(m.effects) - small)
-        if mine:
-            key = "+".join(name(mine))
-            likely[key] = likely.get(key, 0.0) + float(w)
-        else:
-            nothing += float(w)
-    probabilities = {"none": none, "unknown": (1 - none) * (nothing + (1 - nothing) * (1 - known))}
-    probabilities |= {k: (1 - none) * known * v for k, v in likely.items() if (1 - none) * known * v > 1e-4}
-    probabilities["other"] = max(0.0, 1.0 - sum(probabilities.values()))
-    verdict, partners = "none", ()
-    if forced:
-        verdict = "named"
-    elif p < ALARM:
-        verdict = "unknown"
-        if kept:
-            partners = _partners(models, causes, kept)
-            if fold is not None:
-                partners = tuple(sorted({*partners, *_not_told_apart(f, models, causes, kept, fold)}))
-            verdict = "set" if partners else "named"
-    told = kept if verdict in ("named", "set") else ()
-    noise, rows, band = np.ones(len(gap.rows.channels)), every.gap.rows, every.spectrum.band
-    before = _left(every, ())
-    number = {c.name: j for j, c in enumerate(every.gap.candidates)}
-    after = _left(every, tuple(sorted(number[gap.candidates[j].name] for j in told)))
-    chance = {
-        c.name: float(sum(w for m, w in zip(models, weight, strict=True) if j in m.effects)) * (1 - none)
-        for j, c in enumerate(gap.candidates)
-    }
-    return Verdict(
-        verdict,
-        name(told),
-        name(partners),
-        probabilities,
-        detection,
-        parts.remainder if told else 1.0,
-        significant(rows, band, before, noise[rows.channel]) if verdict != "none" else (),
-        significant(rows, band, after, noise[rows.channel]) if verdict != "none" else (),
-        parts,
-        dict(zip(told_by.regimes, told_by.left.tolist(), strict=True)) if told else {},
-        tuple(gap.candidates[j].name for j in kept),
-        fitted(f, causes),
-        chance,
+    sets = [
+        _explanation(names, m, float(w), causes, kept, known(left, 1 - left))
+        for m, w in zip(models, weights(models), strict=True)
+    ]
+    mine = tuple(sorted(names[j] for j in kept))
+    verdict = conclude(sets, detection.p_value, forced=mine if forced else (), chosen=mine)
+    if verdict.causes and fold is not None and not forced:
+        verdict = verdict.beside(names[j] for j in _not_told_apart(f, models, causes, kept, fold))
+    rows, band, sd = every.gap.rows, every.spectrum.band, np.ones(every.gap.rows.channel.size)
+    told = tuple(j for j, c in enumerate(every.gap.candidates) if c.name in verdict.causes)
+    gap = verdict.verdict != "none"
+    parts = told_by.shares(rng)
+    return RobotVerdict(
+        **vars(verdict),
+        detection=detection,
+        remainder=Remainder(
+            parts.remainder if told else float(gap),
+            detected(statistic(every, [fitted(every, told)], told)).p_value,
+            significant(rows, band, residual_left(every, fitted(every, told)), sd) if gap else (),
+        ),
+        where=significant(rows, band, residual_left(every, fitted(every, ())), sd) if gap else (),
+        shares=replace(parts, each=parts.each[:, [causes.index(j) for j in kept]]),
+        left=dict(zip(told_by.regimes, told_by.left.tolist(), strict=True)) if told else {},
+        shared=tuple(names[j] for j in kept),
+        model=fitted(f, causes),
+        chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
     )
 
 
-def _partners(models: Sequence[Model], causes: tuple[int, ...], told: tuple[int, ...]) -> tuple[int, ...]:
-    """Effects that take the place of a cause that is told in sets one in twenty as likely or more."""
-    best = next(m.score for m in models if m.effects == causes)
-    found: set[int] = set()
-    for m in models:
-        gone = set(causes) - set(m.effects)
-        if gone and gone <= set(told) and m.score > best - np.log(TWENTY):
-            found |= set(m.effects) - set(causes)
-    return tuple(sorted(found))
+def _explanation(
+    names: Sequence[str], model: Model, weight: float, borne: tuple[int, ...], kept: tuple[int, ...],
+    chance: float,
+) -> Explanation:  # fmt: skip
+    """A set as the verdict sees it: `chance` to be the cause, `kept` of those `borne` out are told."""
+    # What takes the place of an effect that is too small to be told is none of the causes either.
+    holds = bool(kept) and {*kept} <= {*model.effects}
+    causes = kept if holds else {*model.effects} - ({*borne} - {*kept})
+    named = tuple(sorted(names[j] for j in causes))
+    return Explanation(tuple(names[j] for j in model.effects), weight, named, chance if kept else 0.0)
 
 
 def _not_told_apart(
@@ -157,7 +124,7 @@ def _not_told_apart(
     ]
     for m in [m for m in rivals_of if set(causes) - set(m.effects) <= set(told)][:RIVALS]:
         apart = log_prior(f, m) - log_prior(f, best)
-        if apart > -np.log(TWENTY) and chance_of_gain(f.gap, causes, m.effects, fold) > BORNE_OUT:
+        if apart > -np.log(RULED_OUT) and chance_of_gain(f.gap, causes, m.effects, fold) > BORNE_OUT:
             found |= set(m.effects) - set(causes)
     return found
 
@@ -171,10 +138,3 @@ def log_prior(f: Forms, model: Model) -> float:
         out -= 0.5 * (1 + k) * float(np.log1p(x @ x))
         at += k
     return out
-
-
-def _left(f: Forms, effects: tuple[int, ...]) -> np.ndarray:
-    """Residual cosines (n,) that a set leaves."""
-    from simgap.attribution.invariance import residual_left
-
-    return residual_left(f, fitted(f, effects))

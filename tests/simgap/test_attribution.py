@@ -14,7 +14,7 @@ from simgap.attribution.background import Background
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.heldout import how_far
-from simgap.attribution.invariance import WANDER, Invariance, invariance
+from simgap.attribution.invariance import WANDER, invariance
 from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import sought, weights
@@ -285,7 +285,7 @@ def test_what_has_no_name_explains_only_what_names_do_not():
 
 
 def test_a_cause_of_a_sliver_of_the_gap_leaves_it_unknown():
-    steady = [Invariance(3.0, 1.0, 0.0, np.zeros((2, 1)), np.zeros((2, 1)))]
+    steady = [3.0]
     assert known(0.05, 0.9, steady) > 0.9
     assert known(0.05, 0.01, steady) < 0.01
     assert known(0.9, 0.9, steady) < 0.1
