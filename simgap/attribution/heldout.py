@@ -42,17 +42,20 @@ def how_far(gap: Gap, noise: np.ndarray) -> HowFar | None:
         before[k] = min(before[k], _square(judge, (), weight, empty.x))
         floor[k] = judge.count.sum()
     gone, there = before - after, before - floor
-    total = float(there.sum())
-    if total <= 0:
+    if float(there.sum()) <= 0:
         return None
-    fraction = min(float(gone.sum()) / total, 1.0)
-    # Jackknife of a ratio (Tukey, Ann. Math. Stat. 29, 1958).
-    others = (gone.sum() - gone) / np.maximum(there.sum() - there, 1e-9)
-    sd = float(np.sqrt((trials.size - 1) / trials.size * ((others - others.mean()) ** 2).sum()))
-    wide = float(student.ppf(0.95, trials.size - 1)) * sd
     n = float(floor.sum())
-    return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, fraction,
-                  (fraction - wide, min(fraction + wide, 1.0)))  # fmt: skip
+    return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *fraction_gone(gone, there))
+
+
+def fraction_gone(gone: np.ndarray, there: np.ndarray) -> tuple[float, tuple[float, float]]:
+    """Share of the gap that is gone, of what is `gone` and what was `there` in K parts (K,), and its 90 %
+    interval by the jackknife of a ratio (Tukey, Ann. Math. Stat. 29, 1958)."""
+    k, fraction = gone.size, min(float(gone.sum() / there.sum()), 1.0)
+    others = (gone.sum() - gone) / np.maximum(there.sum() - there, 1e-9)
+    sd = float(np.sqrt((k - 1) / k * ((others - others.mean()) ** 2).sum()))
+    wide = float(student.ppf(0.95, k - 1)) * sd
+    return fraction, (fraction - wide, min(fraction + wide, 1.0))
 
 
 def _square(f: Forms, effects: tuple[int, ...], weight: np.ndarray, x: np.ndarray) -> float:

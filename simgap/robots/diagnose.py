@@ -30,7 +30,7 @@ from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import pruned
 from simgap.robots.search import Found, moved_to, point_of, search
-from simgap.robots.twins import healthy_twins
+from simgap.robots.twins import Twins, healthy_twins
 from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
@@ -104,9 +104,7 @@ def _diagnosed(
     warn: Tell,
 ) -> RobotDiagnosis:
     """The diagnosis of a part of the windows; `whole` has all, and in all of them what is left is told."""
-    rng = np.random.default_rng(seed)
-    simulator, recordings, effects = composed.simulator, composed.recordings, composed.effects
-    parts = phases_of(simulator, recordings) if phases is None else phases
+    parts = phases_of(composed.simulator, composed.recordings) if phases is None else phases
     warnings: list[str] = []
 
     def said(text: str) -> None:
@@ -114,9 +112,49 @@ def _diagnosed(
         warn(text)
 
     tell("sensitivities")
+    composed, plain, alike = _told_by_logs(composed, said)
+    wanted = [n for n in plain.moved if n not in fitted_along(composed)]
+    tell("healthy twins")
+    twins = healthy_twins(composed, plain, parts, seed)
+    found = search(composed, parts, wanted, tell, forced, twins.factor)
+    fold = folds_of(found.linear, len(composed.recordings))
+    if forced:
+        borne = tuple(found.names[j] for j in found.models[0].effects)
+        point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
+    else:
+        tell("held-out logs")
+        borne, point = pruned(composed, parts, found, fold, twins.factor)
+    tell("refit")
+    ended = _refitted(composed, parts, point, wanted, borne, twins.factor)
+    tell("shares")
+    verdict = _judged(whole, composed, parts, ended, plain.point, twins, fold, seed, bool(forced))
+    far, sensor = None, ended.covariances.whitener()
+    if verdict.causes:
+        tell("how far")
+        far = shrinkage(composed, ended, plain, sensor, fold, ended.best, forced=bool(forced))
+    return RobotDiagnosis(
+        composed,
+        parts,
+        _least_squares(composed, plain, sensor),
+        ended.linear,
+        found,
+        ended.forms,
+        verdict,
+        far,
+        alike,
+        next_log(ended.forms, verdict, [r.name for r in composed.recordings]),
+        borne,
+        ended.discrepancy.scale,
+        tuple(warnings),
+    )
+
+
+def _told_by_logs(composed: Composed, said: Tell) -> tuple[Composed, Linear, Identifiability]:
+    """The gap as the simulator comes with all sensitivities, what the logs can tell by them, and the same
+    windows with what contacts make of them; what is left out, and what no such log tells apart, is said."""
     along = fitted_along(composed)
-    wanted = [n for n in effects if n not in along]
-    plain = _plain(composed, {n: effects[n].neutral() for n in along}, wanted)
+    plain = _plain(composed, {n: composed.effects[n].neutral() for n in along},
+                   [n for n in composed.effects if n not in along])  # fmt: skip
     composed = wobbling(composed, plain)
     plain = replace(plain, wobble=composed.wobble)
     for name in plain.diverged:
@@ -125,82 +163,63 @@ def _diagnosed(
         said(
             f"the simulator diverges in {plain.dropped} of {len(composed.windows)} windows: they are left out"
         )
-    wanted = [n for n in wanted if n in plain.moved]
-    alike = _alike(composed, plain, [*along, *wanted])
+    alike = _alike(composed, plain, [*along, *(n for n in plain.moved if n not in along)])
     for one in alike.alike:
         if one.exact:
             said(f"{', '.join(one.names)} act only together on these logs: no such log can tell them apart")
-    tell("healthy twins")
-    twins = healthy_twins(composed, plain, parts, seed)
-    found = search(composed, parts, wanted, tell, forced, twins.factor)
-    fold = folds_of(found.linear, len(recordings))
-    rows = np.flatnonzero(np.isfinite(found.linear.residual))
-    if forced:
-        chosen = found.models[0].effects
-        borne = tuple(found.names[j] for j in chosen)
-        point = point_of(composed, found.forms, chosen, found.linear.point)
-    else:
-        tell("held-out logs")
-        borne, point = pruned(composed, parts, found, fold, twins.factor)
-    tell("refit")
-    linear, off = _refitted(composed, point, [*along, *wanted], twins.factor)
+    return composed, plain, alike
+
+
+def _refitted(
+    composed: Composed, phases: Phases, point: Point, wanted: Sequence[str], borne: Sequence[str],
+    factor: np.ndarray,
+) -> Found:  # fmt: skip
+    """Everything linear about the best fit of what was borne out, its discrepancies, and that set there."""
+    linear = linearise(composed, _settled(composed, point, factor), [*fitted_along(composed), *wanted])
+    cov = covariances(composed, linear, factor)
+    off = learned(cov, linear.residual) if len(cov.blocks) else NONE
     usable = [n for n in wanted if n in linear.moved]
-    kinds = {n: c.kind for n, c in simulator.channels.items()}
-    cov = covariances(linear, composed.windows, kinds, twins.factor)
-    sensor = cov.whitener()
+    f = forms(gap_of(composed, linear, cov.whitener(off), phases, usable))
     causes = tuple(sorted(usable.index(n) for n in borne))
-    f = forms(gap_of(composed, linear, cov.whitener(off), parts, usable))
-    s = forms(gap_of(composed, linear, sensor, parts, usable))
-    null = [_twin_statistic(s, white, rows) for white in twins.residuals]
-    told_apart = fold[rows] if off and len(recordings) >= 3 else None
-    tell("shares")
     names = tuple(usable[j] for j in causes)
-    told_by = explained(composed, linear, sensor, plain.point, names, whole)
-    every = s if whole is composed else _every(whole, linear.point, [*along, *names], parts, names)
-    verdict = judge(f, s, causes, null, rng, told_by, every, bool(forced), told_apart)
-    far = None
-    if verdict.causes:
-        tell("how far")
-        ended = Found(linear, cov.whitener(off), cov, off, f, (fitted(f, causes),), borne)
-        far = shrinkage(composed, ended, plain, sensor, fold, names, forced=bool(forced))
-    plain = _least_squares(composed, plain, sensor)
-    following = next_log(f, verdict, [r.name for r in recordings])
-    return RobotDiagnosis(
-        composed,
-        parts,
-        plain,
-        linear,
-        found,
-        f,
-        verdict,
-        far,
-        alike,
-        following,
-        borne,
-        off.scale,
-        tuple(warnings),
-    )
+    return Found(linear, cov.whitener(off), cov, off, f, (fitted(f, causes),), names)
 
 
-def _every(
-    whole: Composed, point: Point, effects: Sequence[str], parts: Phases, causes: Sequence[str]
-) -> Forms:
+def _judged(
+    whole: Composed, composed: Composed, phases: Phases, ended: Found, plain: Point, twins: Twins,
+    fold: np.ndarray, seed: int, forced: bool,
+) -> RobotVerdict:  # fmt: skip
+    """The verdict on what was borne out, told of the windows of `whole`."""
+    linear, sensor = ended.linear, ended.covariances.whitener()
+    rows = np.flatnonzero(np.isfinite(linear.residual))
+    s = forms(gap_of(composed, linear, sensor, phases, ended.names))
+    told_by = explained(composed, linear, sensor, plain, ended.best, whole)
+    every = s if whole is composed else _every(whole, linear.point, ended.best, phases)
+    null = [_twin_statistic(s, white, rows) for white in twins.residuals]
+    told_apart = fold[rows] if ended.discrepancy and len(composed.recordings) >= 3 else None
+    rng = np.random.default_rng(seed)
+    return judge(ended.forms, s, ended.models[0].effects, null, rng, told_by, every, forced, told_apart)
+
+
+def _every(whole: Composed, point: Point, causes: Sequence[str], phases: Phases) -> Forms:
     """The gap of all windows about a point, by the sensors' noise alone, with these causes as its
     candidates."""
-    linear = linearise(whole, point, effects)
-    kinds = {n: c.kind for n, c in whole.simulator.channels.items()}
-    white = covariances(linear, whole.windows, kinds).whitener()
-    return forms(gap_of(whole, linear, white, parts, causes))
+    linear = linearise(whole, point, [*fitted_along(whole), *causes])
+    return forms(gap_of(whole, linear, covariances(whole, linear).whitener(), phases, causes))
+
+
+def _settled(composed: Composed, point: Point, factor: np.ndarray | None = None) -> Point:
+    """The point of least squares, discrepancies learned anew on the way there."""
+    for _ in range(REFITS if point else 0):
+        rough = linearise(composed, point, [])
+        cov = covariances(composed, rough, factor)
+        point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
+    return point
 
 
 def _plain(composed: Composed, point: Point, wanted: Sequence[str]) -> Linear:
     """The gap as the simulator comes, with what was never measured fitted, and all sensitivities there."""
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
-    for _ in range(REFITS if point else 0):
-        rough = linearise(composed, point, [])
-        cov = covariances(rough, composed.windows, kinds)
-        point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
-    return linearise(composed, point, [*point, *wanted])
+    return linearise(composed, _settled(composed, point), [*point, *wanted])
 
 
 def _least_squares(composed: Composed, plain: Linear, sensor: Whitener) -> Linear:
@@ -210,22 +229,9 @@ def _least_squares(composed: Composed, plain: Linear, sensor: Whitener) -> Linea
     return linearise(composed, moved_to(composed, plain, sensor, plain.point), [])
 
 
-def _refitted(composed: Composed, point: Point, effects: Sequence[str], factor: np.ndarray):
-    """Everything linear about the point of best fit, and its discrepancies."""
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
-    for _ in range(REFITS if point else 0):
-        rough = linearise(composed, point, [])
-        cov = covariances(rough, composed.windows, kinds, factor)
-        point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
-    linear = linearise(composed, point, effects)
-    cov = covariances(linear, composed.windows, kinds, factor)
-    return linear, (learned(cov, linear.residual) if len(cov.blocks) else NONE)
-
-
 def _alike(composed: Composed, linear: Linear, names: Sequence[str]) -> Identifiability:
     """What the logs can tell, from sensitivities at the plain point."""
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
-    whiten = covariances(linear, composed.windows, kinds).whitener()
+    whiten = covariances(composed, linear).whitener()
     told, columns = [], []
     for name in names:
         effect, moved = composed.effects[name], linear.moved[name]

@@ -97,9 +97,8 @@ def explained(
     every, rows = asked, linear.rows
     if whole is not composed:
         there = linearise(whole, linear.point, [])
-        kinds = {n: c.kind for n, c in whole.simulator.channels.items()}
         every, rows = (
-            _Squares.of(whole, there, covariances(there, whole.windows, kinds).whitener()),
+            _Squares.of(whole, there, covariances(whole, there).whitener()),
             whole.rows,
         )
     names, _ = regimes_of(rows)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
+from simgap.attribution.heldout import fraction_gone
 from simgap.attribution.posterior import forms
 from simgap.attribution.search import sought
 from simgap.robots.borne_out import borne_out
@@ -81,11 +81,7 @@ def _plain(composed: Composed, point: Point, logs: Sequence[int]) -> Point:
         return point
     part = composed.along(logs)
     linear = linearise(part, point, list(point))
-    return moved_to(part, linear, covariances(linear, part.windows, _kinds(composed)).whitener(), point)
-
-
-def _kinds(composed: Composed) -> dict[str, str]:
-    return {n: c.kind for n, c in composed.simulator.channels.items()}
+    return moved_to(part, linear, covariances(part, linear).whitener(), point)
 
 
 def _measured(
@@ -108,11 +104,6 @@ def _measured(
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]
     if there.sum() <= 0:
         return None
-    fraction = min(float(gone.sum() / there.sum()), 1.0)
-    others = (gone.sum() - gone) / np.maximum(there.sum() - there, 1e-9)
-    k = numbers.size
-    sd = float(np.sqrt((k - 1) / k * ((others - others.mean()) ** 2).sum()))  # Tukey's jackknife of a ratio
-    wide = float(student.ppf(0.95, k - 1)) * sd
     rms = {}
     for c, name in enumerate(linear.rows.channels):
         mine = usable & (linear.rows.channel == c)
@@ -123,8 +114,7 @@ def _measured(
         total[0] / total[2],
         total[1] / total[2],
         1.0,
-        fraction,
-        (fraction - wide, min(fraction + wide, 1.0)),
+        *fraction_gone(gone, there),
         rms,
         told,
         before,
@@ -144,7 +134,7 @@ def _refitted(
     """The point fitted to some of the logs alone, exactly."""
     part = composed.along(logs)
     linear = linearise(part, point, list(point))
-    cov = covariances(linear, part.windows, _kinds(composed))
+    cov = covariances(part, linear)
     numbers = {
         i: found.discrepancy.multiplier.get(composed.windows.index(w), 1.0)
         for i, w in enumerate(part.windows)

@@ -26,7 +26,6 @@ def pruned(
 ) -> tuple[tuple[str, ...], Point]:
     """The effects that are left, and the point of their best fit. `fold` (N,): of each row; `factor` (N,)
     multiplies the noise's sd."""
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     along = fitted_along(composed)
     kept = tuple(found.names[j] for j in found.models[0].effects)
     point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
@@ -34,7 +33,7 @@ def pruned(
     while kept:
         point = moved_to(composed, linear, whiten, point)
         linear = linearise(composed, point, [*along, *kept])
-        cov = covariances(linear, composed.windows, kinds, factor)
+        cov = covariances(composed, linear, factor)
         whiten = cov.whitener(learned(cov, linear.residual))
         f = forms(gap_of(composed, linear, whiten, phases, kept))
         rows = np.flatnonzero(np.isfinite(linear.residual))

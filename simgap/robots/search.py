@@ -56,13 +56,12 @@ def search(
     factor: np.ndarray | None = None,
 ) -> Found:
     """Search until the best set and its parameters stay."""
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     along = fitted_along(composed)
     point: Point = {n: composed.effects[n].neutral() for n in along}
     if along:
         rough = linearise(composed, point, along)
         for _ in range(2):
-            cov = covariances(rough, composed.windows, kinds, factor)
+            cov = covariances(composed, rough, factor)
             point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
             rough = linearise(composed, point, along)
     best: tuple[str, ...] = ()
@@ -71,7 +70,7 @@ def search(
         tell(f"round {number + 1}")
         linear = linearise(composed, point, [*along, *candidates])
         usable = [n for n in candidates if n in linear.moved]
-        cov = covariances(linear, composed.windows, kinds, factor)
+        cov = covariances(composed, linear, factor)
         off = learned(cov, linear.residual)
         whiten = cov.whitener(off)
         linear, leaders = _leaders(composed, linear, whiten, phases, usable, best)

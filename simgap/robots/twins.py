@@ -34,7 +34,6 @@ class Twins:
 def healthy_twins(composed: Composed, plain: Linear, phases: Phases, seed: int) -> Twins:
     """Twins at the plain point; where the simulator cannot follow the whole log, noise is as stated."""
     rng = np.random.default_rng(seed)
-    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     found = []
     for _ in range(TWINS):
         recordings = twin_recordings(composed, plain.point, rng)
@@ -45,7 +44,7 @@ def healthy_twins(composed: Composed, plain: Linear, phases: Phases, seed: int) 
         found.append(
             (
                 linear,
-                covariances(linear, twin.windows, kinds).whitener()(
+                covariances(twin, linear).whitener()(
                     np.where(np.isfinite(linear.residual), linear.residual, 0.0)
                 ),
             )

@@ -21,14 +21,15 @@ mode. The Cholesky factor turns rows into innovations: what each says beyond tho
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from simgap.robots.linear import Linear
-from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES, Window
+from simgap.robots.model import Composed
+from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
 
 TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
@@ -110,11 +111,9 @@ def total(
     return out
 
 
-def covariances(
-    linear: Linear, windows: Sequence[Window], kinds: Mapping[str, str], factor: np.ndarray | None = None
-) -> Covariances:
-    """Covariances of all windows that did not diverge. `kinds` by channel; `factor` (N,) multiplies the
-    noise's sd."""
+def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = None) -> Covariances:
+    """Covariances of all windows that did not diverge; `factor` (N,) multiplies the noise's sd."""
+    kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     blocks, numbers, noises, sources = [], [], [], []
     free = bool(linear.starts)
     for number, mine in enumerate(linear.rows.of):
@@ -123,7 +122,7 @@ def covariances(
         for block in [np.arange(mine.start, mine.stop)] if free else _by_channel(linear, mine):
             scale = 1.0 if factor is None else factor[block]
             noise = np.diag(linear.rows.variance[block] * scale**2)
-            for state, doubt in windows[number].doubt.items():
+            for state, doubt in composed.windows[number].doubt.items():
                 column = linear.starts[state][block] * doubt
                 noise += np.outer(column, column)
             blocks.append(block)

@@ -147,9 +147,8 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     composed = Composed.of(simulator, [log], {scale.name: scale}, noise, 0.2)
     composed = wobbling(composed, linearise(composed, {}, [scale.name]))
     linear = linearise(composed, {}, [scale.name])
-    kinds = {n: c.kind for n, c in simulator.channels.items()}
     usual = {CONTACTS: 1.0, "z, lying": 2e-2 * 0.05}
-    whiten = covariances(linear, composed.windows, kinds).whitener(Discrepancy(usual, {}))
+    whiten = covariances(composed, linear).whitener(Discrepancy(usual, {}))
     slope = whiten(linear.moved[scale.name].jacobian)[:, 0]
     residual = whiten(linear.residual)
     free = ~composed.rows.touching
@@ -196,7 +195,7 @@ def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
     simulator, log = dropped
     composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     linear = linearise(composed, {}, [])
-    cov = covariances(linear, composed.windows, {n: c.kind for n, c in simulator.channels.items()})
+    cov = covariances(composed, linear)
     for number, block, sources in zip(cov.window, cov.blocks, cov.sources, strict=True):
         lying = {n: s for n, s in sources.items() if n.endswith(LIES)}
         assert len(lying) == (len(POSE) if composed.windows[number].regime == RESTS else 0)

@@ -30,7 +30,7 @@ def composed(recordings, length: float = 0.4) -> Composed:
 def whitened(model: Composed, point=None, effects=()):
     """Residual and Jacobians, whitened by the sensors' noise and the starts' alone."""
     linear = linearise(model, point or {}, list(effects))
-    whiten = covariances(linear, model.windows, {"angle": "position"}).whitener()
+    whiten = covariances(model, linear).whitener()
     return whiten(linear.residual), {n: whiten(m.jacobian) for n, m in linear.moved.items()}, linear
 
 
@@ -141,11 +141,11 @@ def test_resolution_is_found_and_only_where_there_is_one():
 def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
     model = composed([log(s) for s in range(3)])
     linear = linearise(model, {}, [])
-    cov = covariances(linear, model.windows, {"angle": "position"})
+    cov = covariances(model, linear)
     assert learned(cov, linear.residual) == NONE
     off = composed([log(s, viscous=0.01) for s in range(3)])
     linear = linearise(off, {}, [])
-    cov = covariances(linear, off.windows, {"angle": "position"})
+    cov = covariances(off, linear)
     found = learned(cov, linear.residual)
     assert set(found.scale) >= {"angle"} and found.scale["angle"] > 0.1
     white = cov.whitener(found)(linear.residual)

@@ -61,7 +61,7 @@ def damped() -> Composed:
 
 def told(model: Composed, point, causes):
     linear = linearise(model, point, [])
-    sensor = covariances(linear, model.windows, {"angle": "position"}).whitener()
+    sensor = covariances(model, linear).whitener()
     return explained(model, linear, sensor, {}, causes, model)
 
 
