@@ -15,6 +15,7 @@ from estimation.observations import Aligned, Noise, aligned_weights
 from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
+from estimation.rolling import without_roll
 from estimation.sampler import Draws, sample
 from estimation.sliding import with_slides
 from estimation.tables import properties_table
@@ -159,8 +160,9 @@ def identify_aligned(
 ) -> Identification:
     """Properties of every block from aligned trials, pooled; `progress(steps_done, steps_at_most)`."""
     rng, rig = np.random.default_rng(seed), aligned.rig
-    trials = [one.trial for one in aligned.trials]
-    weighed, noise = aligned_weights(aligned, rng)
+    level = without_roll(aligned)
+    trials = [one.trial for one in level.trials]
+    weighed, noise = aligned_weights(level, rng)
     weighed = with_slides(weighed, noise, aligned.rig)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(trials, weighed, noise, aligned.task, rig)

@@ -12,6 +12,12 @@ leaves out):
 | sliding on ground | `block_y` constant; |net fx - m ax| <= mu `support_load` |
 | hold above ground | net fx = m ax; net fy = `carried_force` |
 
+A hand that rolls turns its fingers and what they hold together. These equations hold along and across the
+hand, so differences between the fingers are turned back first (`turned`); sums and means stay as they are:
+weight hangs down however the hand is turned. A roll shows as a height difference of the fingers
+(`rolled_offset`), and what hangs in a rolled hand has one corner lower than the middle of its base
+(`corner_drop`).
+
 Emissions (hmmseg.segmentation), observations of properties (estimation) and residuals of the gap (simgap) are
 built from these functions; the dynamics of the virtual model (simgap.world) is tested against them. All
 work on NumPy and JAX arrays alike, of any shape that broadcasts, in SI units, and raise nothing.
@@ -20,6 +26,8 @@ work on NumPy and JAX arrays alike, of any shape that broadcasts, in SI units, a
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from hmmseg.io.rig import Rig
 
@@ -59,6 +67,22 @@ def block_y(y: Values, fy1: Values, fy2: Values, pads: Pads) -> Values:
 def block_offset(offset: Values, fy1: Values, fy2: Values, pads: Pads) -> Values:
     """Height difference [m] of the places at which the pads hold the block: constant in one grip."""
     return offset - (fy2 * pads.shear2 - fy1 * pads.shear1)
+
+
+def turned(across: Values, up: Values, angle: Values) -> tuple[Values, Values]:
+    """A vector with these horizontal and vertical components, turned counterclockwise by `angle` [rad]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return across * cos - up * sin, across * sin + up * cos
+
+
+def rolled_offset(distance: Values, roll: Values) -> Values:
+    """Height difference [m] that a small roll [rad] gives to fingers at this distance [m]."""
+    return distance * roll
+
+
+def corner_drop(width: Values, tilt: Values) -> Values:
+    """How far [m] the lowest corner of a block, tilted by a small angle [rad], is below its base's middle."""
+    return rolled_offset(width, abs(tilt)) / 2
 
 
 def hanging(weight: Values, pads: Pads) -> Values:

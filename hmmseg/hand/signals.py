@@ -12,7 +12,7 @@ import numpy as np
 
 from hmmseg.hand.kinematics import forward, jacobian
 from hmmseg.io.rig import Rig
-from hmmseg.io.trial import Trial
+from hmmseg.io.trial import ROLL, Trial
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Signals:
     touches: tuple[tuple[float, float], ...] = ()  # times of touch and release known apart, and sds [s]
     timing: np.ndarray | None = None  # sd of when a force changed that changes there [s]
     free: np.ndarray | None = None  # share of a sample in which nothing is held for sure
+    roll: np.ndarray | None = None  # of the hand [rad], where recorded; the rest is as if it had none
 
     @property
     def x(self) -> np.ndarray:
@@ -130,7 +131,8 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
     sds = {f"sd_{name}": np.sqrt(variance) for name, variance in variances.items()}
     force = np.nan if noise.force is None else noise.force
     return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,  # type: ignore[arg-type]
-                   touches=trial.touches, timing=trial.timing, free=trial.free)  # fmt: skip
+                   touches=trial.touches, timing=trial.timing, free=trial.free,
+                   roll=channels.get(ROLL))  # fmt: skip
 
 
 def _square(sd: float | None) -> float:

@@ -21,9 +21,9 @@ from hmmseg.hand.opening import Grip
 from hmmseg.hand.pose import Pose, bridged, pose_of, smooth
 from hmmseg.hand.quaternion_order import order_warnings
 from hmmseg.hand.tool import Tool
-from hmmseg.io.gripper import Gripper, direction
+from hmmseg.io.gripper import AXES, Gripper, direction
 from hmmseg.io.rig import Rig
-from hmmseg.io.trial import Trial
+from hmmseg.io.trial import ROLL, Trial
 
 # chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
 LAG = 0.012
@@ -124,6 +124,10 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
         "x2": x + shown / 2, "y2": y, "vx2": velocity @ pose.across + closing, "vy2": velocity @ pose.up,
         "fx2": fx / 2 - grip, "fy2": fy / 2,
     }  # fmt: skip
+    assert rig.gripper is not None
+    if rig.gripper.turns:  # by which fingers and block stand askew, who are level in these channels
+        closing = pose.turned[:, :, AXES.index(rig.gripper.closing)]
+        channels[ROLL] = np.arcsin(np.clip(closing @ pose.up, -1.0, 1.0))
     if pressing is not None and not isinstance(pressing, float):
         missing = ~np.isfinite(pressing)
         for name in ("fx1", "fx2"):
@@ -135,7 +139,6 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     for each in grips:
         last = min(each.stop, t.size) - 1
         surely[(t > t[each.start] - SURELY) & (t < t[last] + SURELY)] = 0.0
-    assert rig.gripper is not None
     wrong = _inertia(t, pose, tool, rig.gripper.turns, rig.gravity)
     timing = _timing(t, pose, np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)), fy, tool.noise)
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,

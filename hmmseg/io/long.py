@@ -78,10 +78,12 @@ class LongRecording:
 
     def _pieces(self) -> Iterator[Trial]:
         """All pieces in order; times count from the first one's zero."""
+        from hmmseg.hand.roll import levelled  # which reads trials itself
+
         names, _ = channels_of(self.rig, None)
         wanted = [source_of(name, self.rig.columns) for name in ("t", *(names or ()))]
         for table in pieces_of(self.path, wanted, self.piece, MIN_SAMPLES):
-            trial = trial_of(table, self.rig, None, whole=False)
+            trial = levelled(trial_of(table, self.rig, None, whole=False))
             if trial.origin is not None:
                 self._origin = trial.origin if self._origin is None else self._origin
                 trial = replace(trial, t=trial.t + (trial.origin - self._origin) * 1e-9)

@@ -21,6 +21,7 @@ from hmmseg.io.units import LARGEST, si_factor
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
 CARTESIAN_OPTIONAL = ("vx1", "vy1", "vx2", "vy2")
+ROLL = "hand_roll"  # of a Cartesian hand whose fingers turn together [rad]; optional
 LATEST = 1e25  # limit: of times before anything is known of their unit; ns since 1970 are 1e18
 MIN_SAMPLES = 8  # limit: fewer show no task
 MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
@@ -104,10 +105,12 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     trial = trial_of(table, rig, task)
     if task is not None or rig is None:
         return trial
-    from hmmseg.hand.plausibility import check  # which reads trials itself
+    from hmmseg.hand.plausibility import check  # which read trials themselves
+    from hmmseg.hand.roll import levelled
     from hmmseg.hand.wrist import from_halves, halved, two_fingers
 
     warnings = check(trial, rig)
+    trial = levelled(trial)
     if rig.gripper is not None:
         trial = two_fingers(trial, rig)
     elif halved(trial):
@@ -161,7 +164,9 @@ def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, 
     assert rig is not None
     if rig.gripper is not None:
         return rig.gripper.channels, ()
-    return (JOINT_CHANNELS, ()) if rig.jointed else (CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL)
+    if rig.jointed:
+        return JOINT_CHANNELS, ()
+    return (*CARTESIAN_CHANNELS, ROLL), (*CARTESIAN_OPTIONAL, ROLL)
 
 
 def _every(table: Table, columns: Mapping[str, Column]) -> list[str]:

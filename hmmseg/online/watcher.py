@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hand.roll import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
+from hmmseg.io.trial import ROLL
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
 from hmmseg.online.wrist import Wrist, checked
@@ -52,11 +54,14 @@ class Watcher:
         self.filter = Filter(description, hand, float(lag))
         self._wrist = None if hand.gripper is None else Wrist(hand)
         self.channels, self.optional = self.filter.channels, self.filter.optional
+        if not hand.jointed and self._wrist is None:
+            self.channels, self.optional = (*self.channels, ROLL), (*self.optional, ROLL)
         if self._wrist is not None:
             self.channels, self.optional = self._wrist.names, ()
         self.counts: Counter[str] = Counter()
         self._mark: Any = None  # where the last grip of a wrist's gripper began
         self._snapshots: deque[tuple[float, Any]] = deque()
+        self._roll = 0.0  # of the hand, as last recorded [rad]
         self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
 
@@ -83,7 +88,10 @@ class Watcher:
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]
         row = np.array(channels, dtype=np.float64)
-        if row.shape != (len(self.channels),):
+        rolls = ROLL in self.channels  # which stands last, and may be left out
+        if rolls and row.shape == (len(self.channels),):
+            row = self._level(row)
+        if row.shape != (len(self.channels) - rolls,):
             expected = f"({len(self.channels)},): {', '.join(self.channels)}"
             raise ValueError(f"channels: shape {row.shape}, expected {expected}")
         if not math.isfinite(t):
@@ -94,6 +102,12 @@ class Watcher:
         answer = f.answer()
         answer.note = note
         return answer
+
+    def _level(self, row: np.ndarray) -> np.ndarray:
+        """The row as a level hand's; while its roll is missing it is taken to be the last one."""
+        if not math.isnan(row[-1]):
+            self._roll = float(row[-1])
+        return level_row(row[:-1], self._roll) if self._roll else row[:-1]
 
     def _followed(self, t: float, row: np.ndarray) -> str | None:
         """Take a row, in its place; what was odd about it."""

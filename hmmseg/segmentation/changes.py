@@ -112,7 +112,8 @@ def cut(change: Change) -> Change | None:
         return None
     index = index[near[0] : near[-1] + 2]
     return replace(change, contacts=tuple(
-        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
+        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index],
+                ahead=None if c.ahead is None else c.ahead[index])
         for c in change.contacts
     ))  # fmt: skip
 
@@ -250,7 +251,7 @@ def _crossing(c: Penetration, n: int, change: Change, abrupt: float) -> Crossing
     """The crossing of interval n: by position where apart, by force where there is contact."""
     making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
-    pressed, gap = c.pressed[touching], c.place[apart]
+    pressed, gap = c.pressed[touching], c.free_place[apart]
     sd_pressed = float(np.hypot(c.sd_pressed, c.form * abs(pressed)))
     if c.hidden:  # a rigid pad hides its compression
         pressed = max(c.place[touching], 0.0)

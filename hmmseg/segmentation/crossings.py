@@ -28,7 +28,8 @@ class Contacts:
     `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
     position along its own closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just
     after each sample, by finger, `sinking` (2, T) that of the mean height downwards [m/s]; `deflection` (T,):
-    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N].
+    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N];
+    `drop` (T,): how far the lowest corner of a carried block lies below the middle of its base [m].
     """
 
     signals: Signals
@@ -39,6 +40,7 @@ class Contacts:
     sinking: np.ndarray
     deflection: np.ndarray
     tangential: np.ndarray
+    drop: np.ndarray
     weight: dict[str, float]
     sd: dict[str, float]
 
@@ -116,7 +118,7 @@ class Contacts:
         return self._timely(Penetration(
             self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
             self.sd["deflection"], self.sd["carried"], self.sd["y"], self.sd["vy"],
-            self.sensing.shear.form, self.sensing.shear.value < RIGID,
+            self.sensing.shear.form, self.sensing.shear.value < RIGID, ahead=self.drop,
         ), making)  # fmt: skip
 
     def _timely(self, c: Penetration, making: bool) -> Penetration:
@@ -150,8 +152,13 @@ def shown(pads: Pads) -> Pads:
     return Pads(*(max(float(c), STIFFEST) for c in pads))
 
 
-def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Contacts:
-    """Contacts of one trial; noise the rig does not state is learned from the recording."""
+def contacts(
+    signals: Signals, sensing: Sensing, parameters: Parameters, drop: tuple[np.ndarray, float] | None = None
+) -> Contacts:
+    """Contacts of one trial; noise the rig does not state is learned from the recording.
+
+    `drop`: of a carried block's lowest corner, and its sd [m] (`hmmseg.segmentation.tilt`); None: level.
+    """
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
     inward = np.stack([s.x1, -s.x2])
@@ -162,17 +169,18 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     pads, toe = shown(sensing.pads), sensing.normal.toe
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
+    lowest, lowest_sd = (np.zeros(s.t.size), 0.0) if drop is None else drop
     return Contacts(
         signals=s, sensing=sensing,
         compression=_compression(normal, sensing),
         inward=inward, inward_rate=rates, sinking=sinking, deflection=-block_y(0.0, fy1, fy2, pads),
-        tangential=np.stack([fy1, fy2]),
+        tangential=np.stack([fy1, fy2]), drop=lowest,
         weight=parameters.weight,
         sd={
             "compression": force * (float(pads.normal1) + toe.slope),
             "inward": sd_x,
             "inward_rate": sd_vx,
-            "y": float(np.hypot(sd_y / root2, level)),
+            "y": float(np.sqrt(sd_y**2 / 2 + level**2 + lowest_sd**2)),
             "vy": sd_vy / root2,
             "deflection": root2 * hanging(force, pads),
             "carried": hanging(max(parameters.scale["carry"], root2 * force), pads),

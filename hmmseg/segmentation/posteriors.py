@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from hmmseg.segmentation.crossings import HELD, contacts
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import Sensing
 from hmmseg.segmentation.spans import Span
+from hmmseg.segmentation.tilt import corner_drops
 
 INTERVAL = (0.05, 0.95)  # chosen
 NEARBY = 0.15  # chosen: s; a touch known apart from forces this near a boundary is that boundary
@@ -30,10 +32,11 @@ def contact_changes(
     `signals` are those that locate contacts, `thinned` those that were aligned.
     """
     t = thinned.t
-    table = contacts(signals, sensing, parameters)
     path = posterior.smoothed.argmax(axis=1)
     last = np.searchsorted(path, np.arange(len(steps) - 1), side="right") - 1
     edges = [float(t[0]), *t[last], float(t[-1])]
+    drop = corner_drops(signals, sensing.pads, list(pairwise(edges)), steps)
+    table = contacts(signals, sensing, parameters, drop)
     out = []
     for k in range(len(steps) - 1):
         probability = posterior.moves[0][:, k]

@@ -48,6 +48,12 @@ class Penetration:
     sd_rate: float
     form: float
     hidden: bool = False
+    ahead: np.ndarray | None = None
+
+    @property
+    def free_place(self) -> np.ndarray:
+        """Place (num_samples,) [m] of a thing that is apart."""
+        return self.place if self.ahead is None else self.place + self.ahead
 
 
 def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -62,13 +68,17 @@ def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
     log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
     pushes = np.where(force, log_ndtr(pressed / c.sd_pressed), 0.0) - log_force
     silent = np.where(force, _log_student(pressed / c.sd_apart) - np.log(c.sd_apart), 0.0)
-    within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
-    beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
+    # What stands on its corner comes to lie flat: its place is anywhere between.
+    ahead = np.zeros(c.t.size) if c.ahead is None else c.ahead
+    place, sd_place = place + ahead / 2, np.sqrt(c.sd_place**2 + ahead**2 / 12)
+    within = np.where(position, log_ndtr(place / sd_place), 0.0) - log_place
+    apart = np.where(position, c.free_place, 0.0)
+    beyond = np.where(position, log_ndtr(-apart / c.sd_place), 0.0) - log_place
     sd_force = np.hypot(c.sd_pressed, c.form * np.abs(pressed))
-    both = np.hypot(sd_force, c.sd_place)
-    depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
+    both = np.hypot(sd_force, sd_place)
+    depth = (sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
-    held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))
+    held = agree + log_ndtr(depth * both / (sd_force * sd_place))
     held = np.where(force & position & (not c.hidden), held, pushes + within)
     moved, rung = (STRAY, SELDOM) if making else (SELDOM, STRAY)
     neither = np.log(STRAY * SELDOM) - log_force - log_place

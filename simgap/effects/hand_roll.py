@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hmmseg.contact.equations import rolled_offset
 from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance
 from simgap.gap.trial_arrays import CHANNELS
 
@@ -26,7 +27,7 @@ def _scatter(given, residual: np.ndarray):
 
     rows, arrays, there = rows_of(given), given.frame.arrays, given.whitening.weight > 0
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
-    lever = (width * arrays.phase[..., 2])[..., None] * given.whitening.weight
+    lever = rolled_offset(width * arrays.phase[..., 2], 1.0)[..., None] * given.whitening.weight
     lever[..., [c for c, name in enumerate(CHANNELS) if name != "offset"]] = 0.0
     lever = lever[there]
     unit, square = np.zeros(lever.size), np.zeros(lever.size)
@@ -57,7 +58,7 @@ def _apply(performance: Performance, values, rng) -> Performance:
     angle = values["amplitude"] * angle / scale * held
     position = performance.position.copy()
     for finger, sign in ((0, -0.5), (1, 0.5)):
-        position[:, finger, 1] += sign * performance.width * angle * held
+        position[:, finger, 1] += sign * rolled_offset(performance.width, angle * held)
     return performance._replace(position=position)
 
 
