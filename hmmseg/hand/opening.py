@@ -43,7 +43,7 @@ class Grip:
     width_sd: float
 
 
-def closings(t: np.ndarray, opening: np.ndarray) -> list[tuple[int, int, int]]:
+def closings(opening: np.ndarray) -> list[tuple[int, int, int]]:
     """Closings that end in a stand, as samples (begun, least, opened), by turning points.
 
     A swing counts where it is a tenth of the whole way and beyond the noise.
