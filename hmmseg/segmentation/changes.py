@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtr
@@ -48,16 +47,12 @@ class Prior:
     probability: np.ndarray
     limits: tuple[float, float]
 
-    @cached_property
-    def around(self) -> float:
-        """Time [s] within which the alignment cannot tell one interval from another."""
-        return SURROUNDING * float(np.median(np.diff(self.t)))
-
     def log_density(self, t: np.ndarray) -> np.ndarray:
         """Log prior density (unnormalised) of the boundary at t; -inf where it cannot be."""
         out = np.zeros_like(t)
+        around = SURROUNDING * float(np.median(np.diff(self.t)))
         for n in np.flatnonzero(self.probability > LIKELY):
-            low, high = self.t[n] - self.around, self.t[n + 1] + self.around
+            low, high = self.t[n] - around, self.t[n + 1] + around
             out += self.probability[n] / (high - low) * ((t >= low) & (t <= high))
         inside = (t >= self.limits[0]) & (t <= self.limits[1])
         with np.errstate(divide="ignore"):
@@ -72,10 +67,12 @@ SEEN = 4.0  # prior: contacts that the prior of an abrupt end is worth
 class Disagreement:
     """Model error of changes of one sort: `position` [m] that positions are allowed where there is contact;
     `abrupt`: share of contacts that end at once, by a pad that slips off or turns, before it is relaxed.
+    `louder`: what forces are of their noise after a change, as they ring, or come late.
     """
 
     position: float = DISCREPANCY
     abrupt: float = UNIFORM
+    louder: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -98,16 +95,11 @@ class Change:
         """Changes of one sort share a discrepancy."""
         return self.kind, len(self.contacts)
 
-    @cached_property
+    @property
     def log_prior(self) -> np.ndarray:
         """Log prior probability (num_intervals,) of the intervals."""
         t = self.contacts[0].t
         return self.prior.log_density((t[1:] + t[:-1]) / 2) + np.log(np.diff(t))
-
-    @cached_property
-    def intervals(self) -> tuple[int, ...]:
-        """The interval in which each contact most likely switched, wherever force and position disagree."""
-        return tuple(int(switch_probability(c, self.log_prior, self.making).argmax()) for c in self.contacts)
 
 
 def cut(change: Change) -> Change | None:
@@ -132,7 +124,7 @@ def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreem
     """What the changes of each sort show of where force and position disagree."""
     sorts = dict.fromkeys(change.sort for change in changes)
     return {
-        sort: Disagreement(_discrepancy(own), _abruptness(own))
+        sort: Disagreement(_discrepancy(own), _abruptness(own), _loudness(changes, sort[1]))
         for sort in sorts
         for own in [[c for c in changes if c.sort == sort]]
     }
@@ -142,8 +134,8 @@ def _discrepancy(changes: Sequence[Change]) -> float:
     """How far [m] force and position disagree at the contacts next to the changes."""
     found = []
     for change in changes:
-        for c, interval in zip(change.contacts, change.intervals, strict=True):
-            n = interval + change.making
+        for c in change.contacts:
+            n = _interval(c, change) + change.making
             beside = slice(n, n + 2) if change.making else slice(max(n - 1, 0), n + 1)
             sure = np.flatnonzero(c.pressed[beside] > SURE * c.sd_pressed)
             if sure.size:
@@ -161,15 +153,31 @@ def _discrepancy(changes: Sequence[Change]) -> float:
 
 def _abruptness(changes: Sequence[Change]) -> float:
     """Share of contacts that end before the position's way is spent: by maximum likelihood, and its prior."""
-    z = np.array([
-        _inside(c, _last_pressed(c, n)) for change in changes if not change.making
-        for c, n in zip(change.contacts, change.intervals, strict=True)
-    ])  # fmt: skip
+    z = np.array([_inside(c, _last_pressed(c, _interval(c, change))) for change in changes
+                  if not change.making for c in change.contacts])  # fmt: skip
     z = z[np.isfinite(z)]
     share = UNIFORM
     for _ in range(ROUNDS):
         share = (_abrupt(share, z).sum() + UNIFORM * SEEN) / (z.size + SEEN)
     return float(share)
+
+
+def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
+    """What forces are of their noise where positions say for sure that there is no contact any more.
+
+    Those of contacts that were broken, of so many at once; a contact that is made rings alike.
+    """
+    z = [np.zeros(0)]
+    for change in changes:
+        if not change.making and len(change.contacts) == num_contacts:
+            z += [c.pressed[c.free_place < -SURE * c.sd_place] / c.sd_apart for c in change.contacts]
+    z2 = np.concatenate(z) ** 2
+    z2 = z2[np.isfinite(z2)]
+    if not z2.size:
+        return 1.0
+    # Of a normal distribution; half of the samples may be anything.
+    excess = max(float(np.median(z2)) / 0.455 - 1.0, 0.0)
+    return float(np.sqrt(1.0 + z2.size * excess / (z2.size + SEEN)))
 
 
 def _abrupt(share: float, z: np.ndarray | float) -> np.ndarray:
@@ -189,6 +197,11 @@ def _last_pressed(c: Penetration, n: int) -> int:
     """The interval up to n at whose start the force last shows contact, whatever positions say."""
     sure = np.flatnonzero(c.pressed[: n + 1] > SURE * c.sd_pressed)
     return int(sure[-1]) if sure.size else n
+
+
+def _interval(c: Penetration, change: Change) -> int:
+    """The interval in which a contact most likely switched."""
+    return int(switch_probability(c, change.log_prior, change.making).argmax())
 
 
 def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
@@ -223,7 +236,7 @@ def _seen(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] and masses of the moment at which contacts are made, or the first is broken."""
     t, making = contacts[0].t, change.making
-    found = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
+    found = np.array([switch_probability(c, change.log_prior, making, known.louder) for c in contacts])
     combined = crossing_density if making else first_of
     inner = (np.arange(POINTS) + 0.5) / POINTS
     times, masses = [], []
@@ -232,7 +245,7 @@ def _seen(
         for chosen, mass in _shares(found, n, making):
             if mass < LIKELY:
                 continue
-            deciding = [_crossing(contacts[i], n, change, known.abrupt) for i in chosen]
+            deciding = [_crossing(contacts[i], n, change, known) for i in chosen]
             density = combined(deciding if all(x.known for x in deciding) else [], width)
             if not np.isfinite(density).all():
                 density = combined([], width)
@@ -254,17 +267,18 @@ def _shares(found: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ..
     return [((0, 1), float(a * b)), ((0,), float(a * done[1])), ((1,), float(b * done[0]))]
 
 
-def _crossing(c: Penetration, n: int, change: Change, abrupt: float) -> Crossing:
+def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Crossing:
     """The crossing of interval n: by position where apart, by force where there is contact."""
     making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
     pressed, gap = c.pressed[touching], c.free_place[apart]
-    sd_pressed = float(np.hypot(c.sd_pressed, c.form * abs(pressed)))
+    noise = c.sd_pressed * (known.louder if making else 1.0)
+    sd_pressed = float(np.hypot(noise, c.form * abs(pressed)))
     if c.hidden:  # a rigid pad hides its compression
         pressed = max(c.place[touching], 0.0)
         sd_pressed = c.sd_place + 0.5 * abs(gap)
     before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
         return Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-    share = _abrupt(abrupt, _inside(c, n)) if kind == "smooth" else 0.0
+    share = _abrupt(known.abrupt, _inside(c, n)) if kind == "smooth" else 0.0
     return Crossing(-pressed, -gap, -before, -after, sd_pressed, c.sd_place, c.sd_rate, kind, float(share))

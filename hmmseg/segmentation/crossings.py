@@ -82,6 +82,9 @@ class Contacts:
         else:
             inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
         face = _median(inward[held] - self.compression[i, held])
+        # A pad of another stiffness would put the face elsewhere.
+        pressed = np.nan_to_num(_median(self.compression[i, held]))
+        sd_inward = float(np.hypot(sd_inward, self.sensing.normal.doubt * pressed))
         sd = self.sd["compression"]
         return self._timely(Penetration(
             self.signals.t, self.compression[i], inward - face, rate, sd, sd,
@@ -115,9 +118,10 @@ class Contacts:
         y = self.signals.y
         level = _median(y[held] - self.deflection[held])
         carrying = hanging(self.weight[str(before.object)], shown(self.sensing.pads))
+        sd_y = float(np.hypot(self.sd["y"], self.sensing.shear.doubt * carrying))
         return self._timely(Penetration(
             self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
-            self.sd["deflection"], self.sd["carried"], self.sd["y"], self.sd["vy"],
+            self.sd["deflection"], self.sd["carried"], sd_y, self.sd["vy"],
             self.sensing.shear.form, self.sensing.shear.value < RIGID, ahead=self.drop,
         ), making)  # fmt: skip
 

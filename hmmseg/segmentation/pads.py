@@ -33,7 +33,6 @@ RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force 
 SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after all
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
 BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
-SILENT = 3.0  # chosen: sds of noise below which a force is none
 REACH = 0.4  # numerics: s; free motion beside a hold that is looked at: the longest delay, and a touch
 FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays below what counts as one
 LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
@@ -58,6 +57,11 @@ class Compliance:
     sd: float
     form: float
     toe: Toe = NONE
+
+    @property
+    def doubt(self) -> float:
+        """Standard deviation as a share of it, at most all."""
+        return min(self.sd / self.value, 1.0) if self.value > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -106,28 +110,39 @@ def read_again(s: Signals, sensing: Sensing) -> Signals:
         there = np.isfinite(force)
         if sensing.filter:
             forces[name] = np.full_like(force, np.nan)
-            forces[name][there], louder = _unfiltered(s.t[there], force[there], sensing.delay, s.sd_force)
+            forces[name][there], louder = _unfiltered(s.t[there], force[there], sensing.delay)
         else:
-            forces[name] = np.interp(s.t + sensing.delay, s.t[there], force[there], right=np.nan)
+            forces[name] = limited(s.t + sensing.delay, s.t[there], force[there])
     return replace(s, **forces, sd_force=s.sd_force * louder)
 
 
-def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float, sd: float) -> tuple[np.ndarray, float]:
+def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
     """Forces [N] without their first-order filter of this time `constant` [s], and how much louder they are.
 
     (F_n - k F_(n-1)) / (1 - k), k the share that a sample interval h keeps, is a steady input, or one that
-    changes evenly as it was constant - h k / (1 - k) before: h / 2 where it is slow. What lies between two of
-    them is interpolated, but a touch is not seen before its force is.
+    changes evenly as it was constant - h k / (1 - k) before: h / 2 where it is slow.
     """
     step = np.diff(t)
     kept = np.exp(-step / constant)
     read = np.r_[force[:1], (force[1:] - kept * force[:-1]) / (1 - kept)]
     ago = np.r_[0.0, constant - step * kept / (1 - kept)]
     louder = float(np.median(np.sqrt(1 + kept**2) / (1 - kept)))
-    between = np.interp(t, t - ago, read)
-    level = np.nan_to_num(sd) * louder
-    silent = np.abs(read) < SILENT * level
-    return np.where(silent & (np.abs(between) > np.abs(read)), read, between), louder
+    return limited(t, t - ago, read), louder
+
+
+def limited(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Readings (num_samples,) at t [s] as they are `at` other times, NaN where the last is no neighbour.
+
+    Each is read from its nearest neighbour, with the lesser of the slopes on either side of that, if they
+    agree: a force that jumps is not smeared over the samples before (the minmod limiter; van Leer 1979).
+    """
+    slopes = np.diff(values) / np.diff(t)
+    before, after = np.r_[slopes[:1], slopes], np.r_[slopes, slopes[-1:]]
+    slope = np.where(before * after > 0, np.where(np.abs(before) < np.abs(after), before, after), 0.0)
+    right = np.clip(np.searchsorted(t, at), 1, t.size - 1)
+    nearest = np.where(at - t[right - 1] <= t[right] - at, right - 1, right)
+    out = values[nearest] + slope[nearest] * (at - t[nearest])
+    return np.where(at > t[-1] + (t[-1] - t[-2]) / 2, np.nan, out)
 
 
 def sense(

@@ -24,6 +24,8 @@ from scipy.special import log_ndtr
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
 SURE = 5.0  # chosen: sds of noise for a contact to be sure
+DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
+ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 TAIL = 4.0  # prior: Student-t residuals, as in the emissions
 
 
@@ -56,28 +58,38 @@ class Penetration:
         return self.place if self.ahead is None else self.place + self.ahead
 
 
-def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
+def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihoods (num_samples,) of contact and of none, p integrated out; a missing sensor adds nothing.
+
+    After the change forces are `louder` than their noise: in contact if it is made, apart if it is broken.
 
     What is more likely amiss differs: before a touch (`making`) the face may lie elsewhere, as a finger
     that came first pushes the block; after a release the force may ring.
     """
+    sd_pressed, sd_apart = (
+        c.sd_pressed * (louder if making else 1.0),
+        c.sd_apart * (1.0 if making else louder),
+    )
     force, position = np.isfinite(c.pressed), np.isfinite(c.place)
     pressed, place = np.where(force, c.pressed, 0.0), np.where(position, c.place, 0.0)
     log_force = np.log(2 * max(np.ptp(pressed), 10 * c.sd_pressed)) * force
     log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
-    pushes = np.where(force, log_ndtr(pressed / c.sd_pressed), 0.0) - log_force
-    silent = np.where(force, _log_student(pressed / c.sd_apart) - np.log(c.sd_apart), 0.0)
+    pushes = np.where(force, log_ndtr(pressed / sd_pressed), 0.0) - log_force
+    silent = np.where(force, _log_student(pressed / sd_apart) - np.log(sd_apart), 0.0)
     # What stands on its corner comes to lie flat: its place is anywhere between.
     ahead = np.zeros(c.t.size) if c.ahead is None else c.ahead
     place, sd_place = place + ahead / 2, np.sqrt(c.sd_place**2 + ahead**2 / 12)
     within = np.where(position, log_ndtr(place / sd_place), 0.0) - log_place
     apart = np.where(position, c.free_place, 0.0)
     beyond = np.where(position, log_ndtr(-apart / c.sd_place), 0.0) - log_place
-    sd_force = np.hypot(c.sd_pressed, c.form * np.abs(pressed))
+    sd_force = np.hypot(sd_pressed, c.form * np.abs(pressed))
     both = np.hypot(sd_force, sd_place)
     depth = (sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
+    # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
+    # is lost in it, that would count against contact, of which force alone tells.
+    deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
+    agree = agree + np.log(np.maximum(ROOT_2PI * sd_place / deep, 1.0))
     held = agree + log_ndtr(depth * both / (sd_force * sd_place))
     held = np.where(force & position & (not c.hidden), held, pushes + within)
     moved, rung = (STRAY, SELDOM) if making else (SELDOM, STRAY)
@@ -89,9 +101,11 @@ def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
     return contact, none
 
 
-def switch_probability(c: Penetration, log_prior: np.ndarray, making: bool) -> np.ndarray:
+def switch_probability(
+    c: Penetration, log_prior: np.ndarray, making: bool, louder: float = 1.0
+) -> np.ndarray:
     """Probability (num_samples - 1,) that the contact is made, or broken, in each interval."""
-    contact, none = log_contact(c, making)
+    contact, none = log_contact(c, making, louder)
     before, after = (none, contact) if making else (contact, none)
     log_weight = np.cumsum(before)[:-1] + np.cumsum(after[::-1])[::-1][1:] + log_prior
     weight = np.exp(log_weight - log_weight.max())

@@ -43,6 +43,16 @@ def test_the_share_of_contacts_that_end_abruptly_is_learned(share):
     assert found.abrupt == pytest.approx(max(share, 0.02), abs=0.15)
 
 
+@pytest.mark.parametrize("louder", [1.0, 20.0])
+def test_how_loud_forces_are_after_a_change_is_learned(louder):
+    rng, changes = np.random.default_rng(3), [release(False, k) for k in range(40)]
+    for change in changes:
+        c = change.contacts[0]
+        c.pressed[6:] = louder * SD_PRESSED * rng.standard_normal(6)
+    (found,) = disagreements(changes).values()
+    assert found.louder == pytest.approx(louder, rel=0.2)
+
+
 def test_an_abrupt_end_may_be_anywhere_in_its_interval():
     many = [release(k < 20, k) for k in range(40)]
     (known,) = disagreements(many).values()

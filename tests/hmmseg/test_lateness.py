@@ -67,7 +67,7 @@ def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     kept = np.exp(-1e-4 / 0.03)
     t = np.arange(0, 0.98, 0.02)
     filtered = np.interp(t, fine, lfilter([1 - kept], [1, -kept], force))
-    undone, louder = _unfiltered(t, filtered, 0.03, 0.01)
+    undone, louder = _unfiltered(t, filtered, 0.03)
     np.testing.assert_allclose(undone, np.interp(t, fine, force), atol=0.15)
     assert louder == pytest.approx(np.sqrt(1 + np.exp(-4 / 3)) / (1 - np.exp(-2 / 3)), rel=1e-6)
     assert np.abs(undone[t < 0.31]).max() < 0.02

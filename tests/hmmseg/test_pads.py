@@ -11,7 +11,7 @@ from experiments.sweeps.trials import scene
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import Parameters
-from hmmseg.segmentation.pads import Sensing, read_again
+from hmmseg.segmentation.pads import Sensing, limited, read_again
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest
 
 PRIOR = (2.5e-4, 0.75e-4)
@@ -116,6 +116,17 @@ def test_reading_again_undoes_what_was_found():
     again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
     np.testing.assert_allclose(again.fx1[:94], ramp[:94], atol=1e-12)
     np.testing.assert_allclose(again.x1, late)
+
+
+def test_a_jump_is_not_smeared_over_the_samples_before_it():
+    t = np.arange(20) * 0.05
+    jump = np.where(t < 0.5, 0.0, 1.0)
+    for late in (0.01, 0.02, 0.03, 0.04):
+        again = limited(t + late, t, jump)
+        assert set(again[:-1]) == {0.0, 1.0}
+        assert abs(t[np.argmax(again > 0.5)] - (0.5 - late)) <= 0.5 * 0.05 + 1e-9
+    smooth = np.sin(2 * t)
+    np.testing.assert_allclose(limited(t + 0.02, t, smooth)[:-1], np.sin(2 * (t + 0.02))[:-1], atol=6e-3)
 
 
 def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():

@@ -25,7 +25,7 @@ APPROACH = np.linspace(-1.17e-3, 0.93e-3, 22)
 @pytest.mark.parametrize("pressed, place", [(4e-5, 2e-5), (1e-6, -5e-5), (0.0, 2e-5)])
 def test_weights_of_contact_are_integrals_over_the_penetration(pressed, place):
     # With Gaussian tails near the mode: Student-t residuals agree to a factor that both sides share.
-    c = sensed(np.array([place, place]), pressed=np.full(2, pressed), place=np.full(2, place))
+    c = sensed(np.array([place, 3e-4]), pressed=np.array([pressed, 3e-4]), place=np.array([place, 3e-4]))
     contact, none = log_contact(c, making=True)
 
     def joint(p):
@@ -59,6 +59,18 @@ def test_a_ringing_force_after_a_release_is_no_contact():
     probability = switch_probability(sensed(p, pressed=ringing), np.zeros(p.size - 1), False)
     n = int(np.flatnonzero(np.diff(np.sign(p)))[0])
     assert probability[n - 1 : n + 2].sum() > 0.9
+
+
+def test_places_lost_in_noise_do_not_date_a_lift_early():
+    """A load that fades slowly, then a hand that leaves; places are four times as noisy as it is deep."""
+    p = np.concatenate([np.linspace(1e-4, 0, 12)[:-1], -(np.linspace(0.0, 1.3e-1, 14) ** 3)])
+    ranks, true = [], 10
+    for seed in range(80):
+        c = sensed(p, sd_pressed=3e-5, sd_place=4e-4, seed=seed)
+        probability = switch_probability(c, np.zeros(p.size - 1), False)
+        ranks.append(probability[:true].sum() + probability[true] / 2)
+    assert 0.2 < np.mean(ranks) < 0.8  # places weighed as surely as forces had made it 0.998
+    assert np.mean((np.array(ranks) > 0.05) & (np.array(ranks) < 0.95)) > 0.65
 
 
 def test_a_finger_that_pushes_the_block_on_touched_when_its_force_says_so():
