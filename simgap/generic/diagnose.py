@@ -121,7 +121,7 @@ def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Prog
         return fit(given, parts, difference, numbers, effects, base)
 
     tell("fitting effects")
-    names = [n for n in CANDIDATES if n != "structural_vibration" or ring is not None]
+    names = [n for n in CANDIDATES if CANDIDATES[n].each != "event" or ring is not None]
     if forced:
         found = [fitted(tuple(dict.fromkeys(forced)))]
     else:
