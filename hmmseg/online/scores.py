@@ -54,15 +54,14 @@ from hmmseg.online.layout import (
     D,
     Y,
 )
-from hmmseg.segmentation.emissions import ONE_FINGER, RUNG, SHUT, STRAY, TOUCHING
+from hmmseg.segmentation.emissions import ONE_FINGER, SHUT, STRAY, TOUCHING
 
 STILL = 0.2  # prior: share of samples at which a hand that may move stands still,
 CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # prior: ... times this while a lift begins: slow, but a motion
 ALIKE = 0.5  # prior: probability that a block not met yet is like one that was
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
-_LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER - RUNG), math.log(ONE_FINGER / 2)
-_LOG_RUNG = math.log(RUNG)
+_LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
 
 
@@ -97,14 +96,11 @@ def held_height(h, x, pads):
 def _ungripped(h, x, span):
     noise = scale2(h, FORCE)
     silent1 = silent2 = touch1 = touch2 = 0.0
-    rung = _LOG_RUNG
     scale = math.sqrt(noise)
     for c in range(4):
         precision = h[BIAS + 2 * c + 1]
         force = x[FX1 + c] - h[BIAS + 2 * c] / precision
         silent = log_student(force, noise + 1.0 / precision)
-        if not math.isnan(force):
-            rung -= math.log(2 * span)
         if c == 0:
             touch = log_between(force, 0.0, span, scale, span)
         elif c == 2:
@@ -116,7 +112,7 @@ def _ungripped(h, x, span):
         else:
             silent2, touch2 = silent2 + silent, touch2 + touch
     one = log_sum(touch1 + silent2, silent1 + touch2)
-    return log_sum(log_sum(_LOG_SILENT + silent1 + silent2, _LOG_ONE + one), rung)
+    return log_sum(_LOG_SILENT + silent1 + silent2, _LOG_ONE + one)
 
 
 @compiled

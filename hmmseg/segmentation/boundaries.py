@@ -29,6 +29,7 @@ ONSET = 0.001  # prior: s; a pad's force leads its compression by its viscosity,
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
 MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 24  # numerics: nodes over the time at which that motion started
+ALONE = 0.1  # prior: share of grips to which fingers do not come as one
 SHAPE = 0.05  # prior: how far its speed may be off the minimum-jerk profile, as a share of it
 STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
 UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, against what g leaves out
@@ -43,7 +44,8 @@ class Crossing:
     `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise.
     `kind`: "smooth" motion through the crossing; "impact": the crossing stops it (a touch, a
     touchdown); "launch": it sets in with the crossing (a block that was held down lifts off). `anywhere`:
-    probability that it happened at some moment of the interval, whatever the motion.
+    probability that it happened at some moment of the interval, whatever the motion. `earlier`: how long
+    before the left end [s] another sample was, its value and its rate.
     """
 
     left: float
@@ -55,6 +57,7 @@ class Crossing:
     sd_v: float
     kind: Kind = "smooth"
     anywhere: float = 0.0
+    earlier: tuple[float, float, float] | None = None
 
     @property
     def known(self) -> bool:
@@ -136,23 +139,38 @@ def _log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
 def _last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
     """Probability (POINTS,) that every finger has hit by each node of an interval of h s.
 
-    Fingers move as one: duration and start of the motion are marginalised for all of them
-    together, each finger's distance, noise and stop for itself.
+    Fingers move as one, so that duration and start of the motion are marginalised for all of them together;
+    or each by itself, as far as their readings say so. Distance, noise and stop are each finger's own.
     """
     u = (np.arange(POINTS) + 0.5) / POINTS
     duration = np.geomspace(*MOTION, MOTIONS)[:, None, None]
     starts = (np.arange(STARTS) + 0.5) / STARTS
     age = starts[:, None] * (duration + h) - h  # since its start, at the first sample; uniform
-    log_weight, hit = np.log(duration + h)[..., 0] + np.zeros(STARTS), np.ones(1)
+    log_prior = np.log(duration + h)[..., 0] + np.zeros(STARTS)
+    log_prior = log_prior - np.logaddexp.reduce(log_prior, axis=None)
+    together, every, apart, hits = log_prior, np.ones(1), 0.0, np.ones(1)
     for c in impacts:
         log_density = _log_impact(c, h, u, duration, age / duration)
         peak = log_density.max(axis=-1, keepdims=True)
         density = np.exp(log_density - peak)
         total = density.sum(axis=-1)
-        log_weight = log_weight + peak[..., 0] + np.log(total)
-        hit = hit * np.cumsum(density, axis=-1) / total[..., None]
-    weight = np.exp(log_weight - log_weight.max())
-    return (weight[..., None] * hit).sum(axis=(0, 1)) / weight.sum()
+        log_own, own = peak[..., 0] + np.log(total), np.cumsum(density, axis=-1) / total[..., None]
+        together, every = together + log_own, every * own
+        evidence, hit = _mixed(log_prior + log_own, own)
+        apart, hits = apart + evidence, hits * hit
+    evidence, hit = _mixed(together, every)
+    if len(impacts) == 1:
+        return hit
+    share = 1 / (1 + ALONE / (1 - ALONE) * np.exp(np.clip(apart - evidence, -500, 500)))
+    return share * hit + (1 - share) * hits
+
+
+def _mixed(log_weight: np.ndarray, hit: np.ndarray) -> tuple[float, np.ndarray]:
+    """Log sum of weights (...), and the weighted mean of hit (..., POINTS)."""
+    peak = log_weight.max()
+    weight = np.exp(log_weight - peak)
+    axes = tuple(range(weight.ndim))
+    return float(peak + np.log(weight.sum())), (weight[..., None] * hit).sum(axis=axes) / weight.sum()
 
 
 def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray) -> np.ndarray:
@@ -168,38 +186,35 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
     way = np.maximum(_minimum_jerk(at_hit) - _minimum_jerk(phase), 1e-9)
     rate, rate_at_hit = _minimum_jerk_slope(phase) / duration, _minimum_jerk_slope(at_hit) / duration
     gap, sd_v = -c.left, np.hypot(c.sd_v, SHAPE * max(c.v_left, -c.left / h))
-    # gap ~ N(distance way, sd_left), v_left ~ N(distance rate, sd_v); distance integrated out.
-    variance = (way * sd_v) ** 2 + (rate * c.sd_left) ** 2
-    distance = np.maximum((way * gap * sd_v**2 + rate * c.v_left * c.sd_left**2) / variance, c.sd_left)
-    log_before = _log_normal(gap * rate - c.v_left * way, 0.0, np.sqrt(variance)) - np.log(distance)
+    # Each reading ~ N(distance share, sd), the distance integrated out: gap and speed, and those before.
+    shares, readings = [way, rate], [(gap, c.sd_left), (c.v_left, sd_v)]
+    if c.earlier is not None:
+        ago, value, speed_then = c.earlier
+        phase_then = phase - ago / duration
+        covered = value - c.left
+        shares += [
+            _minimum_jerk(phase_then) - _minimum_jerk(phase),
+            _minimum_jerk_slope(phase_then) / duration,
+        ]
+        readings += [(covered, np.hypot(np.sqrt(2.0) * c.sd_left, SHAPE * covered)),
+                     (speed_then, np.hypot(c.sd_v, SHAPE * max(speed_then, -covered / ago)))]  # fmt: skip
+    precision = sum((share / sd) ** 2 for share, (_, sd) in zip(shares, readings, strict=True))
+    weighed = sum(share * x / sd**2 for share, (x, sd) in zip(shares, readings, strict=True))
+    distance = np.maximum(weighed / precision, c.sd_left)
+    left_over = sum((x / sd) ** 2 for x, sd in readings) - weighed**2 / precision
+    log_before = -0.5 * left_over - 0.5 * np.log(precision) - np.log(distance)
     speed = np.maximum(distance * rate_at_hit, c.sd_v)
     stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
     reach = stop * -np.expm1(-after / stop)
-    # What is left of `right`, but for its sign, when the velocity has decayed over this way; in place, as
-    # these are the largest arrays of a boundary.
-    apart = reach * (speed - c.v_right)
-    apart -= c.right - c.v_right * after
-    variance = reach**2 * (2 * SHAPE * speed) ** 2
-    variance += c.sd_right**2 + (c.sd_v * after) ** 2
-    log_after = _log_sum_normal(apart, variance)
+    mean = c.v_right * (after - reach) + speed * reach
+    sd_after = np.sqrt(c.sd_right**2 + (c.sd_v * after) ** 2 + (2 * SHAPE * speed * reach) ** 2)
+    log_after = np.logaddexp.reduce(_log_normal(c.right, mean, sd_after), axis=0)
     return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + log_after + np.log(speed)
 
 
 def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:
     """Log density of a normal distribution but for a constant."""
     return -0.5 * ((x - mean) / sd) ** 2 - np.log(sd)
-
-
-def _log_sum_normal(x: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Log of the sum along the first axis of normal densities, but for a constant; uses up its arguments."""
-    x *= x
-    x /= variance
-    x *= -0.5
-    peak = x.max(axis=0)
-    x -= peak
-    np.exp(x, out=x)
-    x /= np.sqrt(variance, out=variance)
-    return peak + np.log(x.sum(axis=0))
 
 
 def _minimum_jerk(phase: np.ndarray | float) -> np.ndarray | float:

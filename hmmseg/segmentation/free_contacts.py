@@ -21,6 +21,7 @@ from hmmseg.hmm import dense as ergodic
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
+from hmmseg.segmentation.standing import standing
 
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
@@ -32,6 +33,7 @@ ROUNDS = 8  # numerics: of an iteration that settles sooner
 # cited: s; no touch that ends sooner can have been meant to lift: grip forces rise for about as long before a
 # lift as loads do in it, 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
 TAP = 0.2
+FIRM = 0.5  # chosen: of the force with which a block is gripped next: who presses less has not gripped it yet
 IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
 
@@ -113,31 +115,45 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
             for i, b in enumerate(blocks)
         )
     interval = float(np.median(np.diff(f.t)))
-    tapped = _tapped(states, path, interval)
+    tapped = _tapped(states, path, interval, f)
     taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
     for span in tapped:
         table[span], path[span] = 0.0, 0
     return FreeContacts(parameters, blocks, states, table, path, interval, taps)
 
 
-def _tapped(states: tuple[tuple[str, int | None], ...], path: np.ndarray, interval: float) -> list[slice]:
-    """Samples of touches too brief for a grip, of a block at rest that is gripped next."""
+def _tapped(
+    states: tuple[tuple[str, int | None], ...], path: np.ndarray, interval: float, f: Features
+) -> list[slice]:
+    """Samples of touches too brief for a grip, of a block at rest that is gripped next.
+
+    A touch lasts as long as it presses about as firmly as that grip. Fingers that stand on something touch
+    what is no block.
+    """
     held = np.array([state != FREE for state, _ in states])[path]
+    force, stands = _filled(f.grip), standing(f.t, f.force, np.nan, ~held)
     edges = np.flatnonzero(np.diff(np.r_[False, held, False].astype(int)))
     grips = [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     out = []
     for grip, following in itertools.pairwise(grips):
         touched = {states[k] for k in path[grip]}
         same = {block for _, block in touched} == {states[path[following.start]][1]}
-        brief = (grip.stop - grip.start) * interval <= TAP and grip.start > 0
+        firm = int((force[grip] > FIRM * np.median(force[following])).sum())
+        brief = firm * interval <= TAP and grip.start > 0
+        longer = (grip.stop - grip.start) * interval > TAP
+        if longer and stands[grip].any():
+            continue
         if brief and same and {state for state, _ in touched} == {ON_GROUND}:
             out.append(grip)
     return out
 
 
 def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Parameters) -> np.ndarray:
-    """Log-likelihoods (num_timesteps, num_states) without levels."""
-    return log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY)
+    """Log-likelihoods (num_timesteps, num_states) without levels.
+
+    No free sample may ring: whoever holds what the task does not name would pass for that.
+    """
+    return log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY, rung=0.0)
 
 
 def most_probable(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> np.ndarray:

@@ -135,7 +135,8 @@ def _stands(s: Signals, spans: Sequence[Span]) -> np.ndarray:
     free = np.zeros(s.t.size, bool)
     for span in spans:
         free |= (span.state == FREE) & (s.t >= span.start) & (s.t < span.end)
-    return s.t[standing(s, free)]
+    force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1)
+    return s.t[standing(s.t, force, s.sd_force, free)]
 
 
 def joined(

@@ -8,25 +8,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.hand.signals import Signals
-
 FRICTION = 1.5  # cited: rubber on dry solids reaches about 1 to 1.4 (Persson, J. Chem. Phys. 115, 2001)
 CLEAR = 6.0  # numerics: standard deviations, so that no noise of an hour at 1 kHz is taken for a touch
 BRIEF = 0.05  # physics: s; an impact of hard parts rings no longer
 
 
-def standing(signals: Signals, free: np.ndarray) -> np.ndarray:
+def standing(t: np.ndarray, force: np.ndarray, sd_force: float, free: np.ndarray) -> np.ndarray:
     """Booleans (num_timesteps,): samples of stretches in which a finger stands on something.
 
+    `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N] at t [s]; `sd_force`: their noise, NaN if not stated.
     `free` (num_timesteps,) marks free motion: offsets and spread of the vertical forces are learned there.
     """
-    out = np.zeros(signals.t.size, bool)
-    for across, along in ((signals.fx1, signals.fy1), (signals.fx2, signals.fy2)):
+    out = np.zeros(t.size, bool)
+    for across, along in (force[:, :2].T, force[:, 2:].T):
         rest = along[free & np.isfinite(along)]
         centre = float(np.median(rest)) if rest.size else 0.0
         spread = 1.4826 * float(np.median(np.abs(rest - centre))) if rest.size else 0.0
-        limit = FRICTION * np.abs(np.nan_to_num(across)) + CLEAR * max(spread, signals.sd_force)
-        out |= _lasting(centre - np.nan_to_num(along, nan=np.inf) > limit, signals.t)
+        limit = FRICTION * np.abs(np.nan_to_num(across)) + CLEAR * max(spread, float(np.nan_to_num(sd_force)))
+        out |= _lasting(centre - np.nan_to_num(along, nan=np.inf) > limit, t)
     return out
 
 

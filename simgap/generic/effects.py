@@ -52,7 +52,7 @@ class Kind:
 @dataclass(frozen=True)
 class Candidate:
     """An effect: `kinds` of its parameters, one of each a channel (`each` = "channel"), one a channel
-    and event ("event": an oscillation's sine and cosine), or one a subtask ("subtask": of durations)."""
+    and event ("event"), or one a subtask ("subtask")."""
 
     name: str
     says: str

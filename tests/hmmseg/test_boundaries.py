@@ -181,16 +181,24 @@ def touches(rng, width, num=1):
         right = v * stop * -np.expm1(-after / stop)
         noise = rng.normal(size=4)
         roots.append(root)
+        # A sample interval before; drawn apart, so that what stands above is as it was.
+        phase_then, other = (
+            phase - width / duration,
+            np.random.default_rng(int(1e6 * root) + i).normal(size=3),
+        )
+        then = -distance * (_minimum_jerk(at_hit) - _minimum_jerk(phase_then)) + sd_left * other[0]
+        v_then = (1 + SHAPE * other[1]) * distance * _minimum_jerk_slope(phase_then) / duration
         crossings.append(Crossing(
             left + sd_left * noise[0], right + sd_right * noise[1], v_left + sd_v * noise[2],
             v * np.exp(-after / stop) + sd_v * noise[3], sd_left, sd_right, sd_v, "impact",
+            earlier=(width, then, v_then + sd_v * other[2]),
         ))  # fmt: skip
     return max(roots), crossings
 
 
 def impact_case(rng):
     root, (crossing,) = touches(rng, WIDTH)
-    return root, crossing
+    return root, replace(crossing, earlier=None)
 
 
 @pytest.mark.parametrize("width", [0.05, 0.1])
@@ -198,6 +206,7 @@ def test_touches_of_two_fingers_that_move_as_one(width):
     rng, nodes, rows = np.random.default_rng(4), (np.arange(POINTS) + 0.5) / POINTS * width, []
     for _ in range(200):
         root, crossings = touches(rng, width, 2)
+        crossings = [replace(c, earlier=None) for c in crossings]
         cumulative = np.cumsum(crossing_density(crossings, width))
         low, middle, high = np.interp([0.05, 0.5, 0.95], cumulative, nodes)
         rows.append((low <= root <= high, middle - root))
@@ -206,6 +215,36 @@ def test_touches_of_two_fingers_that_move_as_one(width):
     # Fingers taken as independent are late, by 0.03 to 0.05 of the width: what is unknown is shared,
     # and the later one counts.
     assert abs(late) < 0.015 * width, late
+
+
+def _dated(draw, num=200):
+    """Share of roots inside 90 % intervals and mean absolute error [s], with the sample before and without."""
+    rows = []
+    for _ in range(num):
+        root, crossings = draw()
+        for told in (crossings, [replace(c, earlier=None) for c in crossings]):
+            low, middle, high = quantiles(crossing_density(told, WIDTH), [0.05, 0.5, 0.95])
+            rows.append((low <= root <= high, abs(middle - root)))
+    return np.array(rows, float).reshape(num, 2, 2).mean(axis=0)
+
+
+def test_the_sample_before_tells_the_motion_that_a_touch_ends():
+    rng = np.random.default_rng(5)
+    (covered, error), (_, without) = _dated(lambda: touches(rng, WIDTH, 2))
+    assert 0.84 < covered < 0.98, covered
+    assert error < 0.9 * without
+
+
+def test_fingers_that_come_each_by_itself():
+    rng = np.random.default_rng(6)
+
+    def apart():
+        (one, (a,)), (two, (b,)) = touches(rng, WIDTH), touches(rng, WIDTH)
+        return max(one, two), [a, b]
+
+    (covered, error), (_, without) = _dated(apart)
+    assert 0.84 < covered < 0.98, covered
+    assert error < 0.95 * without
 
 
 @pytest.mark.parametrize("case", [smooth_case, impact_case], ids=["smooth", "impact"])

@@ -11,6 +11,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.contact.equations import Pads
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.segmentation.emissions import (
+    RUNG,
     STRAY,
     TAIL,
     Features,
@@ -106,8 +107,18 @@ def test_ungripped_force_density_integrates_to_one():
     proposal = np.logaddexp.reduce(
         [quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1), quiet[:, :2].sum(axis=1) + two]
     ) - np.log(3)
-    ratio = np.exp(_log_ungripped(x, scale, span) - proposal)
+    ratio = np.exp(_log_ungripped(x, scale, span, 0.0) - proposal)
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(num) + 1e-3
+
+
+def test_a_sample_that_rings_is_as_likely_anywhere():
+    loud = np.array([[3.0, -2.0, 4.0, 2.0], [-1.0, 5.0, 5.0, 0.0]])
+    found = _log_ungripped(loud, 0.01, 6.0, RUNG)
+    np.testing.assert_allclose(found, np.log(RUNG) - 4 * np.log(12.0), atol=0.02)
+    lost = np.where(np.arange(4) == 1, np.nan, loud)
+    np.testing.assert_allclose(
+        _log_ungripped(lost, 0.01, 6.0, RUNG), np.log(RUNG) - 3 * np.log(12.0), atol=0.02
+    )
 
 
 @pytest.mark.parametrize("state", [FREE, ON_GROUND, SLIDING, ABOVE_GROUND])

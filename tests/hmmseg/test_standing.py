@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmmseg.hand.signals import Signals
-from hmmseg.io.rig import read_rig
+from hmmseg.io.rig import FORCE_CHANNELS, read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
@@ -18,10 +17,10 @@ GRIPPED = T > 2.0
 
 def make(fy1: np.ndarray, grip: float = 3.0) -> np.ndarray:
     """Stretches found where finger 1 pushes with `fy1` and both grip from 2 s on."""
-    channels = sorted(set(Signals.__dataclass_fields__) - {"t", "sd_force", "derived", "touches"})
-    values = {name: np.zeros_like(T) for name in channels}
+    values = {name: np.zeros_like(T) for name in FORCE_CHANNELS}
     values |= {"fx1": grip * GRIPPED, "fx2": -grip * GRIPPED, "fy1": fy1}
-    return standing(Signals(t=T, **values, sd_force=0.02), ~GRIPPED & (T < 1.0))
+    force = np.stack([values[name] for name in FORCE_CHANNELS], axis=1)
+    return standing(T, force, 0.02, ~GRIPPED & (T < 1.0))
 
 
 def test_a_push_within_friction_is_none():

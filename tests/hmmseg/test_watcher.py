@@ -55,7 +55,7 @@ def test_emissions_are_those_off_line():
     bias = np.array([0.01, -0.02, 0.005, 0.0])
     p = Parameters(bias, {"block1": 0.34, "block2": 0.44}, scale, {"block1": 0.016, "block2": 0.0254},
                    ({1: 0.05},))  # fmt: skip
-    expected, halting = log_likelihoods(f, steps, p, 0), _log_halting(f, p)
+    expected, halting = log_likelihoods(f, steps, p, 0, rung=0.0), _log_halting(f, p)
     h = np.zeros(at.Layout(2, 2).width)
     sure = 1e14  # precision of what is known
     for c in range(4):
