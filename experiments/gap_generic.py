@@ -30,7 +30,7 @@ def made(seed: int, effects: dict | None, aligned: bool) -> Ensembles:
     rng = np.random.default_rng(seed)
     real, first = ensemble(rng, TRIALS, effects)
     sim, second = ensemble(rng, TRIALS, None, name="sim")
-    return align(real, sim, TASK, None, None if aligned else first | second, seed)
+    return align(real, sim, TASK, None, None if aligned else first | second)
 
 
 def upper(count: int, total: int) -> float:

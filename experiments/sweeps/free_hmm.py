@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from experiments.jax_hmm.scans import log_sum_exp
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.dense import viterbi
-from hmmseg.hmm.scans import log_sum_exp
 from hmmseg.segmentation.features import noise_sd, thin
 from hmmseg.segmentation.fit import otsu
 from hmmseg.segmentation.thresholds import NUMBERS, StateLabels

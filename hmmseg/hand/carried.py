@@ -44,7 +44,7 @@ class Held:
 def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
             ) -> Held:  # fmt: skip
     """What closings of the opening (num_timesteps,) [m] hold; `pressing` as `grip_force_of` has it."""
-    held = closings(trial.t, opening)
+    held = closings(opening)
     free = _surely_free(opening, held)
     tool = free_tool(trial, rig, pose, free)
     force = applied_force(trial, rig, pose, tool)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.hand.grouping import grouped
+
 STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
 SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first touch
 ABRUPT = 0.5  # chosen: share of its speed that a closing loses from one step to the next at a hard touch
@@ -43,7 +45,7 @@ class Grip:
     width_sd: float
 
 
-def closings(t: np.ndarray, opening: np.ndarray) -> list[tuple[int, int, int]]:
+def closings(opening: np.ndarray) -> list[tuple[int, int, int]]:
     """Closings that end in a stand, as samples (begun, least, opened), by turning points.
 
     A swing counts where it is a tenth of the whole way and beyond the noise.
@@ -97,8 +99,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tup
 def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.ndarray:
     """The opening [m] every STEP, means of what lies within, of samples [start, stop)."""
     group = max(1, int(STEP / float(np.median(np.diff(t))) + 1e-6))
-    size = (min(stop, opening.size) - start) // group
-    return opening[start : start + size * group].reshape(size, group).mean(axis=1)
+    return grouped(opening[start:stop], group)[0]
 
 
 def _kink(way: np.ndarray, noise: float) -> tuple[float, float] | None:

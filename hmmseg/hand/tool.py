@@ -131,7 +131,7 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     error = scale * np.sqrt(together) * fitted.errors
     if not between and np.all(np.abs(fitted.drift) < CLEAR * error[2:]):
         axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
-    _check(where, gripper, fitted.inertia, float(error[0]), rig.gravity, fitted.offset, scale)
+    _check(where, gripper, fitted.inertia, float(error[0]))
     mass = fitted.mass if fitted.mass is not None else fitted.inertia
     offset, drift = axes @ fitted.offset, axes @ fitted.drift
     return Tool(
@@ -215,8 +215,7 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
     return (left * flip) @ right
 
 
-def _check(where: str, gripper: Gripper, inertia: float, error: float, gravity: float, offset: np.ndarray,
-           scale: float) -> None:  # fmt: skip
+def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
     """InputError where free motion contradicts what the rig says, or cannot tell what it leaves open."""
     if inertia < -CLEAR * error and gripper.reaction is not None:
         problem = "go against the hand's own acceleration in free motion: the sign is the other way round"

@@ -1,7 +1,7 @@
 """Most probable path and posterior of whole recordings, as EM and the segmentation take them.
 
-On the host kernels of hmmseg.hmm: nothing is compiled when it is called. hmmseg.hmm.banded has the same
-recursions in JAX, to be differentiated or run on an accelerator.
+On the host kernels of hmmseg.hmm: nothing is compiled when it is called. experiments.jax_hmm has the same
+recursions in JAX.
 """
 
 from __future__ import annotations
@@ -35,8 +35,12 @@ class Alignment:
 def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.ndarray,
           log_skip: Bands = (), *, log_initial: np.ndarray | None = None,
           log_final: np.ndarray | None = None) -> Alignment:  # fmt: skip
-    """Viterbi path and posterior of one recording, arguments as in hmmseg.hmm.banded.
+    """Viterbi path and posterior of one recording, of log likelihoods (num_timesteps, num_subtasks).
 
+    Log weights to stay (num_timesteps - 1, num_subtasks), to advance (num_timesteps - 1, num_subtasks - 1),
+    to skip one, two ... subtasks; without their first axis where they do not vary in time. Entry [t, k]
+    belongs to leaving subtask k between the samples t and t + 1. A path starts in subtask 0 and ends in the
+    last one unless `log_initial` or `log_final` (num_subtasks,) say otherwise.
     Raises InfeasibleAlignment (which subtask starves) and ValueError (NaN, wrong shapes).
     """
     chain = Chain(log_stay, log_advance, log_skip or None, log_initial=log_initial, log_final=log_final)

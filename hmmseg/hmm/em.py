@@ -43,7 +43,7 @@ class Durations(Protocol):
         ...
 
     def bands(self, trial: int) -> Bands:
-        """Log weights to stay, advance by one, two ... states in one trial (see hmmseg.hmm.banded)."""
+        """Log weights to stay, advance by one, two ... states in one trial (see hmmseg.hmm.alignment)."""
         ...
 
     def updated(self: S, responsibilities: Sequence[np.ndarray]) -> S:

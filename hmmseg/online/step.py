@@ -80,7 +80,7 @@ def _absorb(into, row):
 
 
 @compiled
-def _enter(row, t, half, kinds, blocks, moves, rises, rise_signs, before, after):
+def _enter(row, t, half, kinds, moves, rises, rise_signs, before, after):
     """Rewrite a hypothesis that leaves state `before` for `after`; whether its block rose the wrong way."""
     row[STATE] = after
     row[ENTRY], row[ENTRY_VARIANCE] = t - half, half * half / 3
@@ -126,9 +126,9 @@ def _add(table, count, row):
 
 
 @compiled
-def _advance(table, count, fresh, x, dt, half, chain, num_rounds, cyclic, rises, rise_signs, leave):
+def _advance(table, count, fresh, x, dt, half, chain, num_rounds, cyclic, rises, rise_signs):
     """Hypotheses that move on to the task's next state, and what stays of the others."""
-    kinds, blocks, moves, num_steps = chain
+    kinds, _, moves, num_steps = chain
     t, num_new = x[T], 0
     away = -math.expm1(-dt / PACE)
     for i in range(count):
@@ -146,7 +146,7 @@ def _advance(table, count, fresh, x, dt, half, chain, num_rounds, cyclic, rises,
             row[ROUND] += 1.0
         target = 1 if off else state + 1
         _crossed(row, t, half)
-        wrong = _enter(row, t, half, kinds, blocks, moves, rises, rise_signs, state, target)
+        wrong = _enter(row, t, half, kinds, moves, rises, rise_signs, state, target)
         if wrong:  # another block, or another place: from here on off the task
             row[STATE], row[MISSED], row[LEFT_AT] = num_steps, state, t
         table[i, WEIGHT] += math.log1p(-away)
@@ -193,7 +193,7 @@ def _depart(table, count, fresh, x, dt, half, chain, rises, rise_signs):
             row = fresh[num_new if found < 0 else num_new + 1]
             row[:] = table[i]
             row[WEIGHT] = weight
-            _enter(row, t, half, kinds, blocks, moves, rises, rise_signs, state, target)
+            _enter(row, t, half, kinds, moves, rises, rise_signs, state, target)
             if state < num_steps:
                 row[MISSED], row[LEFT_AT] = min(state + 1, num_steps - 1), t - half
             if found < 0:
@@ -275,7 +275,7 @@ def advance(table, count, fresh, x, dt, since, share, chain, num_rounds, cyclic,
     kinds, _, _, num_steps = chain
     half = dt / 2
     if dt > 0.0:
-        count = _advance(table, count, fresh, x, dt, half, chain, num_rounds, cyclic, rises, rise_signs, 1.0)
+        count = _advance(table, count, fresh, x, dt, half, chain, num_rounds, cyclic, rises, rise_signs)
     if since > 0.0:
         count = _depart(table, count, fresh, x, since, since / 2, chain, rises, rise_signs)
     top = -math.inf

@@ -206,15 +206,31 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
     speed = np.maximum(distance * rate_at_hit, c.sd_v)
     stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
     reach = stop * -np.expm1(-after / stop)
-    mean = c.v_right * (after - reach) + speed * reach
-    sd_after = np.sqrt(c.sd_right**2 + (c.sd_v * after) ** 2 + (2 * SHAPE * speed * reach) ** 2)
-    log_after = np.logaddexp.reduce(_log_normal(c.right, mean, sd_after), axis=0)
+    # What is left of `right`, but for its sign, when the velocity has decayed over this way; in place, as
+    # these are the largest arrays of a boundary.
+    apart = reach * (speed - c.v_right)
+    apart -= c.right - c.v_right * after
+    variance = reach**2 * (2 * SHAPE * speed) ** 2
+    variance += c.sd_right**2 + (c.sd_v * after) ** 2
+    log_after = _log_sum_normal(apart, variance)
     return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + log_after + np.log(speed)
 
 
 def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:
     """Log density of a normal distribution but for a constant."""
     return -0.5 * ((x - mean) / sd) ** 2 - np.log(sd)
+
+
+def _log_sum_normal(x: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Log of the sum along the first axis of normal densities, but for a constant; uses up its arguments."""
+    x *= x
+    x /= variance
+    x *= -0.5
+    peak = x.max(axis=0)
+    x -= peak
+    np.exp(x, out=x)
+    x /= np.sqrt(variance, out=variance)
+    return peak + np.log(x.sum(axis=0))
 
 
 def _minimum_jerk(phase: np.ndarray | float) -> np.ndarray | float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtr
@@ -47,12 +48,16 @@ class Prior:
     probability: np.ndarray
     limits: tuple[float, float]
 
+    @cached_property
+    def around(self) -> float:
+        """Time [s] within which the alignment cannot tell one interval from another."""
+        return SURROUNDING * float(np.median(np.diff(self.t)))
+
     def log_density(self, t: np.ndarray) -> np.ndarray:
         """Log prior density (unnormalised) of the boundary at t; -inf where it cannot be."""
         out = np.zeros_like(t)
-        around = SURROUNDING * float(np.median(np.diff(self.t)))
         for n in np.flatnonzero(self.probability > LIKELY):
-            low, high = self.t[n] - around, self.t[n + 1] + around
+            low, high = self.t[n] - self.around, self.t[n + 1] + self.around
             out += self.probability[n] / (high - low) * ((t >= low) & (t <= high))
         inside = (t >= self.limits[0]) & (t <= self.limits[1])
         with np.errstate(divide="ignore"):
@@ -95,11 +100,16 @@ class Change:
         """Changes of one sort share a discrepancy."""
         return self.kind, len(self.contacts)
 
-    @property
+    @cached_property
     def log_prior(self) -> np.ndarray:
         """Log prior probability (num_intervals,) of the intervals."""
         t = self.contacts[0].t
         return self.prior.log_density((t[1:] + t[:-1]) / 2) + np.log(np.diff(t))
+
+    @cached_property
+    def intervals(self) -> tuple[int, ...]:
+        """The interval in which each contact most likely switched, wherever force and position disagree."""
+        return tuple(int(switch_probability(c, self.log_prior, self.making).argmax()) for c in self.contacts)
 
 
 def cut(change: Change) -> Change | None:
@@ -134,8 +144,8 @@ def _discrepancy(changes: Sequence[Change]) -> float:
     """How far [m] force and position disagree at the contacts next to the changes."""
     found = []
     for change in changes:
-        for c in change.contacts:
-            n = _interval(c, change) + change.making
+        for c, interval in zip(change.contacts, change.intervals, strict=True):
+            n = interval + change.making
             beside = slice(n, n + 2) if change.making else slice(max(n - 1, 0), n + 1)
             sure = np.flatnonzero(c.pressed[beside] > SURE * c.sd_pressed)
             if sure.size:
@@ -153,8 +163,10 @@ def _discrepancy(changes: Sequence[Change]) -> float:
 
 def _abruptness(changes: Sequence[Change]) -> float:
     """Share of contacts that end before the position's way is spent: by maximum likelihood, and its prior."""
-    z = np.array([_inside(c, _last_pressed(c, _interval(c, change))) for change in changes
-                  if not change.making for c in change.contacts])  # fmt: skip
+    z = np.array([
+        _inside(c, _last_pressed(c, n)) for change in changes if not change.making
+        for c, n in zip(change.contacts, change.intervals, strict=True)
+    ])  # fmt: skip
     z = z[np.isfinite(z)]
     share = UNIFORM
     for _ in range(ROUNDS):
@@ -197,11 +209,6 @@ def _last_pressed(c: Penetration, n: int) -> int:
     """The interval up to n at whose start the force last shows contact, whatever positions say."""
     sure = np.flatnonzero(c.pressed[: n + 1] > SURE * c.sd_pressed)
     return int(sure[-1]) if sure.size else n
-
-
-def _interval(c: Penetration, change: Change) -> int:
-    """The interval in which a contact most likely switched."""
-    return int(switch_probability(c, change.log_prior, change.making).argmax())
 
 
 def moment(change: Change, known: Disagreement) -> BoundaryPosterior:

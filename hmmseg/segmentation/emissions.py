@@ -192,48 +192,77 @@ def log_likelihoods(
     """Emission log-likelihoods (num_timesteps, num_subtasks) of one trial.
 
     `stray`: share of resting samples that move; `rung`: of free samples whose forces still ring.
+    What subtasks have in common is computed once: a task has many of few contact states.
     """
-    return np.stack([_log_likelihood(features, s, parameters, trial, stray, rung) for s in subtasks], axis=1)
+    scale, span = parameters.scale, features.span
+    force = features.force - parameters.bias
+    free = _log_ungripped(force, scale["force"], span["force"], rung)
+    free = free + _broad(features, "vx", "vy") + _broad(features, "y") + _broad(features, "d")
+    held = _log_held(features, parameters, force)
+    names = dict.fromkeys(str(s.object) for s in subtasks if s.state != FREE)
+    grips = {name: held + _log_width(features, parameters, name) for name in names}
+    keys = [_alike(s, parameters, trial) for s in subtasks]
+    found = {
+        key: free if key[0] == FREE
+        else _log_gripped(features, parameters, grips[key[1]], free, force, *key, stray)
+        for key in dict.fromkeys(keys)
+    }  # fmt: skip
+    return np.stack([found[key] for key in keys], axis=1)
 
 
-def _log_likelihood(
-    f: Features, subtask: Subtask, p: Parameters, trial: int, stray: float, rung: float
-) -> np.ndarray:
-    scale, span = p.scale, f.span
-    force = f.force - p.bias
-    broad_vx, broad_vy = (-np.log(span[v]) * np.isfinite(getattr(f, v)) for v in ("vx", "vy"))
-    broad_v = broad_vx + broad_vy
-    broad_y = -np.log(span["y"]) * np.isfinite(f.y)
-    broad_d = -np.log(span["d"]) * np.isfinite(f.d)
-    free = _log_ungripped(force, scale["force"], span["force"], rung) + broad_v + broad_y + broad_d
-    if subtask.state == FREE:
-        return free
+def _alike(s: Subtask, p: Parameters, trial: int) -> tuple[str, str, float | None]:
+    """Contact state, object and resting level [m] of a subtask: what its emission depends on."""
+    rests = s.state not in (FREE, ABOVE_GROUND) and bool(p.levels)
+    return s.state, "" if s.state == FREE else str(s.object), p.levels[trial].get(s.index) if rests else None
+
+
+def _broad(f: Features, *names: str) -> np.ndarray:
+    """Log density (num_timesteps,) of quantities that may be anything; 0 where missing."""
+    parts = [-np.log(f.span[name]) * np.isfinite(getattr(f, name)) for name in names]
+    return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+
+
+def _log_held(f: Features, p: Parameters, force: np.ndarray) -> np.ndarray:
+    """Log density of the forces that press a block between the fingers, but for the net vertical one."""
     grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
-    fy, shear = force[:, 1] + force[:, 3], (force[:, 1] - force[:, 3]) / 2
-    out = _log_between(grip, 0.0, span["force"], scale["force"])
+    out = _log_between(grip, 0.0, f.span["force"], p.scale["force"])
     if f.free is not None:
         out += SHUT * (f.free == 1)
-    out += log_student(net_x, scale["net_x"]) + log_student(shear, scale["shear"])
-    width = p.width.get(str(subtask.object))
+    shear = (force[:, 1] - force[:, 3]) / 2
+    return out + (log_student(net_x, p.scale["net_x"]) + log_student(shear, p.scale["shear"]))
+
+
+def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:
+    """Log density of the fingers' distance with an object between them."""
+    width = p.width.get(name)
     if width is None:  # the first pass knows neither widths nor where a block rests
-        out += broad_d
-    else:
-        spread = np.hypot(f.sd_d, scale["width"])
-        out += _log_mostly(f.block_width(p.bias) - width, spread, span["d"], TOUCHING)
-    weight = p.weight[str(subtask.object)]
-    if subtask.state == ABOVE_GROUND:
-        out += log_student(fy - weight * f.carrying, scale["carry"]) + broad_v + broad_y
+        return _broad(f, "d")
+    spread = np.hypot(f.sd_d, p.scale["width"])
+    return _log_mostly(f.block_width(p.bias) - width, spread, f.span["d"], TOUCHING)
+
+
+def _log_gripped(
+    f: Features, p: Parameters, grip: np.ndarray, free: np.ndarray, force: np.ndarray,
+    state: str, name: str, level: float | None, stray: float,
+) -> np.ndarray:  # fmt: skip
+    """Log-likelihoods (num_timesteps,) of one held object in one contact state, resting at this `level`.
+
+    `grip`: log density of what presses it, `free`: of no grip at all, `force`: without biases.
+    """
+    fy, weight, scale = force[:, 1] + force[:, 3], p.weight[name], p.scale
+    if state == ABOVE_GROUND:
+        carried = log_student(fy - weight * f.carrying, scale["carry"])
+        out = grip + (carried + _broad(f, "vx", "vy") + _broad(f, "y"))
         out += np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
         return np.logaddexp(np.log1p(-LOST) + out, np.log(LOST) + free)
-    if subtask.state not in (ON_GROUND, SLIDING):
-        raise ValueError(f"no emission for the contact state {subtask.state!r}")
-    out += _log_between(fy, -span["press"], weight, scale["carry"])
-    level = p.levels[trial].get(subtask.index) if p.levels else None
-    aside = None if subtask.state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
-    upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), broad_vy
+    if state not in (ON_GROUND, SLIDING):
+        raise ValueError(f"no emission for the contact state {state!r}")
+    out = grip + _log_between(fy, -f.span["press"], weight, scale["carry"])
+    aside = None if state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
+    upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), _broad(f, "vy")
     if level is None:  # where it rests is not known
-        out += broad_y
+        out += _broad(f, "y")
     else:
         upward += log_student(f.block_y(p.bias) - level, np.hypot(f.sd_y, scale["level"]))
-        broad_up = broad_up + broad_y
-    return out + _log_resting(aside, upward, broad_vx, broad_up, stray)
+        broad_up = broad_up + _broad(f, "y")
+    return out + _log_resting(aside, upward, _broad(f, "vx"), broad_up, stray)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.contact.equations import pads_of
+from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.emissions import Features
@@ -26,11 +27,6 @@ def noise_sd(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(6.0)) if bend.size else np.nan
 
 
-def group_size(rate: float, max_rate: float) -> int:
-    """How many samples at `rate` [Hz] become one at no more than `max_rate`."""
-    return int(np.ceil(rate / max_rate - 1e-6))
-
-
 def thin(
     signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf, rate: float | None = None
 ) -> Signals:
@@ -45,18 +41,12 @@ def thin(
     if group <= 1:
         return signals
     width = int(np.clip(min(window, 1.0) * rate, 1, group))
-    starts = np.arange(0, signals.t.size - width + 1, group)
-    index = starts[:, None] + np.arange(width)
     thinned = {}
     for name, values in vars(signals).items():
         if not isinstance(values, np.ndarray):
             thinned[name] = values
             continue
-        block = values[index]
-        there = np.isfinite(block)
-        count = there.sum(axis=1)
-        mean = np.where(there, block, 0.0).sum(axis=1) / np.maximum(count, 1)
-        mean = np.where(count > 0, mean, np.nan)
+        mean, count = grouped(values, group, width)
         thinned[name] = mean / np.sqrt(np.maximum(count, 1)) if name.startswith("sd_") else mean
     thinned["sd_force"] = signals.sd_force / np.sqrt(width)
     return Signals(**thinned)

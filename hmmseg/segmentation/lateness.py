@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -91,8 +92,9 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], least: flo
         return None
     compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
     cost = ((compliances - prior[0]) / prior[1]) ** 2 / 2
-    shifted = -cost[:, None] + sum(_log_shifted(s, compliances) for s in squeezes)
-    filtered = -cost[:, None] + sum(_log_filtered(s, compliances) for s in squeezes)
+    loads = [_loads(s, compliances) for s in squeezes]
+    shifted = -cost[:, None] + sum(map(_log_shifted, squeezes, repeat(compliances), loads))
+    filtered = -cost[:, None] + sum(map(_log_filtered, squeezes, repeat(compliances), loads))
     families = ((SHIFTS, shifted.max(axis=0)), (CONSTANTS, filtered.max(axis=0)))
     none = families[0][1][least >= SHIFTS].max()
     found = []
@@ -105,30 +107,29 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], least: flo
     return max(found, key=lambda one: one.gain)
 
 
-def _log_shifted(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
+def _log_shifted(s: Squeeze, compliances: np.ndarray, loads: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_shifts) of one squeeze."""
     clock = np.clip(s.t[:, None] - SHIFTS, s.t[0], s.t[-1])
-    load, pace = (_at(x, clock - s.t[0]) for x in _loads(s, compliances))
+    load, pace = _at(loads, clock - s.t[0])
     return _log_likelihood(s, compliances, load, pace)
 
 
-def _log_filtered(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
+def _log_filtered(s: Squeeze, compliances: np.ndarray, loads: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_constants) of one squeeze."""
-    both = np.stack(_loads(s, compliances))
-    smooth = [_at(_smoothed(both, constant), s.t - s.t[0]) for constant in CONSTANTS]
+    smooth = [_at(_smoothed(loads, constant), s.t - s.t[0]) for constant in CONSTANTS]
     load, pace = np.stack(smooth, axis=-1)
     return _log_likelihood(s, compliances, load, pace)
 
 
-def _loads(s: Squeeze, compliances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Loads [N] (num_compliances, num_steps) at each STEP from the first sample on, and their rates."""
+def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
+    """Loads [N], and their rates, (2, num_compliances, num_steps) at each STEP from the first sample on."""
     there = np.nan_to_num(s.load)
     holds = there >= HOLD * np.quantile(there, FIRMEST)
     width = np.median(s.distance[holds] + compliances[:, None] * there[holds], axis=1, keepdims=True)
     clock = np.minimum(np.arange(s.t[0], s.t[-1] + STEP, STEP), s.t[-1])
     distance = CubicHermiteSpline(s.t, s.distance, s.rate)(clock)
     load = np.maximum(width - distance, 0.0) / compliances[:, None]
-    return load, np.abs(np.gradient(load, STEP, axis=1))
+    return np.stack([load, np.abs(np.gradient(load, STEP, axis=1))])
 
 
 def _at(values: np.ndarray, clock: np.ndarray) -> np.ndarray:

@@ -8,11 +8,12 @@ from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 
+from hmmseg.hand.grouping import group_size
 from hmmseg.hand.rates import come_late, differenced
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
-from hmmseg.segmentation.features import group_size, thin
+from hmmseg.segmentation.features import thin
 from hmmseg.segmentation.rounds import part
 
 MARGIN = 64  # numerics: rows read on either side of a part, for differences of its neighbours

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -89,65 +89,91 @@ def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]
     return out
 
 
+def unfiltered(s: Stretch, constant: float) -> Stretch:
+    """The stretch with the first-order filter of this time `constant` [s] of its loads undone.
+
+    Exact for an input that is steady within each sample interval, whose middle the result belongs to.
+    """
+    kept = np.exp(-s.step / constant)
+    load = (s.load - kept * s.before) / (1 - kept)
+    # A filtered force lingers after its contact.
+    there = load > s.sure * np.sqrt(1 + kept**2) / (1 - kept)
+    return replace(s, t=(s.t - s.step / 2)[there], load=load[there])
+
+
+def shifted(s: Stretch, shifts: np.ndarray, reach: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Loads and values (num_shifts, M) that belong together for forces late by each shift [s].
+
+    Loads are interpolated to the times of the values, whose noise matters more; up to `reach` [s] beyond the
+    first and the last of them they are extrapolated (negative: so much at either end is left out). The last
+    of the three says which count, the others are 0.
+    """
+    t, load, late = s.t, s.load, shifts[:, None]
+    if t.size < 2:
+        return (none := np.zeros((shifts.size, 0))), none, none > 0
+    edge = reach + 1e-9
+    low, high = np.searchsorted(s.clock, [t[0] - shifts.max() - edge, t[-1] - shifts.min() + edge])
+    clock, place = s.clock[low : high + 1], s.place[low : high + 1]
+    first, last = t[0] - late, t[-1] - late
+    after = np.clip(np.searchsorted(t, clock + late), 1, t.size - 1)
+    step = np.diff(t)[after - 1]
+    within = (clock >= first - edge) & (clock <= last + edge) & (step < 1.5 * s.interval)
+    before = load[after - 1]
+    # A straight line between two loads, and beyond the first and the last.
+    loads = before + (load[after] - before) * ((clock + late - t[after - 1]) / step)
+    loads = np.where(within, loads, 0.0)
+    return loads, np.where(within, place + s.toe.give(loads), 0.0), within
+
+
 def reading(
     s: Stretch, shift: float = 0.0, constant: float = 0.0, reach: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Loads and values that belong together, for forces `shift` s late or filtered.
-
-    Loads are interpolated to the times of the values, whose noise matters more; up to `reach` [s] beyond the
-    first and the last of them they are extrapolated (negative: so much at either end is left out). A
-    first-order filter of this time `constant` [s] is undone exactly for an input that is steady within each
-    sample interval, whose middle the result belongs to.
-    """
-    t, load = s.t - shift, s.load
-    if constant > 0:
-        kept = np.exp(-s.step / constant)
-        load = (s.load - kept * s.before) / (1 - kept)
-        # A filtered force lingers after its contact.
-        there = load > s.sure * np.sqrt(1 + kept**2) / (1 - kept)
-        t, load = (t - s.step / 2)[there], load[there]
-    if t.size < 2:
-        return np.zeros(0), np.zeros(0)
-    after = np.clip(np.searchsorted(t, s.clock), 1, t.size - 1)
-    close = t[after] - t[after - 1] < 1.5 * s.interval
-    edge = reach + 1e-9
-    within = (s.clock >= t[0] - edge) & (s.clock <= t[-1] + edge) & close
-    clock = s.clock[within]
-    steep = (load[1] - load[0]) / (t[1] - t[0]), (load[-1] - load[-2]) / (t[-1] - t[-2])
-    beyond = np.minimum(clock - t[0], 0.0) * steep[0] + np.maximum(clock - t[-1], 0.0) * steep[1]
-    loads = np.interp(clock, t, load) + beyond
-    return loads, s.place[within] + s.toe.give(loads)
+    """Loads and values that belong together, as `shifted`, for forces `shift` s late or filtered."""
+    read = unfiltered(s, constant) if constant > 0 else s
+    loads, values, within = shifted(read, np.array([shift]), reach)
+    return loads[within], values[within]
 
 
 def fitted(
-    load: np.ndarray, value: np.ndarray, sd: float, rounds: int = 5
-) -> tuple[float, float, np.ndarray]:
-    """Slope -dvalue/dload, its information and residuals (N,); Student-t, reweighted.
+    load: np.ndarray, value: np.ndarray, sd: float, rounds: int = 5, there: np.ndarray | bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slopes -dvalue/dload (...), their information and residuals (..., N); Student-t, reweighted.
 
-    Noise of the loads would flatten the slope by its share of their variance: that much is not known.
+    Only samples `there` (..., N) count. Noise of the loads would flatten the slope by its share of their
+    variance: that much is not known. Both are 0 where fewer than four samples count, or none differs.
     """
-    weight, slope, scale2, spread = np.ones(load.size), 0.0, sd**2, 0.0
-    residual = np.zeros(value.size)
-    if load.size < 4:
-        return 0.0, 0.0, residual
+    weight = np.broadcast_to(there, load.shape).astype(float)
+    count = weight.sum(axis=-1)
+    told, free = count > 3, np.maximum(count - 2, 1)
+    mask, slope, scale2, spread = weight, np.zeros(count.shape), np.full(count.shape, sd**2), count
+    residual = np.zeros_like(value)
     for _ in range(rounds):
-        total = weight.sum()
-        x, y = load - weight @ load / total, value - weight @ value / total
-        spread = float(weight @ x**2)
-        if spread <= 0:
-            return 0.0, 0.0, y
-        slope = float(-(weight * x) @ y / spread)
-        residual = y + slope * x
-        scale2 = max(float(weight @ residual**2) / max(load.size - 2, 1), sd**2)
-        weight = (TAIL + 1) / (TAIL + residual**2 / scale2)
-    flattened = slope * min(scale2 / max(slope**2 * spread / weight.sum(), 1e-300), 1.0)
-    return slope, 1 / (scale2 / spread + flattened**2), residual
+        total = np.maximum(weight.sum(axis=-1), 1e-300)
+        mean = [((weight * v).sum(axis=-1) / total)[..., None] for v in (load, value)]
+        x, y = load - mean[0], value - mean[1]
+        wx = weight * x
+        spread = (wx * x).sum(axis=-1)
+        told = told & (spread > 0)
+        spread = np.where(told, spread, 1.0)
+        slope = -(wx * y).sum(axis=-1) / spread * told
+        residual = y + slope[..., None] * x
+        scale2 = np.maximum((weight * residual**2).sum(axis=-1) / free, sd**2)
+        weight = mask * ((TAIL + 1) / (TAIL + residual**2 / scale2[..., None]))
+    share = scale2 * weight.sum(axis=-1) / np.maximum(slope**2 * spread, 1e-300)
+    flattened = slope * np.minimum(share, 1.0)
+    return np.asarray(slope), np.asarray(told / (scale2 / spread + flattened**2)), residual
 
 
-def _median(values: np.ndarray) -> float:
-    """Median of finite values; np.median takes ten times as long for a few."""
-    ordered = np.sort(values)
-    return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2)
+def _medians(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Medians (...) of the values (..., N) that are `there`; 0 of none."""
+    if not values.size:
+        return np.zeros(values.shape[:-1])
+    ordered, count = np.sort(np.where(there, values, np.inf), axis=-1), there.sum(axis=-1)
+    pair = [
+        np.take_along_axis(ordered, i[..., None], -1)[..., 0]
+        for i in (np.maximum(count - 1, 0) // 2, count // 2)
+    ]
+    return np.where(count > 0, (pair[0] + pair[1]) / 2, 0.0)
 
 
 def evidence(
@@ -168,20 +194,38 @@ def evidence(
     for row, own, prior in zip(out, kinds, priors, strict=True):
         if not own:
             continue
-        usual, num_samples = _median(np.array([s.sd for s in own])), sum(s.t.size for s in own)
-        tried = []
-        for d in delays:
-            key = {"constant" if filtered else "shift": float(d)}
-            read = [reading(s, **key, reach=-inner * s.interval / 2) for s in own]
-            found = np.array([fitted(*r, s.sd, rounds=3)[:2] for r, s in zip(read, own, strict=True)])
-            weight = np.r_[np.minimum(found[:, 1], len(own) * _median(found[:, 1])), prior[1] ** -2]
-            c = max(float(weight @ np.r_[found[:, 0], prior[0]] / weight.sum()), 0.0)
-            rests = [value + c * load for load, value in read if load.size]
-            tried.append(np.concatenate([r - _median(r) for r in rests] or [np.zeros(0)]))
-        enough = [r.size >= KEPT * num_samples for r in tried]
-        scales = [1.4826 * _median(np.abs(r)) for r, e in zip(tried, enough, strict=True) if e]
-        scale = max(min(scales, default=usual), usual)
-        for i, residual in enumerate(tried):
-            cost = (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL)
-            row[i] = -num_samples * float(cost.mean()) if enough[i] else -np.inf
+        num_samples = sum(s.t.size for s in own)
+        usual = float(_medians(np.array([s.sd for s in own]), np.ones(len(own), bool)))
+        read = [_read(s, delays, filtered, -inner * s.interval / 2) for s in own]
+        found = [fitted(*r[:2], s.sd, 3, r[2])[:2] for r, s in zip(read, own, strict=True)]
+        slope, told = (np.stack([f[i] for f in found], axis=-1) for i in (0, 1))
+        weight = np.minimum(told, len(own) * _medians(told, np.ones_like(told, bool))[:, None])
+        total = weight.sum(axis=-1) + prior[1] ** -2
+        c = np.maximum(((weight * slope).sum(axis=-1) + prior[0] * prior[1] ** -2) / total, 0.0)
+        rests = [value + c[:, None] * load for load, value, _ in read]
+        residual = np.concatenate(
+            [r - _medians(r, one[2])[:, None] for r, one in zip(rests, read, strict=True)], axis=-1
+        )
+        there = np.concatenate([one[2] for one in read], axis=-1)
+        count = there.sum(axis=-1)
+        enough = count >= KEPT * num_samples
+        scale = max(min(1.4826 * _medians(np.abs(residual), there)[enough], default=usual), usual)
+        cost = (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL) * there
+        row[:] = np.where(enough, -num_samples * cost.sum(axis=-1) / np.maximum(count, 1), -np.inf)
     return DEPENDENT * out
+
+
+def _read(
+    s: Stretch, delays: np.ndarray, filtered: bool, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A stretch as `shifted`, for each delay, or each time constant of a filter."""
+    if not filtered:
+        return shifted(s, delays, reach)
+    none = np.zeros(1)
+    every = [shifted(unfiltered(s, d) if d > 0 else s, none, reach) for d in delays]
+    width = max(loads.size for loads, *_ in every)
+    loads, values, there = (
+        np.concatenate([np.pad(one[i], ((0, 0), (0, width - one[i].size))) for one in every])
+        for i in range(3)
+    )
+    return loads, values, there

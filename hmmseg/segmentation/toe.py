@@ -25,6 +25,7 @@ DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of
 DEPTH = 5e-4  # prior: m; sd of how deep a toe is
 DECISIVE = 7.0  # chosen: nats for a toe against none: odds of a thousand to one
 ROUNDS = 6  # numerics: of reweighting
+LEVEL = 1e-28  # numerics: of the squares of loads that do not differ, what rounding leaves about their mean
 Reading = tuple[np.ndarray, np.ndarray, float]
 
 
@@ -57,39 +58,51 @@ def find(readings: Sequence[Reading]) -> Toe:
     if not readings:
         return NONE
     usual = float(np.median([sd for *_, sd in readings]))
-    straight = _depth(readings, None, usual)[1]
-    scale = max(usual, 1.4826 * float(np.median(np.abs(straight))))
-    none = _evidence(straight, scale)
-    found = []
-    for soft in SOFTS:
-        depth, residual = _depth(readings, soft, scale)
-        gain = _evidence(residual, scale) - none - (depth / DEPTH) ** 2 / 2
-        found.append((gain, Toe(depth, soft)))
-    gain, toe = max(found, key=lambda pair: pair[0])
-    return toe if gain > DECISIVE and toe.depth > 0 else NONE
+    load, value, there = _padded(readings)
+    straight = _depths(load, value, np.zeros((1, *load.shape)), there, usual)[1]
+    scale = max(usual, 1.4826 * float(np.median(np.abs(straight[0][there]))))
+    toes = np.stack([Toe(1.0, soft).give(load) for soft in SOFTS])
+    depth, residual = _depths(load, value, toes, there, scale)
+    gain = _evidence(residual, there, scale) - _evidence(straight, there, scale) - (depth / DEPTH) ** 2 / 2
+    best = int(gain.argmax())
+    return Toe(float(depth[best]), SOFTS[best]) if gain[best] > DECISIVE and depth[best] > 0 else NONE
 
 
-def _evidence(residual: np.ndarray, scale: float) -> float:
-    return -DEPENDENT * (TAIL + 1) / 2 * float(np.log1p((residual / scale) ** 2 / TAIL).sum())
+def _padded(readings: Sequence[Reading]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Loads and values (num_stretches, N) of all stretches, and which are there; the rest is 0."""
+    size = max(load.size for load, *_ in readings)
+    there = np.arange(size) < np.array([load.size for load, *_ in readings])[:, None]
+    out = np.zeros((2, *there.shape))
+    for i in range(2):
+        out[i][there] = np.concatenate([r[i] for r in readings])
+    return out[0], out[1], there
 
 
-def _depth(readings: Sequence[Reading], soft: float | None, scale: float) -> tuple[float, np.ndarray]:
-    """Common depth [m] of a toe that ends at `soft` [N] (None: no toe), and residuals of all samples.
+def _evidence(residual: np.ndarray, there: np.ndarray, scale: float) -> np.ndarray:
+    """Log-likelihoods (K,) of residuals (K, num_stretches, N)."""
+    cost = np.log1p((residual / scale) ** 2 / TAIL) * there
+    return -DEPENDENT * (TAIL + 1) / 2 * cost.sum(axis=(1, 2))
 
-    Student-t, reweighted.
+
+def _depths(
+    load: np.ndarray, value: np.ndarray, toes: np.ndarray, there: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Common depth [m] (K,) of a toe of each shape (K, num_stretches, N), and residuals of all samples.
+
+    Each stretch has a line of its own. Student-t, reweighted.
     """
-    weights = [np.ones(load.size) for load, *_ in readings]
-    toes = [np.zeros(r[0].size) if soft is None else Toe(1.0, soft).give(r[0]) for r in readings]
-    depth, residuals = 0.0, []
+    weight = np.broadcast_to(there, toes.shape).astype(float)
     for _ in range(ROUNDS):
-        bent, left = [], []
-        for (load, value, _), toe, weight in zip(readings, toes, weights, strict=True):
-            line = np.stack([np.ones(load.size), load], axis=1)
-            solve = np.linalg.pinv(line * weight[:, None] ** 0.5) * weight**0.5
-            bent.append(toe - line @ (solve @ toe))
-            left.append(value - line @ (solve @ value))
-        curved = sum(float(w @ b**2) for w, b in zip(weights, bent, strict=True)) + (scale / DEPTH) ** 2
-        depth = -sum(float((w * b) @ v) for w, b, v in zip(weights, bent, left, strict=True)) / curved
-        residuals = [v + depth * b for v, b in zip(left, bent, strict=True)]
-        weights = [(TAIL + 1) / (TAIL + (r / scale) ** 2) for r in residuals]
-    return depth, np.concatenate(residuals)
+        total = weight.sum(axis=-1, keepdims=True)
+        x, bent, left = (v - (weight * v).sum(axis=-1, keepdims=True) / total for v in (load, toes, value))
+        wx = weight * x
+        spread = (wx * x).sum(axis=-1, keepdims=True)
+        steep = spread > LEVEL * (weight * load**2).sum(axis=-1, keepdims=True)
+        slope = wx / np.where(steep, spread, np.inf)
+        bent = bent - (slope * bent).sum(axis=-1, keepdims=True) * x
+        left = left - (slope * left).sum(axis=-1, keepdims=True) * x
+        curved = (weight * bent**2).sum(axis=(1, 2)) + (scale / DEPTH) ** 2
+        depth = -(weight * bent * left).sum(axis=(1, 2)) / curved
+        residual = left + depth[:, None, None] * bent
+        weight = there * ((TAIL + 1) / (TAIL + (residual / scale) ** 2))
+    return depth, residual

@@ -79,11 +79,11 @@ def _taught(
     cuts = np.unique(np.clip((known[np.isfinite(known)] * cells).round().astype(int), 1, cells - 1))
     path = partition(np.arcsinh(filled(values[teacher])), number, floor, cuts)
     alone = Learner([values[teacher]], names, [False] * number)
-    taught, start, _ = alone.run(alone.one_hot([path]), temper, FLOORS[1:3], steps=1)
+    taught, start = alone.run(alone.one_hot([path]), temper, FLOORS[1:3], steps=1)
     if cuts.size:
         learner.known[teacher] = path
-    aligned = learner.align(taught, start)
-    emissions, probability, _ = learner.run(
+    aligned = learner.align(taught, learner.law(start))
+    emissions, probability = learner.run(
         [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
     cost = merged_costs(values, [p.argmax(1) for p in probability], number, MERGE_FLOOR) / features

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import align_many
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence import misfit as sequence_misfit
@@ -17,10 +16,9 @@ from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions, from_weights
 from hmmseg.sequence.features import FeatureMap, Features, feature_map, features
 from hmmseg.sequence.labels import Labels, choose_detectors, forbidden, labelled_path, read_labels, shares
-from hmmseg.sequence.learner import FLOORS, STEPS_PER_FLOOR, Learner
-from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states, weights
+from hmmseg.sequence.learner import FLOORS, Learner
+from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states
 from hmmseg.sequence.naming import WEIGHING, Naming, best_choice, naming, probabilities
-from hmmseg.sequence.transitions import transitions
 
 LEAST_PROBABLE = 0.002  # numerics: courses below are left out
 MOST_KEPT = 16  # numerics: courses in a model
@@ -95,9 +93,9 @@ def _fit_unlabelled(data: list[Features], task: SequenceTask, mapping: FeatureMa
 
 def _settle(learner: Learner, start: list[np.ndarray]) -> tuple[StudentEmissions, list[np.ndarray]]:
     """EM at the finest scale, with the emissions' own share of independent observations in the end."""
-    emissions, probability, _ = learner.run(start, 1 / learner.stacked.shape[1], FLOORS[-2:])
+    emissions, probability = learner.run(start, 1 / learner.stacked.shape[1], FLOORS[-2:])
     emissions = replace(emissions, temper=learner.independent_share(emissions, probability))
-    return emissions, [a.smoothed for a in learner.align(emissions, probability)]
+    return emissions, [a.smoothed for a in learner.align(emissions, learner.law(probability))]
 
 
 def _fine(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndarray]:
@@ -135,7 +133,7 @@ def _fit_labelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
     probability = taught.one_hot(paths)
     emissions = from_weights(taught.stacked, taught.pooled(probability), FLOORS[-1], 1.0)
     emissions = replace(emissions, temper=taught.independent_share(emissions, probability))
-    law = transitions(*taught.durations(probability), optional)
+    law = taught.law(probability)
     detectors = choose_detectors(
         taught.values, [boundaries[i] for i in with_labels], [data[i].edges for i in with_labels],
         paths, emissions.temper, FLOORS[-1], law,
@@ -148,14 +146,9 @@ def _fit_labelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
             forbidden(each, b, learner.num_states) if path is None else None
             for each, b, path in zip(data, boundaries, known, strict=True)
         ]
-        parts = [weights(v, emissions, detectors, law.bands) for v in learner.values]
-        tables = [p[0] if a is None else p[0] + a for p, a in zip(parts, learner.allowed, strict=True)]
-        aligned = align_many(tables, [p[1] for p in parts],
-                             log_initial=law.log_initial, log_final=law.log_final)  # fmt: skip
-        start = learner.one_hot([a.path if k is None else k for a, k in zip(aligned, known, strict=True)])
-        emissions, probability, _ = learner.run(
-            start, emissions.temper, FLOORS[-1:], detectors, STEPS_PER_FLOOR
-        )
+        aligned = learner.align(emissions, law, detectors)
+        start = learner.told(learner.one_hot([a.path for a in aligned]))
+        emissions, probability = learner.run(start, emissions.temper, FLOORS[-1:], detectors)
     return _finish(data, task, mapping, learner, emissions, probability, detectors)
 
 

@@ -18,7 +18,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.sequence.detectors import Detectors, learn
 from hmmseg.sequence.emissions import from_weights
 from hmmseg.sequence.features import Features
-from hmmseg.sequence.model import combined
+from hmmseg.sequence.model import jumps
 from hmmseg.sequence.transitions import Transitions
 
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
@@ -164,10 +164,8 @@ def _held_out(values, channels, cells, paths, half, temper, floor,
         emissions = from_weights(np.vstack([values[j] for j in rest]), onehot, floor, temper)
         detectors = learn([channels[j] for j in rest], [shown(cells[j]) for j in rest], half)
         ll, ratios = emissions.log_likelihoods(values[i]), detectors.log_ratios(channels[i])
-        parts += [
-            combined(ll, ratios, replace(detectors, weight=w, state_weight=s), law.bands)
-            for w in WEIGHTS for s in STATE_WEIGHTS
-        ]  # fmt: skip
+        parts += [(s * ll, jumps(ratios, replace(detectors, weight=w), law.bands))
+                  for w in WEIGHTS for s in STATE_WEIGHTS]  # fmt: skip
     aligned = align_many([p[0] for p in parts], [p[1] for p in parts],
                          log_initial=law.log_initial, log_final=law.log_final)  # fmt: skip
     grid = (len(values), len(WEIGHTS), len(STATE_WEIGHTS))

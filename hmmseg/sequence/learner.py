@@ -1,13 +1,15 @@
-"""EM over all trials of a plain ordered task."""
+"""EM over all trials of a plain ordered task: its emissions and durations under `hmmseg.hmm.em`."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.hmm.alignment import Alignment, align_many
+from hmmseg.hmm.alignment import Alignment, Bands
+from hmmseg.hmm.em import em, expectation
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import (
     StudentEmissions,
@@ -16,8 +18,8 @@ from hmmseg.sequence.emissions import (
     residuals,
     update,
 )
-from hmmseg.sequence.model import weights
-from hmmseg.sequence.transitions import transitions
+from hmmseg.sequence.model import jumps, ratios_of
+from hmmseg.sequence.transitions import Transitions, transitions
 
 FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
 STEPS_PER_FLOOR = 4  # numerics: of EM
@@ -32,12 +34,7 @@ class Learner:
     (num_cells, num_states), -inf where a state is forbidden and 0 elsewhere. None where they say nothing.
     """
 
-    def __init__(
-        self,
-        values: Sequence[np.ndarray],
-        names: Sequence[str],
-        optional: Sequence[bool],
-    ) -> None:
+    def __init__(self, values: Sequence[np.ndarray], names: Sequence[str], optional: Sequence[bool]) -> None:
         self.values = list(values)
         self.stacked = np.vstack(self.values)
         self.optional = list(optional)
@@ -60,16 +57,16 @@ class Learner:
         cells = np.sum([p.sum(0) for p in probability], 0) / np.maximum(visited.sum(0), 0.5)
         return np.maximum(cells, 1.5), presence
 
-    def align(self, emissions: StudentEmissions, probability: Sequence[np.ndarray],
-              detectors: Detectors | None = None, labels: bool = True) -> list[Alignment]:  # fmt: skip
-        """Alignments of all trials; `labels` False: as if nothing were known of them."""
-        law = transitions(*self.durations(probability), self.optional)
-        parts = [weights(v, emissions, detectors, law.bands) for v in self.values]
-        tables = [
-            p[0] if allowed is None or not labels else p[0] + allowed
-            for p, allowed in zip(parts, self.allowed, strict=True)
-        ]
-        return align_many(tables, [p[1] for p in parts], log_initial=law.log_initial, log_final=law.log_final)
+    def align(
+        self, emissions: StudentEmissions, law: Transitions, detectors: Detectors | None = None
+    ) -> tuple[Alignment, ...]:
+        """Alignments of all trials, in which no state is where labels forbid it."""
+        states = _Emission(self, detectors, emissions, 0.0)
+        return expectation(states, _Durations(self, detectors, law), len(self.values))
+
+    def law(self, probability: Sequence[np.ndarray]) -> Transitions:
+        """How states follow each other, from posterior state probabilities."""
+        return transitions(*self.durations(probability), self.optional)
 
     def run(
         self,
@@ -78,20 +75,22 @@ class Learner:
         floors: Sequence[float] = FLOORS,
         detectors: Detectors | None = None,
         steps: int = STEPS_PER_FLOOR,
-    ) -> tuple[StudentEmissions, list[np.ndarray], float]:
-        """EM from given state probabilities; also those it ends with and the summed log evidence."""
-        probability = list(probability)
-        emissions = from_weights(self.stacked, self.pooled(probability), floors[0], temper)
-        aligned: list[Alignment] = []
+    ) -> tuple[StudentEmissions, list[np.ndarray]]:
+        """EM from given state probabilities, `steps` at each floor of the scales; also those it ends with."""
+        first = from_weights(self.stacked, self.pooled(probability), floors[0], temper)
+        emission = _Emission(self, detectors, first, floors[0])
+        durations = _Durations(self, detectors, self.law(probability))
         for floor in floors:
-            for _ in range(steps):
-                aligned = self.align(emissions, probability, detectors)
-                probability = [
-                    a.smoothed if path is None else np.eye(self.num_states)[path]
-                    for a, path in zip(aligned, self.known, strict=True)
-                ]
-                emissions = update(emissions, self.stacked, self.pooled(probability), floor)
-        return emissions, probability, sum(a.log_evidence for a in aligned)
+            found = em(replace(emission, floor=floor), durations, len(self.values), max_iterations=steps)
+            probability = found.responsibilities
+            emission = found.emission.updated(probability)
+            durations = found.durations.updated(probability)
+        return emission.emissions, self.told(probability)
+
+    def told(self, probability: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """State probabilities, of labelled trials those of their labels."""
+        return [p if k is None else np.eye(self.num_states)[k]
+                for p, k in zip(probability, self.known, strict=True)]  # fmt: skip
 
     def one_hot(self, paths: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Paths as state probabilities."""
@@ -103,3 +102,44 @@ class Learner:
         return independent_share(
             [residuals(emissions, v, p) for v, p in zip(self.values, paths, strict=True)]
         )
+
+
+@dataclass(frozen=True)
+class _Emission:
+    """`hmmseg.hmm.em.Emission` of a learner's trials; scales are kept above `floor`."""
+
+    learner: Learner
+    detectors: Detectors | None
+    emissions: StudentEmissions
+    floor: float
+
+    def log_likelihoods(self, trial: int) -> np.ndarray:
+        allowed = self.learner.allowed[trial]
+        ll = self.emissions.log_likelihoods(self.learner.values[trial])
+        ll = ll if self.detectors is None else self.detectors.state_weight * ll
+        return ll if allowed is None else ll + allowed
+
+    def updated(self, responsibilities: Sequence[np.ndarray]) -> _Emission:
+        pooled = self.learner.pooled(self.learner.told(responsibilities))
+        return replace(self, emissions=update(self.emissions, self.learner.stacked, pooled, self.floor))
+
+
+@dataclass(frozen=True)
+class _Durations:
+    """`hmmseg.hmm.em.Durations` of a learner's trials; detectors make advancing depend on time."""
+
+    learner: Learner
+    detectors: Detectors | None
+    law: Transitions
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.law.log_initial, self.law.log_final
+
+    def bands(self, trial: int) -> Bands:
+        if self.detectors is None:
+            return self.law.bands
+        return jumps(ratios_of(self.learner.values[trial], self.detectors), self.detectors, self.law.bands)
+
+    def updated(self, responsibilities: Sequence[np.ndarray]) -> _Durations:
+        return replace(self, law=self.learner.law(self.learner.told(responsibilities)))

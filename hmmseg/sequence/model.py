@@ -108,18 +108,20 @@ def weights(values: np.ndarray, emissions: StudentEmissions, detectors: Detector
     ll = emissions.log_likelihoods(values)
     if detectors is None:
         return ll, bands
-    ratios = detectors.log_ratios(values[:, : detectors.mean.shape[2]])
-    return combined(ll, ratios, detectors, bands)
+    return detectors.state_weight * ll, jumps(ratios_of(values, detectors), detectors, bands)
 
 
-def combined(log_likelihoods: np.ndarray, log_ratios: np.ndarray, detectors: Detectors,
-             bands: Bands) -> tuple[np.ndarray, Bands]:  # fmt: skip
-    """Weighted sum of state and boundary emissions; who skips subtasks crosses their boundaries."""
+def ratios_of(values: np.ndarray, detectors: Detectors) -> np.ndarray:
+    """Log ratios (num_cells - 1, num_boundaries) of one trial's boundaries."""
+    return detectors.log_ratios(values[:, : detectors.mean.shape[2]])
+
+
+def jumps(log_ratios: np.ndarray, detectors: Detectors, bands: Bands) -> Bands:
+    """Bands with boundaries' emissions in them; who skips subtasks crosses their boundaries."""
     crossed = np.pad(np.cumsum(detectors.weight * log_ratios, axis=1), ((0, 0), (1, 0)))
-    jumps = [
+    return (bands[0], *(
         band + crossed[:, d:] - crossed[:, : crossed.shape[1] - d] for d, band in enumerate(bands[1:], 1)
-    ]
-    return detectors.state_weight * log_likelihoods, (bands[0], *jumps)
+    ))  # fmt: skip
 
 
 def save_model(model: SequenceModel, path: str | Path) -> None:

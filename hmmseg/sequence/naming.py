@@ -88,7 +88,7 @@ def naming(
 
     `labels` [(num_states - 1,), ...] of each trial: known boundaries as shares of it, NaN where unknown.
     """
-    groups, tail, end = _weights(course, num_states, weighing)
+    groups, tail, end = _weights(course, weighing)
     at = label_weights(course, labels, weighing)
     ahead = [groups[0] + at[0]]
     for b in range(1, num_states - 1):
@@ -104,9 +104,7 @@ def naming(
     return Naming(total - choices, np.exp(joint - total), last)
 
 
-def _weights(
-    course: Course, num_states: int, weighing: Weighing
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _weights(course: Course, weighing: Weighing) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log weights of stretches a <= k < b as one named state [a, b], of those from a on as the last [a], and
     as the last followed by a settled one from e on [a, e]."""
     temper = weighing.independent * course.share / (weighing.independent + course.observations)

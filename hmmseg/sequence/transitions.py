@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Transitions:
-    """Band-limited transitions as hmmseg.hmm.banded takes them.
+    """Band-limited transitions as hmmseg.hmm.alignment takes them.
 
     `bands[d]` (num_states - d,): log weight of going from k to k + d between neighbouring cells;
     `log_initial`, `log_final` (num_states,).

@@ -76,7 +76,7 @@ def attribute(
     somewhere = verdict.verdict != "none" or small is not None
     return Attribution(
         **vars(verdict),
-        effects=_effects(f, models, chance, judged, rng, by_group),
+        effects=_effects(f, models, chance, judged),
         detection=found,
         remainder=Remainder(explained.remainder, p_rest, rest),
         where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
@@ -180,7 +180,6 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
 
 def _effects(
     f: Forms, models: list[Model], chances: dict[str, float], judged: dict[tuple[int, ...], _Judged],
-    rng: np.random.Generator, by_group: np.ndarray,
 ) -> dict[str, EffectPosterior]:  # fmt: skip
     """The posterior of every candidate: from the best set that holds it, or by itself."""
     out: dict[str, EffectPosterior] = {}

@@ -43,17 +43,11 @@ def _step(rows: Rows) -> float:
     return float(np.median(step)) if step.size else np.inf
 
 
-def significant(
-    rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray, rate: float = RATE, slack: float = 0.0
-) -> tuple[Cell, ...]:
-    """Cells whose squares exceed the noise's, largest share first (Benjamini & Hochberg, JRSS B 57, 1995).
-
-    `slack`: by which share healthy cells' mean squares exceed one.
-    """
+def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray) -> tuple[Cell, ...]:
+    """Cells whose squares exceed the noise's, largest share first (Benjamini & Hochberg, JRSS B 57, 1995)."""
     key, energy, count = tallied(rows, band, left, noise)
-    energy = energy / (1 + slack)
     chance = chi2.sf(energy, count)
-    listed = np.flatnonzero(false_discovery_control(np.clip(chance, 0, 1), method="bh") < rate)
+    listed = np.flatnonzero(false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE)
     excess = np.maximum(energy - count, 0.0)
     total = max(float(excess[listed].sum()), 1e-12)
     edges = (*rows.bands, 0.5 / _step(rows))

@@ -2,7 +2,28 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from simgap.effects.base import HAND, Effect, Parameter
+
+WRONG = 0.05  # prior: share by which a measured property may be off
+
+
+def _wrong(given, push: np.ndarray) -> list:
+    """A candidate for each property that was measured apart, where it shows in the residual."""
+    from simgap.attribution.problem import Candidate
+
+    out, nothing = [], np.zeros(1)
+    for o, name in enumerate(given.frame.task.objects):
+        for k, kind in enumerate(("weight", "width", "height")):
+            column = push[:, 3 * o + k]
+            if given.measured[o, k] and (column**2).sum() > 1.0:
+                usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.spread[o, k])
+                out.append(Candidate(EFFECT.name, (f"{name}.{kind}",), nothing, nothing, usual,
+                                     np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
+                                     np.full(1, np.inf)))  # fmt: skip
+    return out
+
 
 EFFECT = Effect(
     name="actual",
@@ -10,7 +31,10 @@ EFFECT = Effect(
     says="a value of actual.toml is off by a share of itself: its name is the parameter's",
     shows="what depends on that property alone",
     mistaken_for=("force_gain", "fingertip_compliance"),
-    parameters=(Parameter("property", "1", 0.05),),
+    called="a measured block property that the recordings contradict",
+    check="Weigh and measure the block again, and check the unit in actual.toml.",
+    parameters=(Parameter("property", "1", WRONG),),
     stage=HAND,
+    wrong=_wrong,
     wrist=True,
 )

@@ -85,6 +85,8 @@ EFFECT = Effect(
     says="recorded q follows q only outside a dead band of `width`",
     shows="position jumps where a joint reverses",
     mistaken_for=("fingertip_compliance",),
+    called="play in the joints",
+    check="Hold each motor still and move its fingertip by hand; look for slack in gears or cables.",
     parameters=(
         Parameter("width", "rad", 0.004, starts=(0.002, 0.006), low=0.0, high=0.05),
         # Rates from the encoder miss what it misses (1); a tachometer's do not (0).

@@ -150,6 +150,13 @@ class Effect:
     deviations by parameter, as rig.toml has them under [systematic]. `wrist`: its first form shows in a
     sensor in the wrist. `played`: values at which it is felt in a played world where none are given,
     by default from its priors; empty for one that cannot be felt.
+
+    `called`: the effect in plain words, `told(means, rig)` where its parameters decide them, and what to
+    `check` on the rig. `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]:
+    least and most that blocks are held with, so that it shows. `restored(channels, values)`: recorded
+    channels as they would be without it. `patched(document, found)`: puts what was found into numbers that
+    rig.toml has of its own, and says where each parameter stands; None where it has none.
+    `wrong(problem, push)`: candidates of the gap that stand for measurements rather than for what acts.
     """
 
     name: str
@@ -170,6 +177,14 @@ class Effect:
     admitted: Callable[[Rig], tuple[str, dict[str, float]]] | None = None
     wrist: bool = False
     played: Mapping[str, float] | None = None
+    called: str = ""
+    check: str = ""
+    told: Callable[[Mapping[str, float], Mapping[str, Any]], str] | None = None
+    sampled: Callable[[np.ndarray, dict[str, float], np.random.Generator], np.ndarray] | None = None
+    grip: tuple[float, float] | None = None
+    restored: Callable[[dict[str, np.ndarray], dict[str, float]], dict[str, np.ndarray]] | None = None
+    patched: Callable[[Any, Mapping[str, Any]], dict[str, str] | None] | None = None
+    wrong: Callable[[Any, np.ndarray], list[Any]] | None = None
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""

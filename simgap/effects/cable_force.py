@@ -43,6 +43,8 @@ EFFECT = Effect(
     says="recorded F = F + stiffness (p - p0) on each finger",
     shows="free motion too, by position",
     mistaken_for=("force_bias",),
+    called="a cable that pulls at the fingers",
+    check="Move the open hand slowly through the workspace and watch the forces; tie the cables elsewhere.",
     parameters=(
         Parameter("stiffness", "N/m", 2.0),
         Parameter("at_x", "N", 0.06),

@@ -44,8 +44,11 @@ EFFECT = Effect(
     says="true sample times = t + normal(0, sd)",
     shows="noise in proportion to the rate of change",
     mistaken_for=("noise",),
+    called="samples that are not taken when their time stamps say",
+    check="Log the acquisition clock beside the time stamps; look for samples stamped on arrival.",
     parameters=(Parameter("sd", "s", 1.0, neutral=0.004, log=True, low=1e-4, high=0.05),),
     stage=READOUT,
+    sampled=lambda t, v, rng: t + rng.normal(0, v["sd"], t.size),
     scatter=_scatter,
     wrist=True,
 )

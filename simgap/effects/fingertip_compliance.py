@@ -36,12 +36,42 @@ def _admitted(rig):
     return "fingertip_compliance/1", {f"give_{k}{i + 1}": give[k] * sds[i] for k in give for i in (0, 1)}
 
 
+def _told(means, rig):
+    nominal, found = rig.get("normal_stiffness"), means.get("normal_stiffness")
+    if nominal is None or found is None:
+        return "other fingertips than the model's"
+    if nominal == float("inf"):
+        return "fingertips that yield, where the model has rigid ones"
+    return "softer fingertips" if found < nominal else "stiffer fingertips"
+
+
+def _patched(document, found):
+    """The pads' own numbers, each with what it was and what rig.toml says of it."""
+    from simgap.patch.fields import number, table, told
+
+    pads = table(document, "fingertip")
+    names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]
+    for name in names:
+        before, said = pads.get(name, float("inf")), ""
+        if name in pads:
+            said = pads[name].trivia.comment.lstrip("# ")
+        pads[name] = number(found[name]["mean"])
+        pads[name].comment(f"was {float(before):g}; {told(found[name])}" + (f"; {said}" if said else ""))
+    return {name: f"fingertip.{name}" for name in names}
+
+
 EFFECT = Effect(
     name="fingertip_compliance",
     acts_on="contact",
     says="pad stiffness differs from nominal (or is finite at all)",
     shows="distance follows grip force",
     mistaken_for=("width", "joint_offset", "force_gain"),
+    called="other fingertips than the model's",
+    check=(
+        "Press a fingertip against a scale with feeler gauges behind it and plot force over travel; look "
+        "for worn or replaced pads."
+    ),
+    told=_told,
     parameters=(
         Parameter("give_normal", "m/N", 4e-4, low=-2.4e-4),
         Parameter("give_shear", "m/N", 4e-4, low=-3.8e-4),
@@ -52,6 +82,7 @@ EFFECT = Effect(
     correct=_correct,
     report=_report,
     admitted=_admitted,
+    patched=_patched,
     scene=lambda v: {"normal_stiffness": v["normal_stiffness"], "shear_stiffness": v["shear_stiffness"]},
     played={"normal_stiffness": 800.0, "shear_stiffness": 500.0},
 )

@@ -38,6 +38,8 @@ EFFECT = Effect(
     says="a viscoelastic arm on the pad (standard linear solid)",
     shows="distance relaxes while held; grip decays",
     mistaken_for=("force_drift", "grip_slip"),
+    called="fingertips that keep yielding under load",
+    check="Grip a rigid block for ten seconds at constant force and watch the distance of the fingers.",
     parameters=(
         Parameter("ratio", "1", 0.7, starts=(0.3,), low=0.0, high=8.0),
         Parameter(

@@ -38,6 +38,11 @@ EFFECT = Effect(
     says="recorded F = F + mass (a + g up), outboard of the sensor",
     shows="constant and inertial, free motion too",
     mistaken_for=("force_bias",),
+    called="mass beyond the force sensor that the model lacks",
+    check=(
+        "Weigh what is mounted in front of the sensor, or hold the finger still at two heights and in two"
+        " directions."
+    ),
     parameters=(Parameter("mass", "kg", 0.012, low=0.0, high=0.1),),
     stage=HAND,
     correct=_correct,

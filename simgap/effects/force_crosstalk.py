@@ -35,6 +35,11 @@ EFFECT = Effect(
     says="recorded fy = fy + e fx and fx = fx + h fy",
     shows="shear and net force follow the grip",
     mistaken_for=("sensor_rotation",),
+    called="cross-talk between the axes of a force sensor",
+    check=(
+        "Press straight against a wall with one finger and see whether the other axis moves; redo the "
+        "calibration matrix."
+    ),
     parameters=(
         Parameter("fy_from_fx", "1", 0.06, low=-0.2, high=0.2),
         Parameter("fx_from_fy", "1", 0.06, low=-0.2, high=0.2),

@@ -43,6 +43,10 @@ EFFECT = Effect(
     says="recorded F = F + c t, per finger and axis",
     shows="a ramp over the trial, free motion too",
     mistaken_for=("fingertip_creep", "force_bias"),
+    called="force sensors whose zero drifts",
+    check=(
+        "Record a minute in free air after switching on; let amplifiers and gauges warm up before a session."
+    ),
     parameters=(
         *(Parameter(c, "N/s", 0.015) for c in FORCES),
         Parameter("bend", "1", 0.15, low=-0.6, high=0.6, hidden=True, shape=True),

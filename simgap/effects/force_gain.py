@@ -27,12 +27,24 @@ def _correct(world: World, values, on) -> World:
     )
 
 
+def _told(means, rig):
+    which = {k: v for k, v in means.items() if k != "gain"}
+    if which:
+        worst = max(which, key=lambda k: abs(which[k]))
+        where = f"finger {worst[-1]}" if worst.startswith("finger") else worst
+        return f"a force sensor that reads too {'high' if which[worst] > 0 else 'low'} ({where})"
+    return f"force sensors that read too {'high' if means.get('gain', 0.0) > 0 else 'low'}"
+
+
 EFFECT = Effect(
     name="force_gain",
     acts_on="sensing",
     says="recorded F = (1 + gain) F, common to all channels, of a finger, or of each channel",
     shows="every load, in proportion",
     mistaken_for=("weight", "fingertip_compliance"),
+    called="force sensors that read too high or too low",
+    check="Hang a known weight from each fingertip and compare; check the calibration factors in the driver.",
+    told=_told,
     parameters=tuple(Parameter(n, "1", 0.1, low=-0.5, high=0.5) for n in EVERY),
     forms=(("gain",), FINGERS, FORCES),
     admitted=lambda rig: ("force_gain/2", dict(zip(FORCES, rig.systematic.force_gain, strict=True))),

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import FILTER, LATE, Effect, Parameter, Performance, flat, with_force, with_mode
+from simgap.effects.filters import of_finger
 
 STARTS = (0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32)  # numerics
 
@@ -29,6 +30,12 @@ EFFECT = Effect(
     says="recorded F(t) = F(t - delay)",
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
+    called="force readings that come late",
+    check=(
+        "Tap a fingertip sharply and compare the time stamps of force and motion; look for a buffer in "
+        "the force channel."
+    ),
+    told=of_finger("force readings that come late"),
     parameters=(
         Parameter("delay", "s", 0.1, starts=STARTS, low=0.0, high=0.4),
         Parameter("finger1", "s", 0.1, starts=STARTS, low=0.0, high=0.4),

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import FILTER, SMOOTH, Effect, Parameter, Performance, flat, with_force, with_mode
+from simgap.effects.filters import of_finger
 
 STARTS = (0.02, 0.06, 0.12, 0.2)  # numerics
 
@@ -33,6 +34,12 @@ EFFECT = Effect(
     says="time_constant dF_rec/dt + F_rec = F",
     shows="rounded contact changes",
     mistaken_for=("force_lag",),
+    called="a slow filter in the force channel",
+    check=(
+        "Look up the filter setting of the force amplifier or driver; tap a fingertip and see how fast "
+        "the reading rises."
+    ),
+    told=of_finger("a slow filter in the force channel"),
     parameters=(
         Parameter("time_constant", "s", 0.08, starts=STARTS, low=0.0, high=0.5),
         Parameter("finger1", "s", 0.08, starts=STARTS, low=0.0, high=0.5),

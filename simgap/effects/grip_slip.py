@@ -39,6 +39,8 @@ EFFECT = Effect(
     says="the pad slides on the block when shear exceeds mu N",
     shows="height changes that do not come back, at impact",
     mistaken_for=("fingertip_creep",),
+    called="blocks that slip in the grip",
+    check="Mark the block at the pad and lift it harder than usual; clean the pads, or grip more firmly.",
     parameters=(
         Parameter(
             "mu",
@@ -54,5 +56,6 @@ EFFECT = Effect(
     stage=CONTACT,
     correct=_correct,
     scene=lambda v: {"friction": v["mu"]},
+    grip=(1.2, 1.8),  # chosen: N: so lightly that pads of a low friction slide
     played={"mu": 0.12},
 )

@@ -68,6 +68,11 @@ EFFECT = Effect(
     says="both fingers and the block turn about the grip by `amplitude` (rms) while carried",
     shows="height difference of the fingers while carried",
     mistaken_for=("offcentre_mass", "fingertip_compliance"),
+    called="a hand that rolls while it carries",
+    check=(
+        "Watch both fingertips' heights while carrying: the wrist or the arm turns; measure it, or "
+        "stiffen it."
+    ),
     parameters=(Parameter("amplitude", "rad", 1.0, neutral=0.005, log=True, low=1e-4, high=0.2),),
     stage=KINEMATICS,
     scatter=_scatter,

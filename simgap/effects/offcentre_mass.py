@@ -18,6 +18,8 @@ EFFECT = Effect(
     says="mass `offset` to the right of the block's middle",
     shows="unequal shear of the two fingers while carried",
     mistaken_for=("force_crosstalk", "force_bias"),
+    called="a block heavier on one side",
+    check="Balance the block on an edge under its middle.",
     parameters=(Parameter("offset", "m", 0.003),),
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(couple=w.couple + v["offset"]),

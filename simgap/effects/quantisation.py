@@ -52,6 +52,8 @@ EFFECT = Effect(
     says="recorded F = step * round(F / step)",
     shows="plateaus; repeated values",
     mistaken_for=("noise",),
+    called="coarse steps in the force readings",
+    check="Check the range and resolution of the converter: list the distinct values in a quiet stretch.",
     parameters=(Parameter("step", "N", 1.0, neutral=0.05, log=True, low=1e-3, high=0.5),),
     stage=READOUT,
     scatter=_scatter,

@@ -30,6 +30,8 @@ EFFECT = Effect(
     says="recorded F = R(angle) F, per finger",
     shows="both axes, antisymmetric",
     mistaken_for=("force_crosstalk", "table_tilt"),
+    called="a force sensor mounted at an angle",
+    check="Check the mounting screws and the stated sensor frame: pull along one axis and read the other.",
     parameters=tuple(Parameter(n, "rad", 0.06, low=-0.6, high=0.6) for n in ("angle1", "angle2")),
     stage=MIX,
     correct=_correct,

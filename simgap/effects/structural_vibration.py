@@ -66,6 +66,8 @@ EFFECT = Effect(
     says="a mode rung by contact changes, gain exp(-damping w t) sin(w t), and by changes of load",
     shows="decaying oscillation after contact changes",
     mistaken_for=("noise", "contact_impact"),
+    called="a part of the structure that rings",
+    check="Tap the finger and record at a high rate; tighten what rings, or damp it.",
     parameters=(
         Parameter(
             "frequency",

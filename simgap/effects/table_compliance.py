@@ -23,6 +23,8 @@ EFFECT = Effect(
     says="the support yields by load / stiffness",
     shows="height falls with vertical force on the ground",
     mistaken_for=("fingertip_compliance",),
+    called="a table that yields under load",
+    check="Press on the table with a known weight beside a dial gauge; look for foam, a mat or a loose foot.",
     parameters=(
         Parameter("give", "m/N", 4e-4, low=0.0),
         Parameter("settling", "s", 0.8, neutral=0.02, low=1e-3, high=0.2, log=True, hidden=True),

@@ -10,6 +10,8 @@ EFFECT = Effect(
     says="support inclined by `angle`, rising to the right",
     shows="heights differ with x",
     mistaken_for=("joint_offset", "height"),
+    called="a table that is not level",
+    check="Lay a spirit level on the table, along the line between the fingers.",
     parameters=(Parameter("angle", "rad", 0.025),),
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),

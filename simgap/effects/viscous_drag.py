@@ -22,6 +22,10 @@ EFFECT = Effect(
     says="recorded F = F + coefficient v on each finger",
     shows="free motion too, by velocity",
     mistaken_for=("force_lag",),
+    called="drag on the fingers as they move",
+    check=(
+        "Move the open hand back and forth at two speeds and watch the forces; look at bearings and sleeves."
+    ),
     parameters=(Parameter("coefficient", "N s/m", 0.6),),
     stage=HAND,
     correct=_correct,

@@ -49,7 +49,9 @@ def gap_of(
         start = healthy.residual - healthy.push @ healthy.u[:k]
         nuisance = np.concatenate([-healthy.push, problem.nuisances.columns], 1)
         shifting = [_shifting(problem, f, start, healthy.push) for f in fits]
-        every = (*shifting, *scattering, *_measured(problem, healthy.push))
+        wrong = [e.wrong for e in catalogue().values() if e.wrong is not None]
+        measured = [c for candidates in wrong for c in candidates(problem, healthy.push)]
+        every = (*shifting, *scattering, *measured)
         return Gap(rows, start, nuisance, every, tolerance=tolerance)
 
     gap = at(given, healthy, fits)
@@ -150,18 +152,3 @@ def _spreading(s: Spread, rows: Rows) -> Candidate:
     variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))
     return Candidate(s.effect, (), nothing, nothing, nothing, np.zeros(count), np.zeros((count, 0)), nothing,
                      nothing, variance, s.known, s.same, frees=s.frees)  # fmt: skip
-
-
-def _measured(given: Problem, push: np.ndarray) -> list[Candidate]:
-    """Each property that was measured apart, wrong."""
-    out, nothing = [], np.zeros(1)
-    wrong = catalogue()["actual"].parameters[0].sd
-    for o, name in enumerate(given.frame.task.objects):
-        for k, kind in enumerate(("weight", "width", "height")):
-            column = push[:, 3 * o + k]
-            if given.measured[o, k] and (column**2).sum() > 1.0:
-                usual = np.full(1, wrong * abs(given.centre[o, k]) / given.spread[o, k])
-                out.append(Candidate("actual", (f"{name}.{kind}",), nothing, nothing, usual,
-                                     np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
-                                     np.full(1, np.inf)))  # fmt: skip
-    return out

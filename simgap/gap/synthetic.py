@@ -32,8 +32,9 @@ def performed(
     """Simulated trials in a scene changed by those effects that change scenes (one scene for all)."""
     hand, around, _ = scene_of(rig, {}, effects)
     blocks = [scene_of(rig, each, effects)[2] for each in blocks]
-    if "grip_slip" in effects:
-        operator = operator or OperatorSettings(grip=(1.2, 1.8))
+    for grip in (effect_named(name).grip for name in effects):
+        if grip is not None:
+            operator = operator or OperatorSettings(grip=grip)
     return simulate_trials(task, hand, blocks, seeds, operator, around)
 
 
@@ -78,8 +79,10 @@ def recorded(
         if effect.apply is not None:
             truth = effect.apply(truth, dict(effects[effect.name]), rng)
     truth = truth if change is None else change(truth)
-    t = simulated.trial.t
-    times = t + rng.normal(0, effects["clock_jitter"]["sd"], t.size) if "clock_jitter" in effects else t
+    t = times = simulated.trial.t
+    for effect in chosen:
+        if effect.sampled is not None:
+            times = effect.sampled(times, dict(effects[effect.name]), rng)
 
     def at(values: np.ndarray) -> np.ndarray:
         columns = [np.interp(times, truth.t, c) for c in values.reshape(-1, 4).T]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
+from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
@@ -50,20 +51,14 @@ def thinned(trial: Trial) -> tuple[Trial, int]:
     Lost readings are left out.
     """
     trial = without_dropouts(trial)
-    group = int(np.ceil(trial.rate / MAX_RATE - 1e-6))
+    group = group_size(trial.rate, MAX_RATE)
     if group <= 1:
         return trial, 1
-    count = trial.t.size // group
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        block = values[: count * group].reshape(count, group)
-        there = np.isfinite(block)
-        total = np.where(there, block, 0.0).sum(1)
-        return np.where(there.any(1), total / np.maximum(there.sum(1), 1), np.nan)
-
-    inertia = None if trial.inertia is None else np.stack([mean(v) for v in trial.inertia.T], 1)
-    channels = {k: mean(v) for k, v in trial.channels.items()}
-    return Trial(trial.file, mean(trial.t), channels, hidden=trial.hidden, inertia=inertia), group
+    inertia = None if trial.inertia is None else grouped(trial.inertia, group)[0]
+    channels = {k: grouped(v, group)[0] for k, v in trial.channels.items()}
+    return Trial(
+        trial.file, grouped(trial.t, group)[0], channels, hidden=trial.hidden, inertia=inertia
+    ), group
 
 
 def boundary_quantiles(aligned: TrialAlignment) -> np.ndarray:

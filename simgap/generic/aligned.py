@@ -42,7 +42,6 @@ def align(
     task: SequenceTask,
     model: SequenceModel | None = None,
     boundaries: Mapping[str, np.ndarray] | None = None,
-    seed: int = 0,
 ) -> Ensembles:
     """Both kinds of trials cut at given boundaries [s] by file, or by the task's HMM.
 

@@ -72,7 +72,7 @@ def diagnose(
     tell = progress or (lambda text: None)
     _check(forced)
     tell("aligning trials")
-    return diagnosed(align(real, sim, task, model, boundaries, seed), forced, seed, tell)
+    return diagnosed(align(real, sim, task, model, boundaries), forced, seed, tell)
 
 
 def diagnose_blocks(
@@ -112,7 +112,7 @@ def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Prog
     numbers = len(real), len(sim)
     tell("locating the gap")
     located = locate(lay, real, sim, seed)
-    ring = _ring(scene(lay), real, sim)
+    ring = _ring(scene(lay))
     given = scene(lay) if ring is None else scene(lay, ring.frequency, ring.damping)
     parts = blocks(given, real, sim)
     difference = real.mean(0) - sim.mean(0)
@@ -121,7 +121,7 @@ def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Prog
         return fit(given, parts, difference, numbers, effects, base)
 
     tell("fitting effects")
-    names = [n for n in CANDIDATES if n != "structural_vibration" or ring is not None]
+    names = [n for n in CANDIDATES if CANDIDATES[n].each != "event" or ring is not None]
     if forced:
         found = [fitted(tuple(dict.fromkeys(forced)))]
     else:
@@ -157,7 +157,7 @@ def _together(singles: list[Fitted], names: list[str], fitted, gap: bool) -> lis
     return out
 
 
-def _ring(given: Scene, real: np.ndarray, sim: np.ndarray) -> Ring | None:
+def _ring(given: Scene) -> Ring | None:
     """The strongest oscillation after an event in the real trials, where they hold more power."""
     lay, best, windows = given.layout, 0.0, None
     for k in range(1, len(lay.ensembles.subtasks)):

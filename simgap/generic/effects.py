@@ -52,7 +52,7 @@ class Kind:
 @dataclass(frozen=True)
 class Candidate:
     """An effect: `kinds` of its parameters, one of each a channel (`each` = "channel"), one a channel
-    and event ("event"), or one a subtask ("subtask")."""
+    and event ("event": an oscillation's sine and cosine), or one a subtask ("subtask": of durations)."""
 
     name: str
     says: str

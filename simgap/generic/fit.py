@@ -180,10 +180,10 @@ def at(given: Scene, block: Block, mine: Sequence[Slot], u: np.ndarray) -> np.nd
         return out
     values, ring = {}, np.zeros((len(given.layout.ensembles.subtasks), 2))
     for slot, value in zip(mine, u, strict=True):
-        if slot.effect == "structural_vibration":
+        if CANDIDATES[slot.effect].each == "event":
             ring[slot.place, int(slot.kind.name == "cos")] = slot.sd * value
         else:
-            values[slot.kind.name if slot.effect != "noise_level" else "sd"] = slot.sd * value
+            values[slot.kind.name] = slot.sd * value
     return predicted(given, block.channel, values, ring)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from simgap.generic.effects import Scene
+from simgap.generic.effects import CANDIDATES, Scene
 from simgap.generic.features import Layout
 from simgap.generic.fit import Fitted
 from simgap.generic.locate import Located, both_variances, cell_means
@@ -50,14 +50,17 @@ def effect_entry(
     reach = -float(stdtrit(max(num_trials - 2, 1), 0.05))
     parameters: dict[str, Any] = {}
     rings: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    ringing = ""
     for k, (mine, u, jacobian) in enumerate(zip(found.slots, found.u, found.jacobian, strict=True)):
         covariance = np.linalg.inv(jacobian.T @ jacobian / temperature + np.eye(u.size))
         for slot, value, sd in zip(mine, u, np.sqrt(np.diag(covariance)), strict=True):
             mean, spread = slot.sd * float(value), slot.sd * float(sd)
             prefix = f"{slot.effect}." if len(found.effects) > 1 else ""
-            if slot.effect == "structural_vibration":
+            each = CANDIDATES[slot.effect].each
+            if each == "event":
+                ringing = prefix
                 rings.setdefault((given.layout.ensembles.channels[k], slot.place), []).append((mean, spread))
-            elif slot.effect == "timing":
+            elif each == "subtask":
                 ratio = float(np.exp(mean))
                 low, high = (float(np.exp(mean + s * reach * spread)) for s in (-1, 1))
                 name = f"{prefix}{given.layout.ensembles.subtasks[slot.place]}"
@@ -66,21 +69,18 @@ def effect_entry(
                 channel = given.layout.ensembles.channels[k]
                 own = f"unit of {channel}"
                 unit = {"": own, "/s": f"{own} per s"}.get(slot.kind.unit, slot.kind.unit)
-                if slot.effect == "noise_level":
-                    unit = own
                 interval = (mean - reach * spread, mean + reach * spread)
                 parameters[prefix + channel] = _entry(mean, spread, interval, unit)
     if rings and ring is not None:
-        prefix = "structural_vibration." if len(found.effects) > 1 else ""
         amplitudes = []
         for (name, _), parts in rings.items():
             means, spreads = zip(*parts, strict=True)
             amplitudes.append((float(np.linalg.norm(means)), float(np.linalg.norm(spreads)), name))
         gain, spread, channel = max(amplitudes)
-        parameters[prefix + "frequency"] = _entry(ring.frequency, ring.frequency_sd, ring.frequency_90, "Hz")
-        parameters[prefix + "damping"] = _entry(ring.damping, ring.damping_sd, ring.damping_90, "1")
+        parameters[ringing + "frequency"] = _entry(ring.frequency, ring.frequency_sd, ring.frequency_90, "Hz")
+        parameters[ringing + "damping"] = _entry(ring.damping, ring.damping_sd, ring.damping_90, "1")
         interval = (max(gain - reach * spread, 0.0), gain + reach * spread)
-        parameters[prefix + "gain"] = _entry(gain, spread, interval, f"unit of {channel}")
+        parameters[ringing + "gain"] = _entry(gain, spread, interval, f"unit of {channel}")
     return {
         "parameters": parameters,
         "log_evidence": found.evidence(temperature),

@@ -33,11 +33,15 @@ def replayed(
 ) -> Replay:
     """A recording's motions through the corrected model: `force` is what its sensors would have shown.
 
-    Joint offsets are taken off the recorded angles before they drive the model. An effect that changes
-    angles otherwise (play, jitter) cannot be taken back and is left out of the motion.
+    Effects that can be are taken off the recorded angles before these drive the model. One that changes
+    angles and cannot (play, jitter) cannot be taken back and is left out of the motion.
     """
     hand, around, blocks = scene_of(rig, blocks, rig.effects)
-    moved = _without_offsets(trial, rig)
+    channels = dict(trial.channels)
+    for name, values in rig.effects.items():
+        if (restored := effect_named(name).restored) is not None:
+            channels = restored(channels, dict(values))
+    moved = replace(trial, channels=channels)
     found = replay(moved, task, hand, blocks, boundaries=boundaries, surroundings=around)
     n, force = len(found.t), found.motion.force
     truth = Performance(
@@ -54,9 +58,3 @@ def replayed(
         if effect.finish is not None:
             force = effect.finish(force, dict(rig.effects[effect.name]))
     return replace(found, force=force.reshape(-1, 2, 2))
-
-
-def _without_offsets(trial: Trial, rig: Rig) -> Trial:
-    offsets = rig.effects.get("joint_offset", {})
-    true = {q: trial.channels[q] - value for q, value in offsets.items()}
-    return replace(trial, channels=trial.channels | true)

@@ -7,15 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import tomlkit
-from tomlkit.items import Table
 
 from hmmseg.errors import InputError
 from simgap.effects import catalogue
+from simgap.patch.fields import number, table, told
 
 Body = Mapping[str, Any]
 FORMAT = "hmmseg.ranges/1"
-# Found values that replace numbers of the rig itself; every other effect stands under [effects].
-PADS = ("normal_stiffness", "shear_stiffness")
 
 
 def files(rig_text: str, body: Body) -> dict[str, str]:
@@ -42,8 +40,8 @@ def files(rig_text: str, body: Body) -> dict[str, str]:
     ranges = {k: v for k, v in ranges.items() if v["mean"] is not None}
     out = {"rig.toml": tomlkit.dumps(document)}
     blocks = _blocks(entry)
-    told = {"format": FORMAT, "causes": list(body["causes"]), "parameters": ranges, "blocks": blocks}
-    out["ranges.json"] = json.dumps(told, indent=1) + "\n"
+    said = {"format": FORMAT, "causes": list(body["causes"]), "parameters": ranges, "blocks": blocks}
+    out["ranges.json"] = json.dumps(said, indent=1) + "\n"
     if blocks:
         out["actual.toml"] = _actual(blocks)
     return out
@@ -51,63 +49,21 @@ def files(rig_text: str, body: Body) -> dict[str, str]:
 
 def _correct(document: tomlkit.TOMLDocument, effect: str, found: Mapping[str, Any]) -> dict[str, str]:
     """Put one effect into the rig; the place of each parameter."""
-    if effect == "fingertip_compliance":
-        pads = _table(document, "fingertip")
-        return {k: _pad(pads, k, found[k]) for k in PADS if k in found}
-    if effect == "link_length" and "fingers" in document:
-        return _links(document, found)
     known = catalogue().get(effect)
+    places = known.patched(document, found) if known is not None and known.patched is not None else None
+    if places is not None:
+        return places
     if known is None or not (known.apply or known.scene or known.finish):
         document.add(tomlkit.comment(f"{effect}: found, but nothing that `hmmseg simulate` can put in"))
         return {}
-    effects = _table(document, "effects")
-    table = tomlkit.table()
+    effects = table(document, "effects")
+    mine = tomlkit.table()
     for parameter, p in found.items():
         if p["mean"] is not None:
-            table.add(parameter, _number(p["mean"]))
-            table[parameter].comment(_told(p))
-    effects[effect] = table
+            mine.add(parameter, number(p["mean"]))
+            mine[parameter].comment(told(p))
+    effects[effect] = mine
     return {parameter: f"effects.{effect}.{parameter}" for parameter in found}
-
-
-def _table(document: tomlkit.TOMLDocument, name: str) -> Table:
-    if name not in document:
-        document.add(tomlkit.nl())
-        document.add(name, tomlkit.table(name == "effects"))
-    return document[name]  # type: ignore[return-value]
-
-
-def _pad(pads: Table, name: str, p: Mapping[str, Any]) -> str:
-    before, said = pads.get(name, float("inf")), ""
-    if name in pads:
-        said = pads[name].trivia.comment.lstrip("# ")  # type: ignore[union-attr]
-    pads[name] = _number(p["mean"])
-    pads[name].comment(f"was {float(before):g}; {_told(p)}" + (f"; {said}" if said else ""))
-    return f"fingertip.{name}"
-
-
-def _links(document: tomlkit.TOMLDocument, found: Mapping[str, Any]) -> dict[str, str]:
-    """Links longer by `scale`, all of them, or each by its own: link11 is finger 1's first."""
-    common = found["scale"]["mean"] if "scale" in found else 0.0
-    for name, finger in document["fingers"].items():  # type: ignore[union-attr]
-        before = [float(v) for v in finger["links"]]
-        own = [found.get(f"link{name}{k}") for k in (1, 2)]
-        factors = [1 + common + (p["mean"] if p else 0.0) for p in own]
-        finger["links"] = [_number(v * f) for v, f in zip(before, factors, strict=True)]
-        told = [_told(p) for p in (found.get("scale"), *own) if p]
-        finger["links"].comment(f"was {before}; share longer: {'; '.join(told)}")
-    return {k: f"fingers.links.{k}" for k in found}
-
-
-def _told(p: Mapping[str, Any]) -> str:
-    low, high = p["interval_90"]
-    unit = "" if p["unit"] == "1" else f" {p['unit']}"
-    return "interval unknown" if None in (low, high) else f"90 % interval {low:.4g} to {high:.4g}{unit}"
-
-
-def _number(value: float) -> float:
-    """Rounded to what a diagnosis can know."""
-    return float(f"{value:.6g}")
 
 
 def _range(p: Mapping[str, Any]) -> dict[str, Any]:

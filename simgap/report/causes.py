@@ -2,78 +2,41 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-Means = Mapping[str, float]
+if TYPE_CHECKING:
+    from simgap.effects.base import Effect
 
 
-def _pads(means: Means, rig: Mapping[str, Any]) -> str:
-    nominal, found = rig.get("normal_stiffness"), means.get("normal_stiffness")
-    if nominal is None or found is None:
-        return "other fingertips than the model's"
-    if nominal == float("inf"):
-        return "fingertips that yield, where the model has rigid ones"
-    return "softer fingertips" if found < nominal else "stiffer fingertips"
-
-
-def _late(words: str) -> Callable[[Means, Mapping[str, Any]], str]:
-    def name(means: Means, rig: Mapping[str, Any]) -> str:
-        acting = [k for k, v in means.items() if v > 0]
-        one = [k for k in acting if k.startswith("finger")]
-        return f"{words} of finger {one[0][-1]}" if len(one) == 1 == len(acting) else words
-
-    return name
-
-
-def _gain(means: Means, rig: Mapping[str, Any]) -> str:
-    which = {k: v for k, v in means.items() if k != "gain"}
-    if which:
-        worst = max(which, key=lambda k: abs(which[k]))
-        where = f"finger {worst[-1]}" if worst.startswith("finger") else worst
-        return f"a force sensor that reads too {'high' if which[worst] > 0 else 'low'} ({where})"
-    value = means.get("gain", 0.0)
-    return f"force sensors that read too {'high' if value > 0 else 'low'}"
-
-
-def _bias(means: Means, rig: Mapping[str, Any]) -> str:
-    if not means:
-        return "a zero error of the force sensors"
-    worst = max(means, key=lambda k: abs(means[k]))
-    total = sum(abs(v) for v in means.values())
-    lone = total > 0 and abs(means[worst]) > 0.8 * total
-    return f"a zero error of force sensor {worst}" if lone else "zero errors of the force sensors"
-
-
-WORDS: dict[str, Callable[[Means, Mapping[str, Any]], str]] = {
-    "fingertip_compliance": _pads,
-    "force_bias": _bias,
-    "force_gain": _gain,
-    "force_lag": _late("force readings that come late"),
-    "force_lowpass": _late("a slow filter in the force channel"),
-}
-
-
-@cache
-def _told() -> dict[str, dict[str, str]]:
-    return tomllib.loads(Path(__file__).with_name("causes.toml").read_text(encoding="utf-8"))
-
-
-def plain_name(effect: str, means: Means | None = None, rig: Mapping[str, Any] | None = None) -> str:
+def plain_name(
+    effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
+) -> str:
     """An effect, or several joined by +, in plain words; `means`: its parameters, `rig`: the model's pads."""
-    out = []
-    for name in effect.split("+"):
-        own = {k.removeprefix(f"{name}."): v for k, v in (means or {}).items()}
-        if own and name in WORDS:
-            out.append(WORDS[name](own, rig or {}))
-        else:
-            out.append(_told().get(name, {}).get("name", name.replace("_", " ")))
-    return " and ".join(out)
+    return " and ".join(_one(name, means or {}, rig or {}) for name in effect.split("+"))
+
+
+def _one(name: str, means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
+    called, _, effect = _words(name)
+    own = {k.removeprefix(f"{name}."): v for k, v in means.items()}
+    return effect.told(own, rig) if own and effect is not None and effect.told is not None else called
 
 
 def checks(effects: Sequence[str]) -> list[str]:
     """What to look at on the rig, one line an effect."""
-    return [_told()[name]["check"] for name in effects if name in _told()]
+    return [check for _, check, _ in map(_words, effects) if check]
+
+
+def _words(name: str) -> tuple[str, str, Effect | None]:
+    """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
+    from simgap.robot_effects import words
+
+    robots = words(name)
+    if robots is not None:
+        return *robots, None
+    from simgap.effects import catalogue  # slow to import
+
+    known = catalogue().get(name)
+    if known is None:
+        return name.replace("_", " "), "", None
+    return known.called or name.replace("_", " "), known.check, known

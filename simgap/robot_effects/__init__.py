@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import re
 from functools import cache
 from types import ModuleType
 
@@ -25,3 +26,14 @@ def candidates(setting: Setting) -> dict[str, RobotEffect]:
     """Every candidate for this simulator and these recordings, by name."""
     made = [effect for module in families().values() for effect in module.candidates(setting)]
     return {effect.name: effect for effect in made}
+
+
+def words(name: str) -> tuple[str, str] | None:
+    """A candidate in plain words, of a channel or a body by its name, and what to check on the robot; None of
+    a model's own parameter."""
+    kind, where = re.sub(r":.*\.", ".", name), re.search(r":(.*)\.", name)
+    for module in families().values():
+        if kind in (known := getattr(module, "WORDS", {})):
+            called, check = known[kind]
+            return called + (f" ({where[1]})" if where else ""), check
+    return None

@@ -20,6 +20,14 @@ def play(values: np.ndarray, width: float) -> np.ndarray:
     return out
 
 
+WORDS = {
+    "command.backlash": (
+        "play between a drive and what it moves",
+        "Hold the drive still and move the joint by hand.",
+    ),
+}
+
+
 def _played(name: str):
     return lambda recording, theta: recording.with_columns({name: play(recording[name], theta["width"])})
 

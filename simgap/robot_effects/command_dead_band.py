@@ -6,6 +6,13 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect, Setting, drives
 
+WORDS = {
+    "command.dead_band": (
+        "commands too small to do anything",
+        "Raise the command slowly from nothing and note where motion begins.",
+    ),
+}
+
 
 def _dead(name: str):
     def act(recording, theta):

@@ -8,6 +8,10 @@ from simgap.robot_effects.base import RobotEffect, Setting, Theta
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
+WORDS = {
+    "command.delay": ("commands that are carried out late", "Log commands and motion with one clock."),
+}
+
 
 def _late(names: list[str]):
     def late(recording: Recording, theta: Theta) -> Recording:

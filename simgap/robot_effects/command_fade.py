@@ -7,6 +7,13 @@ import numpy as np
 from simgap.robot_effects.base import RobotEffect, Setting, drives
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "command.fade": (
+        "a drive that falls behind large commands",
+        "Command a large constant torque and measure it.",
+    ),
+}
+
 
 def _faded(name: str, most: float):
     def act(recording, theta):

@@ -5,6 +5,13 @@ from __future__ import annotations
 from simgap.robot_effects.base import RobotEffect, Setting, drives, places
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "command.gain": (
+        "commands that are carried out too weakly or strongly",
+        "Command a known step and measure the motion.",
+    ),
+}
+
 
 def _scaled(name: str):
     return lambda recording, theta: recording.with_columns({name: (1 + theta["gain"]) * recording[name]})

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from simgap.robot_effects.base import RobotEffect, Setting, drives, places
 
+WORDS = {
+    "command.offset": (
+        "commands that are carried out with an offset",
+        "Command the home position and measure where the robot is.",
+    ),
+}
+
 
 def _shifted(name: str):
     return lambda recording, theta: recording.with_columns({name: recording[name] + theta["offset"]})

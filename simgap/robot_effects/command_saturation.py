@@ -7,6 +7,13 @@ import numpy as np
 from simgap.robot_effects.base import RobotEffect, Setting, drives, places
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "command.saturation": (
+        "a drive that gives no more than so much",
+        "Look up the drive's current limit; command its largest torque and measure it.",
+    ),
+}
+
 
 def _limited(name: str, most: float):
     def act(recording, theta):

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from simgap.robot_effects.base import RobotEffect, Setting
 
+WORDS = {
+    "readout.bias": (
+        "a zero error of a reading",
+        "Record two seconds at rest and compare with the model's value.",
+    ),
+}
+
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each channel; its usual size is 3 % of the channel's spread."""

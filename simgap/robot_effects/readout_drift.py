@@ -5,6 +5,10 @@ from __future__ import annotations
 from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "readout.drift": ("a reading whose zero drifts", "Record a minute at rest after switching on."),
+}
+
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each channel; over the longest log it usually drifts by 3 % of the channel's spread."""

@@ -5,6 +5,13 @@ from __future__ import annotations
 from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "readout.gain": (
+        "a reading that is off by a factor",
+        "Compare the sensor with a known load or distance; check its unit and scale.",
+    ),
+}
+
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each channel."""

@@ -7,6 +7,10 @@ import numpy as np
 from simgap.robot_effects.base import RobotEffect, Setting, delayed
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "readout.lag": ("a reading that comes late", "Compare time stamps of two channels at a sharp event."),
+}
+
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for each channel. A stamp that is late makes the delay negative."""

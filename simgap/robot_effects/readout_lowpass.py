@@ -9,6 +9,10 @@ from simgap.simulators.protocol import Parameter
 
 SHORTEST = 1e-9  # numerics: s: below this nothing is smoothed
 
+WORDS = {
+    "readout.lowpass": ("a slow filter in a reading", "Look up the filter setting of this channel."),
+}
+
 
 def lowpass(since: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:
     """tau y' + y = u for values u (num_timesteps,) linear between samples, exactly.

@@ -16,6 +16,21 @@ from simgap.simulators.recording import Recording
 
 PLACE, TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
+WORDS = {
+    "pose.lag": (
+        "a pose that is read late",
+        "Compare time stamps of the pose and of another channel at a sharp event.",
+    ),
+    "pose.turned": (
+        "a tracked frame that is turned against the body's",
+        "Check how the markers' frame was laid on the body.",
+    ),
+    "pose.offset": (
+        "a tracked point beside the body's origin",
+        "Measure from the tracked point to the body's origin.",
+    ),
+}
+
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """For each body whose pose is read: its lag, and how the frame that is read lies in the body's own."""

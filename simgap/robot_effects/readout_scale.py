@@ -6,6 +6,13 @@ from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.simulators.protocol import Channels, Parameter
 from simgap.simulators.recording import Recording
 
+WORDS = {
+    "readout.scale": (
+        "lengths that are all read too long or too short",
+        "Measure a known distance with the tracking system.",
+    ),
+}
+
 
 def candidates(setting: Setting) -> list[RobotEffect]:
     """One for all lengths that are read, where there are several."""

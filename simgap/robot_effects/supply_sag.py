@@ -7,6 +7,13 @@ import numpy as np
 from simgap.robot_effects.base import RobotEffect, Setting, drives
 from simgap.simulators.protocol import Parameter
 
+WORDS = {
+    "supply.sag": (
+        "torque that falls with the supply's voltage",
+        "Measure the voltage at the drive under load.",
+    ),
+}
+
 
 def _sagging(names: list[str], supply: str, usual: float):
     def act(recording, theta):

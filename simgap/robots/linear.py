@@ -69,10 +69,10 @@ def base_at(composed: Composed, point: Point) -> Base:
     return Base(point, begun, true, read, composed.rows.averaged(read))
 
 
-def linearise(composed: Composed, point: Point, effects: Sequence[str], progress=None) -> Linear:
+def linearise(composed: Composed, point: Point, effects: Sequence[str]) -> Linear:
     """Residuals at a point, sensitivities to starts, and to the parameters of these effects.
 
-    InputError where the simulator diverges in every window. `progress(1)` is called after each effect.
+    InputError where the simulator diverges in every window.
     """
     base = base_at(composed, point)
     if all(channels is None for channels in base.read):
@@ -97,8 +97,6 @@ def linearise(composed: Composed, point: Point, effects: Sequence[str], progress
             diverged.append(name)
         else:
             moved[name] = one
-        if progress is not None:
-            progress(1)
     return found.with_moved(moved, diverged)
 
 

@@ -17,12 +17,11 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
 from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import Blocks
-from simgap.world.scene import Surroundings, finite_stiffness, physics, substeps_for
+from simgap.world.scene import Surroundings, physics, substeps_for
 from simgap.world.smoothing import Motion, smooth
 from simgap.world.virtual_model import Rollout, rollout, standing
 
 BUCKET = 4000  # numerics: control periods; padded to multiples, so that few programs are compiled
-LOADED = 5.0  # chosen: a finger is loaded above so many standard deviations of the force noise
 APART = 0.1  # look: m; where a block stands that the recording never locates
 
 # physics: mean and difference coordinates (x, y, distance, offset) from tips (x1, y1, x2, y2), and back.
@@ -60,19 +59,17 @@ class Replay:
 @double_precision
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
-           infer_grip: bool = False) -> Replay:  # fmt: skip
+           ) -> Replay:  # fmt: skip
     """Drive the calibrated model with a recording's motion.
 
     `boundaries` [s] between the subtasks say which block is where; without them the trial is
-    segmented. `infer_grip` takes the fluctuation of the fingers' distance and offset in a grip from
-    the forces through the nominal pads, which tell it an order finer than the joints, and leaves
-    only its mean to the joints: the forces then serve as a measurement of the motion.
+    segmented.
     """
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]
         boundaries = [span.start for span in found.spans[1:]]
-    path = finger_motion(signals, rig, infer_grip)
+    path = finger_motion(signals)
     t = np.arange(signals.t[0], signals.t[-1] + CONTROL_PERIOD / 2, CONTROL_PERIOD)
     position, velocity = (z @ TO_TIPS.T for z in path.at(t))
     constants = physics(rig, [blocks[name] for name in task.objects], surroundings)
@@ -86,43 +83,14 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     return Replay(signals, force.reshape(-1, 2, 2), measured.reshape(-1, 2, 2), t, tips[: t.size], motion)
 
 
-def finger_motion(signals: Signals, rig: Rig, infer_grip: bool = False) -> Motion:
+def finger_motion(signals: Signals) -> Motion:
     """Smoothed motion in x, y, distance, offset: in a grip the last two rest while the hand moves."""
     pick = lambda names: np.stack([getattr(signals, name) for name in names], 1)  # noqa: E731
     scale = np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean of two; differences have twice
-    path = smooth(signals.t, pick(("x", "y", "distance", "offset")),
+    return smooth(signals.t, pick(("x", "y", "distance", "offset")),
                   np.stack([signals.vx, signals.vy, signals.vx2 - signals.vx1, signals.vy2 - signals.vy1], 1),
                   pick(("sd_x", "sd_y", "sd_x", "sd_y")) * scale,
                   pick(("sd_vx", "sd_vy", "sd_vx", "sd_vy")) * scale)  # fmt: skip
-    return _inferred(path, signals, rig) if infer_grip else path
-
-
-def _inferred(path: Motion, signals: Signals, rig: Rig) -> Motion:
-    """Distance and offset in every grip from the forces, but for their mean."""
-    position, velocity, sd = path.position.copy(), path.velocity.copy(), path.sd.copy()
-    shear = finite_stiffness(rig.fingertip.shear_stiffness)
-    normal = finite_stiffness(rig.fingertip.normal_stiffness)
-    give = {2: (signals.distance, -(signals.fx1 - signals.fx2) / normal),
-            3: (signals.offset, -(signals.fy1 - signals.fy2) / shear)}  # fmt: skip
-    for grip in grips(signals):
-        inner = np.arange(grip.start + 1, grip.stop - 1)
-        for channel, (measured, moved) in give.items():
-            there = inner[np.isfinite(measured[inner]) & np.isfinite(moved[inner])]
-            if there.size < 3:
-                continue
-            position[there, channel] = np.mean(measured[there] - moved[there]) + moved[there]
-            velocity[there, channel] = np.gradient(position[there, channel], signals.t[there])
-            sd[there, channel] = np.std(measured[there] - moved[there]) / np.sqrt(there.size)
-    return Motion(path.t, position, velocity, sd)
-
-
-def grips(signals: Signals) -> list[slice]:
-    """Runs of samples in which both fingers press; a missing sample belongs to its neighbours."""
-    sd = signals.sd_force if np.isfinite(signals.sd_force) else 0.01 * np.nanmax(signals.grip)
-    there = np.isfinite(signals.grip)
-    loaded = np.interp(signals.t, signals.t[there], signals.grip[there]) > LOADED * sd
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], loaded, [False]]).astype(int)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:

@@ -7,8 +7,8 @@ import pytest
 from path_enumeration import brute, random_problem
 from scipy.stats import chisquare
 
+from experiments.jax_hmm.alignment import forward, forward_backward, sample_alignments, viterbi
 from hmmseg.hmm.alignment import align, align_many
-from hmmseg.hmm.banded import forward, forward_backward, sample_alignments, viterbi
 from hmmseg.hmm.chain import InfeasibleAlignment
 
 SIZES = [(1, 1), (4, 1), (2, 2), (5, 2), (4, 4), (6, 3), (8, 4)]

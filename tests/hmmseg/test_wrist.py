@@ -77,7 +77,7 @@ def test_a_recording_may_end_as_it_grips(after):
     """So few samples that the way of the touch is not all there."""
     t = np.arange(50) / 50
     opening = np.maximum(0.05 - 0.04 * np.maximum(t - 0.5, 0), 0.05 - 0.04 * (t[-after] - 0.5))
-    (closing,) = closings(t, opening)
+    (closing,) = closings(opening)
     grip = grip_of(t, opening, np.zeros(50, bool), closing, None)
     assert grip is None or opening[-1] <= grip.width <= 0.05
 

@@ -7,8 +7,9 @@ import pytest
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
 from hmmseg_cli.gap_report import Setting, page
 from simgap.effects import catalogue
-from simgap.report.causes import _told, checks, plain_name
+from simgap.report.causes import checks, plain_name
 from simgap.report.finding import headline, moving, remains, sentences, to_do
+from simgap.robot_effects import families
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
 
@@ -52,9 +53,18 @@ def test_numbers_have_one_unit_and_no_exponent():
 
 
 def test_every_effect_has_a_plain_name_and_a_check():
-    missing = [n for n, e in catalogue().items() if e.chosen and n not in _told()]
-    assert not missing
-    assert all(checks([n])[0].endswith(".") for n in _told())
+    for name, effect in catalogue().items():
+        assert effect.called and checks([name]) == [effect.check] and effect.check.endswith(".")
+    for family in families().values():
+        for kind, (called, check) in getattr(family, "WORDS", {}).items():
+            whole = kind.replace(".", ":arm x.") if kind.split(".")[0] in ("readout", "pose") else kind
+            assert plain_name(whole) == called + (" (arm x)" if whole != kind else "")
+            assert checks([whole]) == [check] and check.endswith(".")
+    assert plain_name("readout:z.gain") == "a reading that is off by a factor (z)"
+    assert (
+        plain_name("gravity_compensation") == "gravity compensation"
+        and checks(["gravity_compensation"]) == []
+    )
     assert plain_name("fingertip_compliance", {"normal_stiffness": 1200.0}, {"normal_stiffness": 4000.0}) == (
         "softer fingertips"
     )

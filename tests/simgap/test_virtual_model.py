@@ -96,18 +96,6 @@ def test_replay_of_a_healthy_recording_leaves_little_more_than_the_sensors_noise
     assert rest["hold-above-ground"] < 1.5
 
 
-def test_forces_sharpen_the_motion_in_a_grip(performed):
-    errors = []
-    for infer in (False, True):
-        result = replay(performed.trial, STACK, HAND, PAPER_BLOCKS, boundaries=performed.boundaries,
-                        infer_grip=infer)  # fmt: skip
-        held = result.signals.grip > 1.0
-        errors.append(
-            np.sqrt(np.mean((result.residual[held][:, 0, 0] - result.residual[held][:, 1, 0]) ** 2))
-        )
-    assert errors[1] < errors[0]
-
-
 def test_smoothing_keeps_a_parabola_and_averages_a_rest():
     t = np.arange(0, 4, 0.05)
     truth = np.stack([0.1 + 0.02 * t - 0.03 * t**2, np.full(t.size, 0.05)], 1)

@@ -1,4 +1,4 @@
-"""The recursions of hmmseg.hmm.banded in JAX; whoever calls them has checked shapes."""
+"""The recursions of experiments.jax_hmm.alignment in JAX; whoever calls them has checked shapes."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Int, PRNGKeyArray, Shaped
 
+from experiments.jax_hmm.scans import Filtered, Path, Posterior, Weights, best_path, draw, filtered, smoothed
 from hmmseg.hmm.chain import Chain, why_infeasible
-from hmmseg.hmm.scans import Filtered, Path, Posterior, Weights, best_path, draw, filtered, smoothed
 
 Skip = Shaped[ArrayLike, "*_"] | tuple[Shaped[ArrayLike, "*_"], ...] | None
 

@@ -1,0 +1,1 @@
+"""The recursions of hmmseg.hmm in JAX, by themselves: what its kernels are compared with."""

@@ -1,0 +1,37 @@
+"""An effect is a plug-in: what it does stands in its own file, and no other file lists it by its name."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import simgap
+from simgap.effects import fitted
+
+ROOT = Path(simgap.__file__).parent
+# The comparison with given trials has effects of its own, some of the same names, in a catalogue of its own.
+CATALOGUES = {ROOT / "generic/effects.py"}
+
+
+def named_in(path: Path, names: set[str]) -> set[str]:
+    """Effects whose names stand as strings in the code of a file, alone or before what follows a dot."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    texts = (n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str))
+    found = [text for text in texts if not text.endswith(".toml")]  # actual.toml is a file
+    return {text.split(".")[0].split("/")[0] for text in found} & names
+
+
+def test_no_file_but_its_own_names_an_effect():
+    names, listed = set(fitted()), {}
+    for path in sorted(ROOT.rglob("*.py")):
+        own = {path.stem} if path.parent == ROOT / "effects" else set()
+        # What an effect is taken for, and its own keys, are said in its own file.
+        others = set() if own & names or path in CATALOGUES else named_in(path, names)
+        if others:
+            listed[str(path.relative_to(ROOT))] = others
+    assert listed == {}
+
+
+def test_the_search_for_names_finds_them(tmp_path):
+    (tmp_path / "list.py").write_text('SENSORS = ("force_bias", "x")\nKEY = "link_length/1"\n')
+    assert named_in(tmp_path / "list.py", set(fitted())) == {"force_bias", "link_length"}
