@@ -9,10 +9,10 @@ from typing import Any
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
+from hmmseg.levels import CONTRADICTS
 
 UNITS = {"weight": "N", "width": "m", "height": "m", "friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
-DISAGREES = 4.0  # chosen: sds of both together; by chance in one of 16,000 comparisons
 
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
@@ -44,7 +44,7 @@ def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0)
     """Identified `properties` (as in identify's JSON) beside measured values, by object and property.
 
     Each with `relative_deviation`, `z` (in sds of both together), `inside_95` and `disagrees`: beyond
-    DISAGREES sds and beyond `smallest`, the relative deviation that matters. Of a friction that has a
+    CONTRADICTS sds and beyond `smallest`, the relative deviation that matters. Of a friction that has a
     lower bound alone it can only be said that the measured one lies below. Null where not identified.
     """
     out: dict[str, Any] = {}
@@ -58,10 +58,10 @@ def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0)
                 row["relative_deviation"] = share
                 row["z"] = (found["mean"] - value) / math.hypot(found["sd"], sd)
                 row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
-                row["disagrees"] = bool(abs(row["z"]) > DISAGREES and abs(share) > smallest)
+                row["disagrees"] = bool(abs(row["z"]) > CONTRADICTS and abs(share) > smallest)
             elif found is not None and found.get("lower_bound") is not None:
                 short = 1 - value / found["lower_bound"]
-                row["disagrees"] = bool(short > smallest and value + DISAGREES * sd < found["lower_bound"])
+                row["disagrees"] = bool(short > smallest and value + CONTRADICTS * sd < found["lower_bound"])
             out.setdefault(obj, {})[prop] = row
     return out
 

@@ -16,6 +16,7 @@ import numpy as np
 from hmmseg.contact.equations import Pads, block_width, block_y, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
+from hmmseg.levels import CONTRADICTS
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
 UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
@@ -25,7 +26,6 @@ TAIL = 4.0  # prior: of the residuals, Student-t, as everywhere (hmmseg.segmenta
 # prior: standard deviation of one slope beyond its sampling, and of all alike, as forces and positions are
 # read apart in time: measured on a robot arm's recordings whose pads are known springs (0.04 and 0.08 off).
 SLOPE_SD = 0.1
-SURPRISING = 4.0  # chosen: standard errors of what the rig admits; as with forces in free motion
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def unexpected_share(shares: np.ndarray, variances: np.ndarray, stated: bool, ad
     # A slope's own error is a share of what truly gives.
     middle, error = middle_share(shares, variances, SLOPE_SD if stated else SLOPE_SD * np.abs(shares))
     alike = SLOPE_SD if stated else SLOPE_SD * abs(middle)
-    return middle if abs(middle) > SURPRISING * np.hypot(np.hypot(error, alike), admitted) else 0.0
+    return middle if abs(middle) > CONTRADICTS * np.hypot(np.hypot(error, alike), admitted) else 0.0
 
 
 def possible_share(shares: np.ndarray, variances: np.ndarray) -> float:

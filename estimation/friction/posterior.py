@@ -16,17 +16,16 @@ import numpy as np
 from estimation.friction.ground import GroundFriction, ground_friction
 from estimation.friction.ratio_bound import largest_ratio
 from estimation.friction.slip import SlipEvidence, Stretch, slip_evidence
-from estimation.observations import Aligned
+from estimation.observations import MIN_FREE, Aligned
 from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask, subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
+from hmmseg.levels import SURE
 
 # chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
 # ratio of two small forces says little: samples below this share of the grip's median are left out.
 FIRM = 0.5
-CLEAR = 5.0  # chosen: noise sds that a normal force must reach
-FEW_FREE = 5  # chosen: samples of free motion below which they do not tell the force bias
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _forces(a: Aligned, rig: Rig, finger: int, sd_force: float) -> _Forces:
     centred, sds = [], []
     for name in (f"fx{finger}", f"fy{finger}"):
         values = getattr(a.signals, name)
-        if free.sum() >= FEW_FREE:
+        if free.sum() >= MIN_FREE:
             bias = float(values[free].mean())
             shown = 1.4826 * float(np.median(np.abs(values[free] - bias)))
             sd = max(stated, shown) * np.sqrt(1 + 1 / free.sum())
@@ -141,7 +140,7 @@ def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
     core = (holding.mean(axis=0) > 0.5) & recorded
     if not core.any():
         return np.zeros(core.size, bool)
-    least = max(FIRM * float(np.median(forces.normal[core])), CLEAR * forces.sd_normal)
+    least = max(FIRM * float(np.median(forces.normal[core])), SURE * forces.sd_normal)
     return recorded & (np.nan_to_num(forces.normal) > least)
 
 

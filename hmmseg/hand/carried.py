@@ -18,12 +18,11 @@ from hmmseg.hand.tool import Tool, applied_force, free_tool
 from hmmseg.io.gripper import Gripper
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
+from hmmseg.levels import MOVED, SURE
 
 ACTIVE = 8.0  # chosen: noise scales above which the wrist feels something
-RAISED = 3e-3  # chosen: m from where it gripped: the hand has gone somewhere
 TOGETHER = 5  # chosen: samples within one smoothing window
 LEAST = 3  # numerics: samples; of fewer there is no scatter
-LOADED = 5.0  # chosen: standard errors at which a grip carries a load
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def give_of(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, 
 def _raised(grip: Grip, pose: Pose) -> np.ndarray:
     """Samples of a grip (num_samples,) in which the hand is higher than where it begins and ends."""
     height = pose.position[grip.start : grip.stop] @ pose.up
-    return height - max(height[0], height[-1]) > RAISED
+    return height - max(height[0], height[-1]) > MOVED
 
 
 def _is_raised(grip: Grip, pose: Pose) -> bool:
@@ -137,7 +136,7 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
     inside = slice(grip.start, grip.stop)
     raised = _raised(grip, pose)
     lifted = _is_raised(grip, pose)
-    far = np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > RAISED
+    far = np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > MOVED
     moved = raised if lifted else far
     load = force[inside][moved] @ (pose.up if lifted else pose.across)
     load = load[np.isfinite(load)]
@@ -145,6 +144,6 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
         return None
     scatter = max(1.4826 * float(np.median(np.abs(load - np.median(load)))), tool.noise)
     found = float(np.median(load))
-    if abs(found) <= LOADED * scatter / np.sqrt(load.size / TOGETHER):
+    if abs(found) <= SURE * scatter / np.sqrt(load.size / TOGETHER):
         return 0.0
     return found if lifted else abs(found)

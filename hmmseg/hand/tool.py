@@ -25,10 +25,10 @@ from hmmseg.hand.pose import Pose, bridged, smooth
 from hmmseg.io.gripper import Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
+from hmmseg.levels import SURE
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
 TAIL = 4.0  # prior: degrees of freedom of the Student-t weights, as in the emissions
-CLEAR = 5.0  # chosen: standard errors at which a parameter shows in free motion
 TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
 SAMPLES = 20  # chosen: of free motion, at least
 
@@ -129,7 +129,7 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
     axes, fitted, scale = _fit(rig, force, terms, time, turns)
     error = scale * np.sqrt(together) * fitted.errors
-    if not between and np.all(np.abs(fitted.drift) < CLEAR * error[2:]):
+    if not between and np.all(np.abs(fitted.drift) < SURE * error[2:]):
         axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
     _check(where, gripper, fitted.inertia, float(error[0]))
     mass = fitted.mass if fitted.mass is not None else fitted.inertia
@@ -217,11 +217,11 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
 
 def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
     """InputError where free motion contradicts what the rig says, or cannot tell what it leaves open."""
-    if inertia < -CLEAR * error and gripper.reaction is not None:
+    if inertia < -SURE * error and gripper.reaction is not None:
         problem = "go against the hand's own acceleration in free motion: the sign is the other way round"
         raise InputError(where, problem, f"reaction = {str(not gripper.reaction).lower()} under [gripper]")
     left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
-    if (left_open or gripper.reaction is None) and abs(inertia) < CLEAR * error:
+    if (left_open or gripper.reaction is None) and abs(inertia) < SURE * error:
         problem = "do not show the hand's own mass in free motion, so nothing tells how the sensor stands"
         raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
                          "under [gripper], as they are mounted")  # fmt: skip

@@ -16,9 +16,9 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS
 from hmmseg.io.units import unit_in_name
+from hmmseg.levels import GAP
 
 BUCKETS = 24  # numerics: of a small plot
-GAP = 3.0  # chosen: usual sample periods
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from hmmseg.hand.carried import LOADED, RAISED, TOGETHER
+from hmmseg.hand.carried import TOGETHER
+from hmmseg.levels import MOVED, SURE
 
 WENT = 20  # chosen: samples of a hand that goes somewhere before what it bears is judged
 
@@ -28,8 +29,8 @@ class Went:
             self._start = height, position
         if self._judged or t < self._last + apart:
             return
-        raised = height > self._start[0] + RAISED
-        if raised or np.linalg.norm(position - self._start[1]) > RAISED:
+        raised = height > self._start[0] + MOVED
+        if raised or np.linalg.norm(position - self._start[1]) > MOVED:
             self._last = t
             self._up.append(up)
             self._across.append(across)
@@ -41,7 +42,7 @@ class Went:
         if self._judged or n < WENT:
             return None
         self._judged = True
-        limit = LOADED / math.sqrt(n / TOGETHER)
+        limit = SURE / math.sqrt(n / TOGETHER)
         up, across = np.array(self._up), np.array(self._across)
         found, aside = float(np.median(up)), float(np.median(across))
         scatter = [max(1.4826 * float(np.median(np.abs(v - np.median(v)))), noise) for v in (up, across)]

@@ -16,10 +16,11 @@ from hmmseg.contact.decompose import FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.hand.signals import task_space
 from hmmseg.hmm import left_to_right, smooth
 from hmmseg.io.trial import Trial
+from hmmseg.levels import DRIFTS
 from hmmseg.online import layout as at
 from hmmseg.segmentation.boundaries import combine
 from hmmseg.segmentation.changes import Disagreement, Prior, moment
-from hmmseg.segmentation.crossings import HELD, contacts
+from hmmseg.segmentation.crossings import contacts
 from hmmseg.segmentation.emissions import Parameters, log_likelihoods
 from hmmseg.segmentation.features import MAX_RATE, WINDOW, features, thin
 from hmmseg.segmentation.pads import sense
@@ -28,7 +29,7 @@ from hmmseg.segmentation.posteriors import nearest_touch
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter
 
-NEAREST = 6  # chosen: samples of a hold that locate the block next to a contact change
+NEAREST = round(DRIFTS * MAX_RATE)  # samples of a hold that locate the block next to a contact change
 REACH = 0.6  # chosen: s before a boundary: what is read of the subtask that it ends
 FINE = 100.0  # numerics: Hz; in faster recordings the filter itself places touches
 SCALES: tuple[str, ...] = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
@@ -83,7 +84,7 @@ def refined(
         return None
     probability = posterior.boundary[:, 0]
     n, t = int(probability.argmax()), signals.t
-    near = (t[n + 1], t[n + 1] + HELD) if touch else (t[n] - HELD, t[n])
+    near = (t[n + 1], t[n + 1] + DRIFTS) if touch else (t[n] - DRIFTS, t[n])
     table = contacts(signals, sense([], [], (), parameters, filter_.rig), parameters)
     change = table.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
     out = combine(t, probability, {}) if change is None else moment(change, Disagreement())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.levels import MOVED
 from hmmseg.online.densities import log_sum
 from hmmseg.online.layout import (
     ABOVE_KIND,
@@ -38,7 +39,6 @@ LOG_DEPARTURE = math.log(1e-4)  # prior: as in hmmseg.segmentation.departure, as
 BRIEF = 1e-8  # prior
 SETTLING = 0.2  # prior
 RINGING = 0.1  # prior
-WRONG_RISE = 3e-3  # chosen
 PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
 NEGLIGIBLE = -28.0  # numerics: nats below the best at which a hypothesis is dropped
 SAME_STATE = 14  # numerics: hypotheses of one state that are kept apart, ...
@@ -92,7 +92,7 @@ def _enter(row, t, half, kinds, moves, rises, rise_signs, before, after):
         if known and row[ORIGIN + 1] > 0.0:
             rise = row[LEVEL] / row[LEVEL + 1] - row[ORIGIN]
             sign = rise_signs[moves[before]]
-            wrong = sign != 0.0 and sign * rise < -WRONG_RISE
+            wrong = sign != 0.0 and sign * rise < -MOVED
             precision = 1.0 / (row[ORIGIN + 1] + 1.0 / row[LEVEL + 1])
             row[rises + 2 * moves[before]] += precision * rise
             row[rises + 2 * moves[before] + 1] += precision

@@ -14,13 +14,13 @@ from hmmseg.hand.roll import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import ROLL
+from hmmseg.levels import GAP
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
 from hmmseg.online.wrist import Wrist, checked
 
 LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points over the lag to which a late row returns
-GAP = 3.0  # chosen: usual intervals between rows that make a gap
 USUAL = 0.02  # chosen: how fast the usual interval follows
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtr
 
+from hmmseg.levels import SURE
 from hmmseg.segmentation.boundaries import (
     ONSET,
     POINTS,
@@ -26,7 +27,7 @@ from hmmseg.segmentation.boundaries import (
     crossing_density,
     first_of,
 )
-from hmmseg.segmentation.switching import SURE, Penetration, switch_probability
+from hmmseg.segmentation.switching import Penetration, switch_probability
 
 LIKELY = 1e-3  # chosen: least probability of an interval within which the crossing is looked at
 SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another

@@ -18,6 +18,7 @@ import numpy as np
 from hmmseg.contact.decompose import FREE, Subtask, height_equations, subtasks
 from hmmseg.hmm.alignment import align
 from hmmseg.io.task import BlockTask
+from hmmseg.levels import MOVED
 from hmmseg.segmentation.departure import column, departing, leaving, scored, settled
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.free_contacts import (
@@ -33,7 +34,6 @@ MAX_RATE = 50.0  # chosen: Hz
 MAX_ASSIGNMENTS = 24  # numerics: tried at most
 MANY = 20  # learned: trials; of more than these one alone does not sway what most have learned
 BETWEEN_TRIALS = 2.0  # prior: slack of like blocks: poses, pads and cables shift widths and weights as well
-WRONG_RISE = 3e-3  # chosen: m against the task's direction; blocks are taller than that, slips shorter
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _check_rises(f: Features, c: Conformity, steps: tuple[Subtask, ...], task: B
         if not all(np.isfinite(height[span]).any() for span in spans.values()):
             continue
         risen = float(np.nanmedian(height[spans[held[-1]]]) - np.nanmedian(height[spans[held[0]]]))
-        if risen * np.sign(next(iter(rise.values()))) < -WRONG_RISE:
+        if risen * np.sign(next(iter(rise.values()))) < -MOVED:
             wrong.append((held[0], held[-1], risen))
     if not wrong:
         return c

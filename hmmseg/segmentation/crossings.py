@@ -10,13 +10,13 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_y, hanging
 from hmmseg.hand.rates import one_sided
 from hmmseg.hand.signals import Signals, central_differences
+from hmmseg.levels import SURE
 from hmmseg.segmentation.changes import Change, Prior, cut
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
-from hmmseg.segmentation.switching import SURE, Penetration
+from hmmseg.segmentation.switching import Penetration
 
-HELD = 0.15  # chosen: s of a hold that locate the block next to a contact change; a hand drifts over more
 PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
 STIFFEST = 1e-7  # numerics: m/N
 

@@ -22,6 +22,7 @@ from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
+from hmmseg.levels import CONTRADICTS
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.lateness import Squeeze, lateness, squeeze
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest, stretches
@@ -38,7 +39,6 @@ FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays below what counts 
 LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
 LATE = 0.01  # chosen: s; a longer delay is the sensor's
 DECISIVE = 15.0  # chosen: nats for a longer delay against none; its prior probability is about exp(-5)
-APART = 4.0  # chosen: sds beyond which a compliance contradicts the rig
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be asked
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
@@ -93,7 +93,7 @@ class Sensing:
             how = "are filtered with a time constant of" if self.filter else "come late by"
             out.append(f"forces {how} {1e3 * self.delay:.0f} ms against positions; boundaries allow for it")
         told, found = pads_of(rig).normal1, self.normal
-        if abs(found.value - told) > max(APART * found.sd, STIFFNESS_SD * told):
+        if abs(found.value - told) > max(CONTRADICTS * found.sd, STIFFNESS_SD * told):
             stated = f"rig.toml says {1e6 * told:.0f}" if told > 0 else "rig.toml says they are rigid"
             out.append(f"the pads give {1e6 * found.value:.0f} um/N along the grip, where {stated}; "
                        "boundaries allow for it")  # fmt: skip

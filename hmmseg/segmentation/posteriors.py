@@ -10,9 +10,10 @@ import numpy as np
 from hmmseg.contact.decompose import FREE, Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.alignment import Alignment
+from hmmseg.levels import DRIFTS
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal
 from hmmseg.segmentation.changes import Change, Disagreement, Prior, moment
-from hmmseg.segmentation.crossings import HELD, contacts
+from hmmseg.segmentation.crossings import contacts
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import Sensing
 from hmmseg.segmentation.spans import Span
@@ -80,8 +81,8 @@ def _held_side(
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
     if after:
-        return t[n + 1], min(t[n + 1] + HELD, max(t[own[-1]] if own.size else 0.0, t[n + 1]))
-    return max(t[n] - HELD, min(t[own[0]] if own.size else np.inf, t[n])), t[n]
+        return t[n + 1], min(t[n + 1] + DRIFTS, max(t[own[-1]] if own.size else 0.0, t[n + 1]))
+    return max(t[n] - DRIFTS, min(t[own[0]] if own.size else np.inf, t[n])), t[n]
 
 
 def to_spans(

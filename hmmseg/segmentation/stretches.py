@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from hmmseg.hand.signals import Signals
+from hmmseg.levels import SURE as SIGNIFICANT
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.toe import DEPENDENT, NONE, Toe
 
-SIGNIFICANT = 5.0  # chosen: sds of force noise for a contact to be sure
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
 KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there

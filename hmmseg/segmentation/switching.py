@@ -23,7 +23,6 @@ from scipy.special import log_ndtr
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
-SURE = 5.0  # chosen: sds of noise for a contact to be sure
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 TAIL = 4.0  # prior: Student-t residuals, as in the emissions

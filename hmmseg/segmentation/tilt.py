@@ -11,8 +11,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_offset, corner_drop
 from hmmseg.hand.roll import slow_roll
 from hmmseg.hand.signals import Signals
-
-STOOD = 0.15  # chosen: s before a lift in which the block stands as it was gripped; a hand drifts over more
+from hmmseg.levels import DRIFTS
 
 
 def tilts(
@@ -28,7 +27,7 @@ def tilts(
         start, end = ends[step.index]
         lift = ends[before.index][1]
         inside = (s.t >= start) & (s.t <= end)
-        stood = (s.t > lift - STOOD) & (s.t <= lift)
+        stood = (s.t > lift - DRIFTS) & (s.t <= lift)
         if (before.state, step.state) != (ON_GROUND, ABOVE_GROUND) or not inside.any():
             continue
         shown = offset if s.roll is None else s.roll
@@ -57,7 +56,7 @@ def corner_drops(
         width = float(np.median(there))
         out[inside] = np.nan_to_num(corner_drop(width, tilt))
         last = np.flatnonzero(inside)[-1]
-        following = np.flatnonzero(s.t <= s.t[last] + STOOD)
+        following = np.flatnonzero(s.t <= s.t[last] + DRIFTS)
         out[last + 1 : following[-1] + 1] = out[last]
         worst = max(worst, float(corner_drop(width, sd)))
     return out, worst

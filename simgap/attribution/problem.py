@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.fft import dct
 
+BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are told apart
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -32,7 +34,7 @@ class Rows:
     trials: tuple[str, ...]
     channels: tuple[str, ...]
     parts: tuple[str, ...]
-    bands: tuple[float, ...] = (0.0, 1.0, 5.0)
+    bands: tuple[float, ...] = BANDS
     sd: np.ndarray | None = None
     shape: np.ndarray | None = None
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from simgap.attribution.problem import Candidate, Gap, Rows
+from simgap.attribution.problem import BANDS, Candidate, Gap, Rows
 from simgap.effects import catalogue, decoys, fitted, name_of
 from simgap.gap.carried import again, carried
 from simgap.gap.evaluation import residual_at
@@ -18,8 +18,6 @@ from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.spread import Spread
 from simgap.gap.tolerance import tolerated
 from simgap.gap.trial_arrays import CHANNELS
-
-BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of those that are told apart
 
 
 def rows_of(given: Problem) -> Rows:

@@ -11,6 +11,7 @@ from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
+from hmmseg.levels import SURE
 from hmmseg.segmentation.align import TrialAlignment
 from simgap.effects.base import FORCES
 from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise, sensor_sd
@@ -21,7 +22,6 @@ BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its s
 PHASES = ("free", "pickup", "carry", "place", "slide")
 LOST = 0.05  # chosen: share of the grip on either side below which all forces of a sample are nothing
 MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
-TOUCHING = 5.0  # chosen: sds of a force by which a touch shows
 # chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
 EITHER_SIDE = 0.02
 FIRST_TOUCH = 0.2  # chosen: s; one finger touches no earlier before the other, nor lets go later
@@ -135,8 +135,8 @@ def _one_finger(
     for s in np.unique(subtask[free]):
         mine = np.flatnonzero(subtask == s)
         change = force[mine] - np.median(force[mine], axis=0)
-        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > TOUCHING * sd[mine, None]
-        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < TOUCHING * sd[mine, None]
+        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > SURE * sd[mine, None]
+        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < SURE * sd[mine, None]
         near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
         out[mine] = near & ((inwards[:, 0] & quiet[:, 1]) | (inwards[:, 1] & quiet[:, 0]))
     return out

@@ -15,6 +15,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.sequence.model import SequenceModel
 from simgap.attribution.detection import Detection
 from simgap.attribution.document import entries
+from simgap.attribution.search import MOST
 from simgap.attribution.shares import Shares
 from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known
 from simgap.generic.aligned import Ensembles, align
@@ -27,7 +28,6 @@ from simgap.generic.report import effect_entry, listed_cells
 from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
 from simgap.generic.shrinkage import fraction, heldout, shrinkage, sizes
 
-MOST = 6  # chosen: effects that may act together
 GAIN = 5.0  # chosen: nats that a further effect must add
 WORTH = 0.98  # chosen: it must leave no more than this share of the excess square
 TEMPERATURE = 1.5  # chosen: least; covariances come from a few trials

@@ -32,7 +32,6 @@ WHEN = {
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
 TINY = 1e-16  # numerics
-MOSTLY = 0.5  # chosen: a remainder above it is the larger part of the gap
 
 
 def p_text(p: float) -> str:
@@ -68,7 +67,7 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
         return "A gap that no known cause explains"
     text = named(body, rig)
     rest = (body.get("remainder") or {}).get("share")
-    more = ", and a larger gap that no known cause explains" if rest is not None and rest > MOSTLY else ""
+    more = ", and a larger gap that no known cause explains" if rest is not None and rest > 1 - rest else ""
     return text[0].upper() + text[1:] + more
 
 

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simgap.attribution.problem import Candidate, Gap
+from simgap.attribution.problem import BANDS, Candidate, Gap
 from simgap.attribution.problem import Rows as Told
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
 from simgap.robots.whiten import Whitener
-
-BANDS = (0.0, 1.0, 5.0)  # chosen: Hz, lower edges of the bands that are told apart
 
 
 def fitted_along(composed: Composed) -> tuple[str, ...]:

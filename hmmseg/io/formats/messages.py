@@ -22,8 +22,8 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.io.table import Table
+from hmmseg.levels import GAP
 
-GAP = 3.0  # chosen: usual periods
 MAX_ENTRIES = 64  # numerics: of an array in a message: images and clouds are no channels
 MAX_MESSAGES = 20_000_000  # limit: more is a damaged or hostile file
 
