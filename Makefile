@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: robots-check bench-robot gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -126,9 +126,19 @@ results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills th
 	$(BIN)/python -m experiments.write_tables
 
 ROBOTS := build/robots
+CHECKED_ROBOTS := pendulum reacher acrobot manipulator ur5e
 robots-models: $(INSTALLED)  ## models of robots by others out of packages, in build/robots, for experiments.robots_check
 	$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps --only-binary :all: -d $(ROBOTS) dm-control robosuite
 	cd $(ROBOTS) && for wheel in *.whl; do ../../$(BIN)/python -m zipfile -e $$wheel .; done
+
+robots-check: robots-models  ## seeded faults in these models, diagnosed (in build/robots_check; resumable) and scored; fills docs/robots_results.md
+	for robot in $(CHECKED_ROBOTS); do $(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 9301 --cases 12 --robots $$robot --out build/robots_check/$$robot || exit 1; done
+	$(BIN)/python -m experiments.robots_check $(ROBOTS) --score build/robots_check
+	$(BIN)/python -m experiments.write_tables
+
+bench-robot: robots-models  ## time of a diagnosis of a minute of an arm of six joints, in one go and interrupted; fills docs/robots_results.md
+	$(BIN)/python -m experiments.benchmarks.robot $(ROBOTS) --interrupt
+	$(BIN)/python -m experiments.write_tables
 
 calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds that differ, NUTS beside the sampler; resumable
 	$(BIN)/python -m experiments.sbc

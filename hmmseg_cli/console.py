@@ -94,13 +94,14 @@ class Output:
         self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
 
     @contextlib.contextmanager
-    def progress(self, text: str, total: int) -> Iterator[Callable[[int], None]]:
-        """A progress bar on standard error; yields a function that advances it by so many steps."""
+    def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
+        """A progress bar on standard error; yields a function that advances it by so many steps, and says
+        what is going on where it is told."""
         from rich.progress import Progress
 
         with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
             task = bar.add_task(text, total=total)
-            yield lambda steps: bar.advance(task, steps)
+            yield lambda steps, now=text: bar.update(task, advance=steps, description=now)
 
     def figure(self, name: str) -> Path:
         """Path to draw a figure of this file name to; only where `--figures` was given."""

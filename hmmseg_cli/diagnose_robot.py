@@ -95,6 +95,7 @@ def diagnose_robot(
     """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
     from simgap.robots.describe import body
     from simgap.robots.diagnose import STAGES, diagnose
+    from simgap.robots.kept import kept_for, modules_beside
     from simgap.simulators.recording import read_recording
 
     more: list = []
@@ -106,6 +107,7 @@ def diagnose_robot(
         wanted = [n for n, c in simulator.channels.items()]
         recordings = [read_recording(path, wanted) for path in paths]
         at_risk = simulator
+        inputs = [own.simulator.encode(), *modules_beside(Path(own.simulator.rpartition(":")[0]))]
     else:
         from simgap.simulators.mjcf.load import load_mjcf
 
@@ -113,6 +115,7 @@ def diagnose_robot(
         loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
         recordings = [loaded.read(path) for path in paths]
         at_risk, length = loaded.simulator, loaded.map.length
+        inputs = [loaded.digest, *(name.encode() for name in own.candidates)]
         more = loaded.effects(recordings)
         for warning in loaded.warnings:
             out.warn(warning)
@@ -122,18 +125,28 @@ def diagnose_robot(
         from simgap.robots.task_phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
+    inputs += [*(path.read_bytes() for path in paths), b"" if task is None else task.read_bytes()]
+    kept = kept_for([*inputs, repr((sorted(effect), out.seed)).encode()])
+    if kept.begun:
+        out.print("going on where an earlier run of this was interrupted")
     with out.progress("diagnosing", total=STAGES) as advance:
-        found = diagnose(
-            at_risk,
-            recordings,
-            forced=tuple(dict.fromkeys(effect)),
-            seed=out.seed,
-            more=more,
-            length=length,
-            phases=phases,
-            tell=lambda text: advance(1),
-            warn=out.warn,
-        )
+        try:
+            found = diagnose(
+                at_risk,
+                recordings,
+                forced=tuple(dict.fromkeys(effect)),
+                seed=out.seed,
+                more=more,
+                length=length,
+                phases=phases,
+                tell=lambda text: advance(1, text),
+                warn=out.warn,
+                kept=kept,
+            )
+        except KeyboardInterrupt:
+            if kept.begun:
+                out.warn("interrupted; the same command goes on from here")
+            raise
     document = body(found)
     out.print(sentence(document), *tables(document, found))
     if out.figures is not None or out.report is not None:
@@ -143,6 +156,7 @@ def diagnose_robot(
 
         write_patch(found, document, own.mjcf, lambda name: out.stage(own.patch / name))  # type: ignore[operator]
     out.finish(document)
+    kept.forget()
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:

@@ -99,7 +99,7 @@ def main() -> None:
                     number, found["robot"], [f["kind"] for f in found["faults"]], told["verdict"], flush=True
                 )
     if given.score is not None:
-        every = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(given.score.glob("*.json"))]
+        every = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(given.score.rglob("*.json"))]
         save(given.output, scored(every))
 
 

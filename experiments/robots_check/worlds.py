@@ -60,7 +60,13 @@ def motion(robot: Robot, rng: np.random.Generator) -> Callable[[float], np.ndarr
     return lambda t: about + np.sum(sizes * np.sin(rates * t + phases), 1)
 
 
-def run(robot: Robot, world: World, wanted: Callable[[float], np.ndarray], measure: bool = False) -> dict:
+def run(
+    robot: Robot,
+    world: World,
+    wanted: Callable[[float], np.ndarray],
+    measure: bool = False,
+    rate: float = RATE,
+) -> dict:
     """A log: `t`, commands as logged, positions without noise."""
     model, data = world.model, LIKE.MjData(world.model)
     actuators = [model.actuator(a).id for a in robot.driven]
@@ -71,9 +77,9 @@ def run(robot: Robot, world: World, wanted: Callable[[float], np.ndarray], measu
         data.qpos[place] = robot.about.get(joint, 0.0)
     LIKE.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
-    steps = round(1 / RATE / model.opt.timestep)
-    rows = round(robot.seconds * RATE)
-    t, log, commands = np.arange(rows) / RATE, np.zeros((rows, len(read))), np.zeros((rows, len(dofs)))
+    steps = round(1 / rate / model.opt.timestep)
+    rows = round(robot.seconds * rate)
+    t, log, commands = np.arange(rows) / rate, np.zeros((rows, len(read))), np.zeros((rows, len(dofs)))
     shown = {j: ([], [], []) for j, _ in robot.driven.values()}
     limits = np.where(model.actuator_ctrllimited[actuators], model.actuator_ctrlrange[actuators, 1], np.inf)
     gear = model.actuator_gear[actuators, 0]

@@ -13,14 +13,10 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-import estimation
-import hmmseg
-import simgap
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -32,6 +28,7 @@ from simgap.attribution.search import sought
 from simgap.gap.search import Search, search
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.wrist_gap import as_from_wrist, of_wrist
+from simgap.source_digest import source_digest
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 
@@ -162,17 +159,6 @@ def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | Non
     more = (repr(task), rig.model_dump_json(), repr(actual), str(seed), source_digest())
     digest.update("\n".join(more).encode())
     return cache_folder() / "twins" / f"{digest.hexdigest()[:24]}.json"
-
-
-@cache
-def source_digest() -> str:
-    """A hash of the product's own source: other code may give a twin another statistic."""
-    digest = hashlib.sha256()
-    for package in (hmmseg, estimation, simgap):
-        root = Path(package.__path__[0])
-        for file in sorted(root.rglob("*.py")):
-            digest.update(f"{package.__name__}/{file.relative_to(root)}\n".encode() + file.read_bytes())
-    return digest.hexdigest()
 
 
 def _keep(file: Path, values: list[float]) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hmmseg.hmm.kernels.compile import compiled
 from simgap.robot_effects.base import RobotEffect, Setting, places
 
 
-@njit(cache=True)
+@compiled
 def play(values: np.ndarray, width: float) -> np.ndarray:
     """The play operator: the output (n,) follows the input only where that pushes a side of the gap."""
     out = np.empty_like(values)

@@ -20,16 +20,18 @@ from simgap.robots.borne_out import folds_of
 from simgap.robots.discrepancy import learned
 from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.explained import explained
+from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
 from simgap.robots.judge import RobotVerdict, judge
+from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import pruned
-from simgap.robots.search import Found, moved_to, point_of, search
+from simgap.robots.search import Found, point_of, search
 from simgap.robots.twins import Twins, healthy_twins
 from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
@@ -73,9 +75,11 @@ def diagnose(
     warn: Tell = lambda text: None,
     more: Sequence[RobotEffect] = (),
     length: float | None = None,
+    kept: Kept = NOWHERE,
 ) -> RobotDiagnosis:
     """Diagnose logs against a simulator. `forced` names effects instead of choosing; `more` are further
-    candidates; `warn` is told at once what cannot be told apart. InputError for input at fault."""
+    candidates; `warn` is told at once what cannot be told apart; what an earlier run of the same inputs has
+    `kept` is not worked out again. InputError for input at fault."""
     noise = noises(simulator, recordings)
     effects = candidates_of(Setting(simulator, recordings)) | {e.name: e for e in more}
     for name in forced:
@@ -87,11 +91,11 @@ def diagnose(
     # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.
     if not forced and (calm := whole.calm()) is not whole:
-        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn)
+        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn, kept.of("calm"))
         if found.verdict.causes:
             return found
         tell("where bodies move in contact")
-    return _diagnosed(whole, whole, forced, seed, phases, tell, warn)
+    return _diagnosed(whole, whole, forced, seed, phases, tell, warn, kept)
 
 
 def _diagnosed(
@@ -102,6 +106,7 @@ def _diagnosed(
     phases: Phases | None,
     tell: Tell,
     warn: Tell,
+    kept: Kept,
 ) -> RobotDiagnosis:
     """The diagnosis of a part of the windows; `whole` has all, and in all of them what is left is told."""
     parts = phases_of(composed.simulator, composed.recordings) if phases is None else phases
@@ -112,26 +117,30 @@ def _diagnosed(
         warn(text)
 
     tell("sensitivities")
-    composed, plain, alike = _told_by_logs(composed, said)
+    composed, plain, alike = _told_by_logs(composed, said, kept)
     wanted = [n for n in plain.moved if n not in fitted_along(composed)]
     tell("healthy twins")
-    twins = healthy_twins(composed, plain, parts, seed)
-    found = search(composed, parts, wanted, tell, forced, twins.factor)
+    twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
+    found = search(composed, parts, wanted, tell, forced, twins.factor, kept.of("search"))
     fold = folds_of(found.linear, len(composed.recordings))
     if forced:
         borne = tuple(found.names[j] for j in found.models[0].effects)
         point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
     else:
         tell("held-out logs")
-        borne, point = pruned(composed, parts, found, fold, twins.factor)
+        borne, point = kept("borne out", lambda: pruned(composed, parts, found, fold, twins.factor))
     tell("refit")
-    ended = _refitted(composed, parts, point, wanted, borne, twins.factor)
+    settled = kept("settled", lambda: _settled(composed, point, twins.factor))
+    ended = _refitted(composed, parts, settled, wanted, borne, twins.factor)
     tell("shares")
-    verdict = _judged(whole, composed, parts, ended, plain.point, twins, fold, seed, bool(forced))
+    judged = (whole, composed, parts, ended, plain.point, twins, fold, seed, bool(forced))
+    verdict = kept("verdict", lambda: _judged(*judged))
     far, sensor = None, ended.covariances.whitener()
     if verdict.causes:
         tell("how far")
-        far = shrinkage(composed, ended, plain, sensor, fold, ended.best, forced=bool(forced))
+        far = kept(
+            "how far", lambda: shrinkage(composed, ended, plain, sensor, fold, ended.best, bool(forced))
+        )
     return RobotDiagnosis(
         composed,
         parts,
@@ -149,12 +158,13 @@ def _diagnosed(
     )
 
 
-def _told_by_logs(composed: Composed, said: Tell) -> tuple[Composed, Linear, Identifiability]:
+def _told_by_logs(composed: Composed, said: Tell, kept: Kept) -> tuple[Composed, Linear, Identifiability]:
     """The gap as the simulator comes with all sensitivities, what the logs can tell by them, and the same
     windows with what contacts make of them; what is left out, and what no such log tells apart, is said."""
     along = fitted_along(composed)
-    plain = _plain(composed, {n: composed.effects[n].neutral() for n in along},
-                   [n for n in composed.effects if n not in along])  # fmt: skip
+    neutral = {n: composed.effects[n].neutral() for n in along}
+    wanted = [n for n in composed.effects if n not in along]
+    plain = kept("plain", lambda: _plain(composed, neutral, wanted))
     composed = wobbling(composed, plain)
     plain = replace(plain, wobble=composed.wobble)
     for name in plain.diverged:
@@ -175,7 +185,7 @@ def _refitted(
     factor: np.ndarray,
 ) -> Found:  # fmt: skip
     """Everything linear about the best fit of what was borne out, its discrepancies, and that set there."""
-    linear = linearise(composed, _settled(composed, point, factor), [*fitted_along(composed), *wanted])
+    linear = linearise(composed, point, [*fitted_along(composed), *wanted])
     cov = covariances(composed, linear, factor)
     off = learned(cov, linear.residual) if len(cov.blocks) else NONE
     usable = [n for n in wanted if n in linear.moved]
@@ -196,9 +206,11 @@ def _judged(
     told_by = explained(composed, linear, sensor, plain, ended.best, whole)
     every = s if whole is composed else _every(whole, linear.point, ended.best, phases)
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
-    told_apart = fold[rows] if ended.discrepancy and len(composed.recordings) >= 3 else None
+    off = bool(ended.discrepancy) and len(composed.recordings) >= 3
+    numerics = tuple(j for j, n in enumerate(ended.names) if composed.numeric(n))
     rng = np.random.default_rng(seed)
-    return judge(ended.forms, s, ended.models[0].effects, null, rng, told_by, every, forced, told_apart)
+    causes = ended.models[0].effects
+    return judge(ended.forms, s, causes, null, rng, told_by, every, fold[rows], forced, off, numerics)
 
 
 def _every(whole: Composed, point: Point, causes: Sequence[str], phases: Phases) -> Forms:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve, cholesky, lapack, solve_triangular
 from scipy.optimize import minimize
 
-from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy, Source, total
+from simgap.robots.tied import Solved, Tied
+from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy
 
 # prior: sd of a window's log multiplier: the model is off by e (sd) from window to window
 SPREAD = 1.0
@@ -19,18 +17,13 @@ WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 FREEDOM = 4.0  # prior: of Student's t: heavy tails, finite variance
 ENOUGH = 40  # learned: windows from which discrepancies are learned
 
-dpotri: Any = lapack.dpotri  # type: ignore[attr-defined]  # inverse from a Cholesky factor
-
 
 def learned(cov: Covariances, residual: np.ndarray) -> Discrepancy:
     """The discrepancy of a residual (N,); channels for which it gains nothing have none."""
-    names = tuple(dict.fromkeys(n for s in cov.sources for n in s))
-    rows = sum(len(n) for n in cov.noise) / max(len(cov.blocks), 1)
+    names = tuple(dict.fromkeys(n for b in cov.blocks for n in b.sources))
+    rows = sum(b.rows.size for b in cov.blocks) / max(len(cov.blocks), 1)
     every = max(1, int(len(cov.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
-    terms = [
-        _Terms(n, [s.get(name, Source(np.zeros(0, int), np.zeros((0, 0)))) for name in names], residual[b])
-        for b, n, s in zip(cov.blocks[::every], cov.noise[::every], cov.sources[::every], strict=True)
-    ]
+    terms = [Tied.of(b, residual[b.rows], names) for b in cov.blocks[::every]]
     kept = list(range(len(names)))
     x = np.full(len(kept), -np.inf)
     for k in kept:
@@ -66,69 +59,51 @@ def _multipliers(cov: Covariances, residual: np.ndarray, scale: Mapping[str, flo
     which nothing happens.
     """
     cost: dict[int, np.ndarray] = {}
-    for block, number, noise, sources in zip(cov.blocks, cov.window, cov.noise, cov.sources, strict=True):
-        own = cost.setdefault(number, 0.5 * (np.array(GRID) / SPREAD) ** 2)
+    variance = np.square(list(scale.values()))
+    for block in cov.blocks:
+        own = cost.setdefault(block.window, 0.5 * (np.array(GRID) / SPREAD) ** 2)
+        tied = Tied.of(block, residual[block.rows], tuple(scale))
         for i, g in enumerate(GRID):
             try:
-                factor = cholesky(total(noise, sources, scale, np.exp(g)), lower=True, check_finite=False)
-            except LinAlgError:  # so large that the noise is lost in rounding
+                found = tied.solved(np.exp(g) * variance)
+            except np.linalg.LinAlgError:  # so large that the noise is lost in rounding
                 own[i] = np.inf
                 continue
-            white = solve_triangular(factor, residual[block], lower=True, check_finite=False)
-            own[i] += float(np.log(np.diag(factor)).sum() + 0.5 * white @ white)
+            own[i] += found.half + 0.5 * found.square
     return {number: float(np.exp(GRID[int(own.argmin())])) for number, own in cost.items()}
 
 
-@dataclass(frozen=True)
-class _Terms:
-    """Of one block: covariance of noise, of every source, and the residual."""
-
-    noise: np.ndarray
-    sources: list[Source]
-    residual: np.ndarray
-
-
-def _first_guess(terms: list[_Terms], k: int) -> float:
+def _first_guess(terms: list[Tied], k: int) -> float:
     """Log variance that alone would explain the residual's excess."""
-    ratio = [
-        float(t.residual @ t.residual) / max(float(np.trace(t.sources[k].covariance)), 1e-300)
-        for t in terms
-        if np.trace(t.sources[k].covariance) > 0
-    ]
+    ratio = [t.square / max(float(t.trace[k]), 1e-300) for t in terms if t.trace[k] > 0]
     return float(np.log(max(np.median(ratio), 1e-30))) if ratio else -60.0
 
 
-def _value(x: np.ndarray, terms: list[_Terms], kept: list[int]) -> float:
+def _value(x: np.ndarray, terms: list[Tied], kept: list[int]) -> float:
     """Minus log likelihood of the log variances; a window's rows together are Student's t, so that few in
     which the model is far off do not decide."""
-    variance = np.exp(x)
-    return sum(_one(term, variance, kept)[0] for term in terms)
+    return sum(_student(term.solved(_variance(term, x, kept))) for term in terms)
 
 
-def _one(term: _Terms, variance: np.ndarray, kept: list[int]) -> tuple[float, np.ndarray, np.ndarray, float]:
-    """Of one block: minus log likelihood, Cholesky factor, its solution of the residual, and the square."""
-    whole = term.noise.copy()
-    for v, k in zip(variance, kept, strict=True):
-        term.sources[k].add(whole, v)
-    factor = cholesky(whole, lower=True, check_finite=False)
-    alpha = cho_solve((factor, True), term.residual, check_finite=False)
-    n, square = len(whole), float(term.residual @ alpha)
-    value = float(np.log(np.diag(factor)).sum()) + 0.5 * (FREEDOM + n) * np.log1p(square / FREEDOM)
-    return value, factor, alpha, square
+def _variance(term: Tied, x: np.ndarray, kept: list[int]) -> np.ndarray:
+    """Variances (K,) of all sources, 0 for those that are not kept."""
+    out = np.zeros(term.trace.size)
+    out[kept] = np.exp(x)
+    return out
 
 
-def _cost(x: np.ndarray, terms: list[_Terms], kept: list[int]) -> tuple[float, np.ndarray]:
+def _student(found: Solved) -> float:
+    return found.half + 0.5 * (FREEDOM + found.tied.size) * float(np.log1p(found.square / FREEDOM))
+
+
+def _cost(x: np.ndarray, terms: list[Tied], kept: list[int]) -> tuple[float, np.ndarray]:
     """`_value` and its gradient."""
-    value, slope, variance = 0.0, np.zeros(len(kept)), np.exp(x)
+    value, slope = 0.0, np.zeros(len(kept))
     for term in terms:
-        own, factor, alpha, square = _one(term, variance, kept)
-        value += own
-        weight = (FREEDOM + len(alpha)) / (FREEDOM + square)
-        inverse = np.tril(dpotri(factor, lower=1)[0])
-        inverse += np.tril(inverse, -1).T
-        for i, (v, k) in enumerate(zip(variance, kept, strict=True)):
-            source = term.sources[k]
-            pull = alpha[source.rows] @ source.covariance @ alpha[source.rows]
-            trace = float(np.sum(source.within(inverse) * source.covariance))
-            slope[i] += 0.5 * v * (trace - weight * float(pull))
+        variance = _variance(term, x, kept)
+        found = term.solved(variance)
+        value += _student(found)
+        trace, pull = found.slopes()
+        weight = (FREEDOM + term.size) / (FREEDOM + found.square)
+        slope += 0.5 * (variance * (trace - weight * pull))[kept]
     return value, slope

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from simgap.attribution.shares import Shares
+from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Rows
-from simgap.robots.search import moved_to
 from simgap.robots.whiten import Whitener, covariances
 from simgap.robots.windows import REGIMES
 

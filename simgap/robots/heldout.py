@@ -11,9 +11,10 @@ from simgap.attribution.heldout import fraction_gone
 from simgap.attribution.posterior import forms
 from simgap.attribution.search import sought
 from simgap.robots.borne_out import borne_out
+from simgap.robots.fit import moved_to
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
-from simgap.robots.search import Found, moved_to, point_of
+from simgap.robots.search import Found, point_of
 from simgap.robots.whiten import Whitener, covariances
 
 

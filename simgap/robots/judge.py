@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from simgap.attribution.shares import Shares
 from simgap.attribution.verdict import LEAST, MOST, RULED_OUT, Explanation, Verdict, acting, conclude, known
 from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
 from simgap.robots.explained import Explained
+from simgap.robots.scatter import scattering
 
 RIVALS = 8  # numerics: sets that are compared on held-out rows
 
@@ -53,31 +55,35 @@ def judge(
     rng: np.random.Generator,
     told_by: Explained,
     every: Forms,
+    fold: np.ndarray,
     forced: bool = False,
-    fold: np.ndarray | None = None,
+    off: bool = False,
+    numerics: tuple[int, ...] = (),
 ) -> RobotVerdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
     `causes` were borne out by held-out rows, and explain what `told_by` says, in that order; `every` is the
     gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
-    statistics.
+    statistics; `fold` (n,) of each row; `off`: whether the model is off by itself, so that only held-out rows
+    tell small differences; `numerics` are candidates of the solver's own.
 
     A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
     channels that it moves, and the gap of these is the one that it explains. What is left in others is the
     remainder, which is told."""
     names = [c.name for c in f.gap.candidates]
     models = rivals(f, causes)
-    detection = detected(statistic(sensor, [fitted(sensor, causes), fitted(sensor, ())]), twins or None)
     # Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it.
     least = np.where(told_by.part >= LEAST, told_by.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
     kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
     left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
+    value = _beside_numerics(sensor, causes, () if {*kept} & {*numerics} else numerics)
+    detection = detected(value, twins or None)
     sets = [
         _explanation(names, m, float(w), causes, kept, known(left, 1 - left))
         for m, w in zip(models, weights(models), strict=True)
     ]
     mine = tuple(sorted(names[j] for j in kept))
     verdict = conclude(sets, detection.p_value, forced=mine if forced else (), chosen=mine)
-    if verdict.causes and fold is not None and not forced:
+    if verdict.causes and off and not forced:
         verdict = verdict.beside(names[j] for j in _not_told_apart(f, models, causes, kept, fold))
     rows, band, sd = every.gap.rows, every.spectrum.band, np.ones(every.gap.rows.channel.size)
     told = tuple(j for j, c in enumerate(every.gap.candidates) if c.name in verdict.causes)
@@ -95,8 +101,21 @@ def judge(
         shares=replace(parts, each=parts.each[:, [causes.index(j) for j in kept]]),
         left=dict(zip(told_by.regimes, told_by.left.tolist(), strict=True)) if told else {},
         shared=tuple(names[j] for j in kept),
-        model=fitted(f, causes),
+        model=scattering(f, fitted(f, causes), fold),
         chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
+    )
+
+
+def _beside_numerics(f: Forms, causes: tuple[int, ...], numerics: tuple[int, ...]) -> float:
+    """Log Bayes factor of a gap, with the solver's step and integrator such as leave least of it.
+
+    No robot has a step. What another one makes of the simulator is no gap of the robot's where it is too
+    little to be named; where it is named, it is a cause like others, and `numerics` are none.
+    """
+    beside = [acting for k in range(len(numerics) + 1) for acting in combinations(numerics, k)]
+    return min(
+        statistic(f, [fitted(f, tuple(sorted({*causes, *a}))), fitted(f, tuple(sorted(a)))], tuple(sorted(a)))
+        for a in beside
     )
 
 

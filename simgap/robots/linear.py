@@ -52,13 +52,15 @@ class Linear:
 
 @dataclass(frozen=True)
 class Base:
-    """Rollouts at a point, from which effects are varied: starts, true channels, as read, and their rows."""
+    """Rollouts at a point, from which effects are varied: starts, true channels, as read, and their rows;
+    `numeric`: of true channels what the simulator's own numerics make up, where the point has them other."""
 
     point: Point
     begun: list
     true: list[Channels | None]
     read: list[Channels | None]
     rows: np.ndarray
+    numeric: list[Channels | None] | None = None
 
 
 def base_at(composed: Composed, point: Point) -> Base:
@@ -69,12 +71,38 @@ def base_at(composed: Composed, point: Point) -> Base:
     return Base(point, begun, true, read, composed.rows.averaged(read))
 
 
+def numeric_at(composed: Composed, base: Base) -> Base:
+    """The base with what other numerics make of it.
+
+    A finer step costs as many more rollouts, and what it changes is small: what it changes of the change that
+    an effect makes is smaller by as much again, so it is taken as it is at the point.
+    """
+    plain = composed.plainly(base.point)
+    if plain is base.point:
+        return base
+    bare = composed.rolled(plain, base.begun)
+    return replace(base, numeric=[_sum(a, b, -1.0) for a, b in zip(base.true, bare, strict=True)])
+
+
+def _sum(one: Channels | None, other: Channels | None, sign: float = 1.0) -> Channels | None:
+    """Channel by channel; None where either diverged."""
+    return None if one is None or other is None else {n: v + sign * other[n] for n, v in one.items()}
+
+
+def _rolled(composed: Composed, base: Base, point: Point, begun: list) -> list[Channels | None]:
+    """True channels at another point or from other starts, numerics as they are at the base."""
+    if base.numeric is None:
+        return composed.rolled(point, begun)
+    run = composed.rolled(composed.plainly(point), begun)
+    return [_sum(a, b) for a, b in zip(run, base.numeric, strict=True)]
+
+
 def linearise(composed: Composed, point: Point, effects: Sequence[str]) -> Linear:
     """Residuals at a point, sensitivities to starts, and to the parameters of these effects.
 
     InputError where the simulator diverges in every window.
     """
-    base = base_at(composed, point)
+    base = numeric_at(composed, base_at(composed, point))
     if all(channels is None for channels in base.read):
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
     residual = composed.rows.observed - base.rows
@@ -182,7 +210,8 @@ def _rows_at(
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
     if not effect.reads:
-        run = composed.rolled(moved, base.begun)
+        exact = composed.plainly({name: dict(values)}) == {}
+        run = composed.rolled(moved, base.begun) if exact else _rolled(composed, base, moved, base.begun)
         return composed.rows.averaged(composed.read(run, moved))
     out = composed.rows.averaged(composed.read(base.true, moved))
     if effect.undoes:
@@ -210,7 +239,7 @@ def _by_start(composed: Composed, base: Base) -> dict[str, np.ndarray]:
             s if s is None or state not in s else {**s, state: s[state] + h}
             for s, h in zip(base.begun, steps, strict=True)
         ]
-        run = composed.rolled(base.point, begun)
+        run = _rolled(composed, base, base.point, begun)
         there = composed.rows.averaged(composed.read(run, base.point))
         by_row = np.array(steps)[composed.rows.window]
         change = np.where(by_row > 0, (there - base.rows) / np.where(by_row > 0, by_row, 1.0), 0.0)

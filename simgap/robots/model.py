@@ -13,6 +13,8 @@ from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, alike, cut, st
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 
+# numerics: windows of a regime with which a search begins; it ends on all of them
+FIRST = 48
 SETTLE = 0.2  # chosen: s that a model has to come to rest where a window is of rest
 
 Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; what is not named is neutral
@@ -55,18 +57,30 @@ class Composed:
 
     def along(self, logs: Sequence[int]) -> Composed:
         """The same along some of the logs alone, which keep their numbers."""
-        windows = tuple(w for w in self.windows if w.log in logs)
-        wobble = None if self.wobble is None else self.wobble[np.isin(self.rows.log, logs)]
+        return self.among([k for k, w in enumerate(self.windows) if w.log in logs])
+
+    def calm(self) -> Composed:
+        """The same in flight and at rest alone, where there are such windows; else this."""
+        kept = [k for k, w in enumerate(self.windows) if w.regime != STRIKES]
+        if not kept or len(kept) == len(self.windows):
+            return self
+        return replace(self.among(kept), wobble=None)
+
+    def among(self, numbers: Sequence[int]) -> Composed:
+        """The same in some of the windows alone, by number, ascending."""
+        windows = tuple(self.windows[k] for k in numbers)
+        wobble = None if self.wobble is None else self.wobble[np.isin(self.rows.window, numbers)]
         return replace(
             self, windows=windows, rows=rows_of(self.recordings, windows, self.noise), wobble=wobble
         )
 
-    def calm(self) -> Composed:
-        """The same in flight and at rest alone, where there are such windows; else this."""
-        windows = tuple(w for w in self.windows if w.regime != STRIKES)
-        if not windows or len(windows) == len(self.windows):
-            return self
-        return replace(self, windows=windows, rows=rows_of(self.recordings, windows, self.noise), wobble=None)
+    def thinned(self) -> list[int]:
+        """Numbers of windows that a search begins with: of every regime evenly chosen ones, about FIRST."""
+        kept: list[int] = []
+        for regime in sorted({w.regime for w in self.windows}):
+            mine = [k for k, w in enumerate(self.windows) if w.regime == regime]
+            kept += mine[:: max(1, len(mine) // FIRST)]
+        return sorted(kept)
 
     def commanded(self, point: Point) -> list[Recording]:
         """The recordings with commands as the drives took them."""
@@ -85,6 +99,16 @@ class Composed:
                 if short in self.effects[name].model:
                     out[self.effects[name].model[short]] = value
         return out
+
+    def plainly(self, point: Point) -> Point:
+        """The point without what sets the simulator's own numerics; the same where it sets none."""
+        out = {n: v for n, v in point.items() if not self.numeric(n)}
+        return point if len(out) == len(point) else out
+
+    def numeric(self, effect: str) -> bool:
+        """Whether an effect is of the simulator's own numerics."""
+        numerics = getattr(self.simulator, "numerics", ())
+        return any(p in numerics for p in self.effects[effect].model.values())
 
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """True channels of every window from these starts; None where a rollout diverged."""

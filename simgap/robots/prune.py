@@ -13,11 +13,12 @@ import numpy as np
 from simgap.attribution.posterior import forms
 from simgap.robots.borne_out import weakest
 from simgap.robots.discrepancy import learned
+from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.search import Found, moved_to, point_of
+from simgap.robots.search import Found, point_of
 from simgap.robots.whiten import covariances
 
 

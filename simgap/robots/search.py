@@ -6,24 +6,23 @@ rolled out at their own best fit, so that what kinks at its neutral value is see
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.robots.discrepancy import learned
+from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
-from simgap.robots.linear import Linear, base_at, linearise, vary
+from simgap.robots.kept import NOWHERE, Kept
+from simgap.robots.linear import Linear, base_at, linearise, numeric_at, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
 from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with
-STEPS = 8  # numerics: evaluations of a least-squares fit
 SETTLED = 2.0  # chosen: nats that a further round must gain
 
 Tell = Callable[[str], None]
@@ -47,6 +46,16 @@ class Found:
         return tuple(c.name for c in self.forms.gap.candidates)
 
 
+@dataclass(frozen=True)
+class Step:
+    """Where a search stands: about which point it goes on, the best set so far, and all that were best."""
+
+    point: Point
+    best: tuple[str, ...] = ()
+    seen: frozenset[tuple[str, ...]] = frozenset()
+    settled: bool = False
+
+
 def search(
     composed: Composed,
     phases: Phases,
@@ -54,44 +63,97 @@ def search(
     tell: Tell,
     forced: Sequence[str] = (),
     factor: np.ndarray | None = None,
+    kept: Kept = NOWHERE,
 ) -> Found:
-    """Search until the best set and its parameters stay."""
-    along = fitted_along(composed)
-    point: Point = {n: composed.effects[n].neutral() for n in along}
-    if along:
-        rough = linearise(composed, point, along)
-        for _ in range(2):
-            cov = covariances(composed, rough, factor)
-            point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
-            rough = linearise(composed, point, along)
-    best: tuple[str, ...] = ()
-    last, seen = None, set[tuple[str, ...]]()
+    """Search until the best set and its parameters stay: where there are many windows in some of them first,
+    from which all are gone on with."""
+    point: Point = {n: composed.effects[n].neutral() for n in fitted_along(composed)}
+    begin = Step(point)
+    few = composed.thinned()
+    if not forced and len(few) < len(composed.windows):
+        noise = None if factor is None else factor[np.isin(composed.rows.window, few)]
+        part = composed.among(few)
+        ask = _Ask(part, phases, tuple(candidates), (), noise)
+
+        def ended() -> Step:
+            found = _searched(ask, Step(_along(ask, point)), tell, kept.of("some windows"))
+            return Step(point_of(part, found.forms, found.models[0].effects, found.linear.point), found.best)
+
+        begin = kept("some windows", ended)
+    ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor)
+    if not begin.best:
+        begin = Step(kept("fitted along", lambda: _along(ask, point)))
+    return _searched(ask, begin, tell, kept)
+
+
+@dataclass(frozen=True)
+class _Ask:
+    """What a search is asked: in which windows, with which candidates, by which noise."""
+
+    composed: Composed
+    phases: Phases
+    candidates: tuple[str, ...]
+    forced: tuple[str, ...]
+    factor: np.ndarray | None
+
+    def covariances(self, linear: Linear) -> Covariances:
+        """Of the windows about a point."""
+        return covariances(self.composed, linear, self.factor)
+
+
+def _searched(ask: _Ask, step: Step, tell: Tell, kept: Kept) -> Found:
+    """Rounds until the best set stays. A round that was kept is made again only if it is the last."""
+    found: Found | None = None
+
+    def made() -> Step:
+        nonlocal found
+        found, after = _round(ask, step, number)
+        return after
+
     for number in range(ROUNDS):
+        found = None
         tell(f"round {number + 1}")
-        linear = linearise(composed, point, [*along, *candidates])
-        usable = [n for n in candidates if n in linear.moved]
-        cov = covariances(composed, linear, factor)
-        off = learned(cov, linear.residual)
-        whiten = cov.whitener(off)
-        linear, leaders = _leaders(composed, linear, whiten, phases, usable, best)
-        f = forms(gap_of(composed, linear, whiten, phases, leaders))
-        if forced:
-            chosen = tuple(j for j, n in enumerate(leaders) if n in forced)
-            models = [fitted(f, chosen), fitted(f, ())]
-        else:
-            models = [one_more(f, [leaders.index(n) for n in best if n in leaders])]
-        now = tuple(sorted(leaders[j] for j in models[0].effects))
-        last = Found(linear, whiten, cov, off, f, tuple(models), now)
-        tell(f"round {number + 1}: {' + '.join(now) or 'nothing'}")
-        settled = now == best and number and _gain(last) < SETTLED
-        again = now != best and now in seen  # sets that take turns are alike, and none will win
-        if settled or again or number == ROUNDS - 1:
+        after = kept(f"round {number + 1}", made)
+        tell(f"round {number + 1}: {' + '.join(after.best) or 'nothing'}")
+        if after.settled:
             break
-        seen.add(now)
-        best = now
-        point = moved_to(composed, linear, whiten, point_of(composed, f, models[0].effects, point))
-    assert last is not None
-    return last
+        step = after
+    return _round(ask, step, number)[0] if found is None else found
+
+
+def _along(ask: _Ask, point: Point) -> Point:
+    """What is fitted along, without any cause."""
+    for _ in range(2 if point else 0):
+        rough = linearise(ask.composed, point, list(point))
+        cov = ask.covariances(rough)
+        point = moved_to(ask.composed, rough, cov.whitener(learned(cov, rough.residual)), point)
+    return point
+
+
+def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
+    """One round: what is best about the step's point, and where to go on."""
+    composed = ask.composed
+    linear = linearise(composed, step.point, [*fitted_along(composed), *ask.candidates])
+    usable = [n for n in ask.candidates if n in linear.moved]
+    cov = ask.covariances(linear)
+    off = learned(cov, linear.residual)
+    whiten = cov.whitener(off)
+    linear, leaders = _leaders(composed, linear, whiten, ask.phases, usable, step.best)
+    f = forms(gap_of(composed, linear, whiten, ask.phases, leaders))
+    if ask.forced:
+        chosen = tuple(j for j, n in enumerate(leaders) if n in ask.forced)
+        models = [fitted(f, chosen), fitted(f, ())]
+    else:
+        models = [one_more(f, [leaders.index(n) for n in step.best if n in leaders])]
+    now = tuple(sorted(leaders[j] for j in models[0].effects))
+    found = Found(linear, whiten, cov, off, f, tuple(models), now)
+    first = number == 0 and not step.best and bool(step.point)  # what is fitted along is yet to follow
+    settled = now == step.best and not first and _gain(found) < SETTLED
+    again = now != step.best and now in step.seen  # sets that take turns are alike, and none will win
+    if settled or again or number == ROUNDS - 1:
+        return found, replace(step, best=now, settled=True)
+    point = moved_to(composed, linear, whiten, point_of(composed, f, models[0].effects, step.point))
+    return found, Step(point, now, step.seen | {now})
 
 
 def one_more(f: Forms, best: Sequence[int]) -> Model:
@@ -166,7 +228,7 @@ def _leaders(
         values = np.clip(values, c.neutral - 5 * c.scale, c.neutral + 5 * c.scale)
         at[name] = dict(zip(c.parameters, values.tolist(), strict=True))
     first = sorted(gains, key=lambda n: -gains[n])[: max(LEADERS - len(held), 4)]
-    base = base_at(composed, linear.point)
+    base = numeric_at(composed, base_at(composed, linear.point))
     more = {}
     for name in first:
         if all(
@@ -177,70 +239,3 @@ def _leaders(
         if one is not None:
             more[name] = one
     return linear.with_moved(more), sorted([*held, *first])
-
-
-def moved_to(
-    composed: Composed, linear: Linear, whiten: Whitener, point: Point, only: Sequence[str] | None = None
-) -> Point:
-    """The point of least squares of whitened residuals, from a start; priors as in attribution. `only`: the
-    effects that are moved, all by default."""
-    if only is not None and set(only) != set(point):
-        held = {e: theta for e, theta in point.items() if e not in only}
-        free = {e: theta for e, theta in point.items() if e in only}
-        return {**point, **_moved(composed, linear, whiten, free, held)}
-    return _moved(composed, linear, whiten, point, {})
-
-
-def _moved(
-    composed: Composed, linear: Linear, whiten: Whitener, point: Point, held: Point
-) -> dict[str, Mapping[str, float]]:
-    names = [(e, p) for e, theta in point.items() for p in theta]
-    known = [composed.effects[e].parameters[p] for e, p in names]
-    if not names:
-        return dict(point)
-    sd = np.array([p.sd for p in known])
-    low, high = np.array([p.low for p in known]), np.array([p.high for p in known])
-    nominal = np.array([p.nominal for p in known])
-    loose = np.array([composed.effects[e].fitted for e, _ in names])
-
-    def at(x: np.ndarray) -> dict[str, dict[str, float]]:
-        out: dict[str, dict[str, float]] = {}
-        for (effect, short), value in zip(names, nominal + sd * x, strict=True):
-            out.setdefault(effect, {})[short] = float(value)
-        return out
-
-    def prior(x: np.ndarray) -> np.ndarray:
-        return np.where(loose, x, np.sqrt(2 * np.log1p(x**2)))
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        found = linear.rows.observed - base_at(composed, {**held, **at(x)}).rows
-        # A rollout that diverged is as far off as the recording is from its mean.
-        found = np.where(np.isfinite(found), found, linear.rows.observed)
-        return np.concatenate([whiten(np.where(np.isfinite(linear.residual), found, 0.0)), prior(x)])
-
-    def jacobian(x: np.ndarray) -> np.ndarray:
-        here = at(x)
-        base = base_at(composed, {**held, **here})
-        columns = []
-        for effect in here:
-            moved = vary(composed, base, linear.starts, effect)
-            size = len(composed.effects[effect].parameters)
-            columns.append(np.zeros((linear.residual.size, size)) if moved is None else moved.jacobian)
-        whole = np.concatenate(columns, 1) * sd
-        slope = np.where(loose, 1.0, _slope(x))
-        return np.concatenate([-whiten(np.where(np.isfinite(whole), whole, 0.0)), np.diag(slope)])
-
-    order = [(e, p) for e in point for p in composed.effects[e].parameters]
-    assert order == names, "a point names all parameters of its effects, in their order"
-    begin = np.array([(point[e][p] - q.nominal) / q.sd for (e, p), q in zip(names, known, strict=True)])
-    bounds = (low - nominal) / sd, (high - nominal) / sd
-    inside = np.clip(begin, bounds[0] + 1e-6, bounds[1] - 1e-6)
-    derivative: Any = jacobian
-    done = least_squares(residual, inside, derivative, bounds=bounds, max_nfev=STEPS, method="trf", ftol=1e-5)
-    return dict(at(np.clip(done.x, *bounds)))
-
-
-def _slope(x: np.ndarray) -> np.ndarray:
-    """Derivative of sqrt(2 log(1 + x^2)), which is sqrt(2) sign(x) near 0 (0 at 0)."""
-    root = np.sqrt(2 * np.log1p(x**2))
-    return np.where(root > 1e-9, 2 * x / (1 + x**2) / np.maximum(root, 1e-9), 0.0)

@@ -67,69 +67,72 @@ class Whitener:
 
 @dataclass(frozen=True)
 class Source:
-    """A discrepancy's covariance (k, k) at s = 1, and which rows of the block it is of (k,)."""
+    """A discrepancy's covariance (k, k) at s = 1, or its variances (k,) where it ties no rows, and which rows
+    of the block it is of (k,)."""
 
     rows: np.ndarray
     covariance: np.ndarray
 
+    @property
+    def trace(self) -> float:
+        """The sum of its variances."""
+        own = self.covariance
+        return float(own.sum() if own.ndim == 1 else np.trace(own))
+
     def add(self, total: np.ndarray, variance: float) -> None:
         """Add it to a block's covariance, in place."""
-        total[np.ix_(self.rows, self.rows)] += variance * self.covariance
+        across = self.rows if self.covariance.ndim == 1 else self.rows[:, None]
+        total[across, self.rows] += variance * self.covariance
 
-    def within(self, whole: np.ndarray) -> np.ndarray:
-        """Its rows and columns of a matrix."""
-        return whole[np.ix_(self.rows, self.rows)]
+
+@dataclass(frozen=True)
+class Block:
+    """Rows (n,) of one window that belong together: the noise's `variance` (n,), `start` (n, S) by which each
+    state of the uncertain start moves them at one standard deviation, and sources of discrepancy by name."""
+
+    rows: np.ndarray
+    window: int
+    variance: np.ndarray
+    start: np.ndarray
+    sources: Mapping[str, Source]
+
+    def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
+        """The rows' covariance (n, n)."""
+        out = np.diag(self.variance) + self.start @ self.start.T
+        multiplier = discrepancy.multiplier.get(self.window, 1.0)
+        for name, s in discrepancy.scale.items():
+            if name in self.sources:
+                self.sources[name].add(out, multiplier * s**2)
+        return out
 
 
 @dataclass(frozen=True)
 class Covariances:
-    """Of every block of rows: its window, the covariance of noise and start, and of each channel's
-    discrepancy at s = 1 where it has any rows."""
+    """Of all blocks of rows."""
 
-    blocks: tuple[np.ndarray, ...]
-    window: tuple[int, ...]
-    noise: tuple[np.ndarray, ...]
-    sources: tuple[dict[str, Source], ...]
+    blocks: tuple[Block, ...]
 
     def whitener(self, discrepancy: Discrepancy = NONE) -> Whitener:
         """The whitener of all rows."""
-        factors = [
-            cholesky(total(n, s, discrepancy.scale, discrepancy.multiplier.get(w, 1.0)), lower=True)
-            for n, s, w in zip(self.noise, self.sources, self.window, strict=True)
-        ]
-        return Whitener(self.blocks, tuple(factors))
-
-
-def total(
-    noise: np.ndarray, sources: Mapping[str, Source], scale: Mapping[str, float], multiplier: float
-) -> np.ndarray:
-    """A block's covariance with discrepancies of these sizes."""
-    out = noise.copy()
-    for name, s in scale.items():
-        if name in sources:
-            sources[name].add(out, multiplier * s**2)
-    return out
+        factors = [cholesky(block.covariance(discrepancy), lower=True) for block in self.blocks]
+        return Whitener(tuple(block.rows for block in self.blocks), tuple(factors))
 
 
 def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = None) -> Covariances:
     """Covariances of all windows that did not diverge; `factor` (N,) multiplies the noise's sd."""
     kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
-    blocks, numbers, noises, sources = [], [], [], []
+    blocks = []
     free = bool(linear.starts)
     for number, mine in enumerate(linear.rows.of):
         if mine.stop == mine.start or not np.isfinite(linear.residual[mine]).all():
             continue
-        for block in [np.arange(mine.start, mine.stop)] if free else _by_channel(linear, mine):
-            scale = 1.0 if factor is None else factor[block]
-            noise = np.diag(linear.rows.variance[block] * scale**2)
-            for state, doubt in composed.windows[number].doubt.items():
-                column = linear.starts[state][block] * doubt
-                noise += np.outer(column, column)
-            blocks.append(block)
-            numbers.append(number)
-            noises.append(noise)
-            sources.append(_sources(linear, block, kinds, free))
-    return Covariances(tuple(blocks), tuple(numbers), tuple(noises), tuple(sources))
+        for rows in [np.arange(mine.start, mine.stop)] if free else _by_channel(linear, mine):
+            scale = 1.0 if factor is None else factor[rows]
+            moved = [linear.starts[n][rows] * doubt for n, doubt in composed.windows[number].doubt.items()]
+            start = np.array(moved).reshape(-1, rows.size).T
+            variance = linear.rows.variance[rows] * scale**2
+            blocks.append(Block(rows, number, variance, start, _sources(linear, rows, kinds, free)))
+    return Covariances(tuple(blocks))
 
 
 def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
@@ -172,7 +175,7 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
         out[key] = Source(moved, response @ np.exp(-np.abs(t[:, None] - t) / TAU) @ response.T)
     if linear.wobble is not None and regime == STRIKES:
         out[CONTACTS] = Source(every, linear.wobble[block] @ linear.wobble[block].T)
-    out[CLOCK] = Source(every, np.diag(linear.rates[block] ** 2))
+    out[CLOCK] = Source(every, linear.rates[block] ** 2)
     return out
 
 

@@ -30,6 +30,7 @@ class UserSimulator:
     says: Mapping[str, str] = field(default_factory=dict)
     poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     by_log: Mapping[str, Parameter] = field(default_factory=dict)
+    numerics: frozenset[str] = frozenset()
 
 
 def load_simulator(spec: str) -> UserSimulator:
@@ -85,8 +86,19 @@ def checked(found: Any, where: str) -> UserSimulator:
         if name not in BY_LOG:
             raise InputError(f"{where}: by_log {name}", "unknown key", nearest(name, BY_LOG))
     poses = dict(getattr(found, "poses", None) or {})
+    numerics = frozenset(getattr(found, "numerics", None) or ())
+    for name in numerics - parameters.keys():
+        raise InputError(f"{where}: numerics", f"no parameter {name}", nearest(name, list(parameters)))
     return UserSimulator(
-        parameters, channels, run, restarted, says=says, poses=poses, by_log=by_log, **optional
+        parameters,
+        channels,
+        run,
+        restarted,
+        says=says,
+        poses=poses,
+        by_log=by_log,
+        numerics=numerics,
+        **optional,
     )
 
 

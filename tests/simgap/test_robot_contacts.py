@@ -196,12 +196,12 @@ def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
     composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     linear = linearise(composed, {}, [])
     cov = covariances(composed, linear)
-    for number, block, sources in zip(cov.window, cov.blocks, cov.sources, strict=True):
-        lying = {n: s for n, s in sources.items() if n.endswith(LIES)}
-        assert len(lying) == (len(POSE) if composed.windows[number].regime == RESTS else 0)
+    for block in cov.blocks:
+        lying = {n: s for n, s in block.sources.items() if n.endswith(LIES)}
+        assert len(lying) == (len(POSE) if composed.windows[block.window].regime == RESTS else 0)
         for name, source in lying.items():
-            column = np.zeros(block.size)
+            column = np.zeros(block.rows.size)
             column[source.rows] = 1.0
             channel = composed.rows.channels.index(name.split(",")[0])
-            assert (column == (composed.rows.channel[block] == channel)).all()
+            assert (column == (composed.rows.channel[block.rows] == channel)).all()
             assert (source.covariance == 1.0).all()

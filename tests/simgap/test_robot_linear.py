@@ -150,3 +150,35 @@ def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
     assert set(found.scale) >= {"angle"} and found.scale["angle"] > 0.1
     white = cov.whitener(found)(linear.residual)
     assert 0.4 < np.mean(white**2) < 1.6 < np.mean(cov.whitener()(linear.residual) ** 2)
+
+
+def test_numerics_are_exact_at_a_point_and_constant_about_it():
+    """What the step changes is no part of other effects' derivatives, and needs no runs for them."""
+    runs = []
+
+    class Stepped(Swing):
+        parameters = Swing.parameters | {"step": {"nominal": 0.0, "sd": 0.5}}
+        numerics = frozenset({"step"})
+
+        def simulate(self, parameters, recording, start=None):
+            runs.append(parameters["step"])
+            found = super().simulate(parameters, recording, start)["angle"]
+            return {"angle": found * (1 + 0.01 * parameters["step"])}
+
+    simulator, logs = checked(Stepped(), "here"), [log(0, seconds=1.0)]
+    effects = candidates(Setting(simulator, logs))
+    made = Composed.of(simulator, logs, effects, noises(simulator, logs))
+    runs.clear()
+    point = {"step": {"step": 0.5}}
+    linear = linearise(made, point, ["viscous", "inertia"])
+    assert sum(s != 0 for s in runs) <= 0.4 * len(runs)
+    exact = linearise(made, {}, ["viscous", "inertia"])
+    base = made.rows.averaged(made.read(made.run(point), point))
+    np.testing.assert_allclose(linear.residual, made.rows.observed - base)
+    for name in exact.moved:
+        near = pytest.approx(exact.moved[name].jacobian, rel=1e-6, abs=1e-9)
+        assert linear.moved[name].jacobian == near
+    doubled = linearise(made, point, ["step"]).moved["step"]
+    assert doubled.shift == pytest.approx(
+        0.01 * 0.5 * (made.rows.observed - exact.residual), rel=1e-3, abs=1e-9
+    )

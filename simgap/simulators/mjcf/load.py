@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,12 +20,14 @@ from simgap.simulators.recording import Recording, read_recording
 
 @dataclass(frozen=True)
 class Loaded:
-    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs."""
+    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs; `digest`:
+    a hash of model and map."""
 
     simulator: Any
     map: Map
     candidates: Sequence[str]
     warnings: tuple[str, ...]
+    digest: bytes
 
     def read(self, path: Path) -> Recording:
         """A log in SI, as the map has it; InputError where a unit cannot be."""
@@ -88,7 +91,10 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     simulator, warnings = _simulator(mujoco, model, described, address)
-    return Loaded(simulator, described, candidates, tuple(warnings))
+    whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, whole)
+    digest = hashlib.sha256(f"{mujoco.__version__} {described}".encode() + whole.tobytes()).digest()
+    return Loaded(simulator, described, candidates, tuple(warnings), digest)
 
 
 def _add_sensors(mujoco: Any, spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[str, int]]:

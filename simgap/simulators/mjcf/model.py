@@ -125,11 +125,10 @@ class MjcfSimulator:
     def _read(self, log: Recording, sensed: np.ndarray, times: np.ndarray) -> Channels | None:
         """Sensors at the log's times: on the grid as they are, between by cubics (positions, velocities)."""
         since = log.t - log.t[0]
-        out = {}
-        for name, address in self.sensor.items():
-            values = sensed[:, address]
-            smooth = self.channels[name].kind in ("position", "velocity")
-            out[name] = cubic(since, times, values) if smooth else np.interp(since, times, values)
+        smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
+        between = cubic(since, times, sensed[:, [self.sensor[n] for n in smooth]]) if smooth else sensed
+        out = {n: between[:, k] for k, n in enumerate(smooth)}
+        out |= {n: np.interp(since, times, sensed[:, a]) for n, a in self.sensor.items() if n not in out}
         for columns in self.free.values():
             aligned(log, out, columns)
         return finite(out) if all(np.abs(v).max() < 1e9 for v in out.values()) else None
@@ -175,6 +174,11 @@ class MjcfSimulator:
         mujoco.mj_getState(self.model, data, state, int(self._spec))
         state[0] = 0.0
         return state
+
+    @property
+    def numerics(self) -> frozenset[str]:
+        """Parameters of the solver, not of the robot: what they change is small, and costs further runs."""
+        return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
 
     @property
     def states(self) -> tuple[str, ...]:

@@ -15,15 +15,23 @@ class Held:
     def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
         self.since = since
         self.edges = np.append(times, 2 * times[-1] - times[-2])
+        self.width = np.diff(self.edges)
+        self.at = self._at(since)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Means (steps,) of a column (num_timesteps,); missing samples hold the one before."""
         seen = np.isfinite(values)
-        t, u = self.since[seen], values[seen]
+        if seen.all():
+            t, u, k = self.since, values, self.at
+        else:
+            t, u = self.since[seen], values[seen]
+            k = self._at(t)
         area = np.concatenate([[0.0], np.cumsum(u[:-1] * np.diff(t))])
-        k = np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
-        whole = area[k] + u[k] * (self.edges - t[k])
-        return np.diff(whole) / np.diff(self.edges)
+        return np.diff(area[k] + u[k] * (self.edges - t[k])) / self.width
+
+    def _at(self, t: np.ndarray) -> np.ndarray:
+        """The sample that is held at each edge."""
+        return np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
 
 
 def filled(values: np.ndarray) -> np.ndarray:
@@ -33,13 +41,14 @@ def filled(values: np.ndarray) -> np.ndarray:
 
 
 def cubic(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values between points of an even grid by cubics through neighbours (Catmull & Rom 1974)."""
+    """Values (n, ...) between points of an even grid, (T, ...), by cubics through neighbours (Catmull & Rom
+    1974)."""
     h = times[1] - times[0]
     place = np.clip(at / h, 0, times.size - 1)
     i = np.minimum(place.astype(int), times.size - 2)
-    s = place - i
+    s = (place - i).reshape(-1, *([1] * (values.ndim - 1)))
     p0, p1, p2, p3 = (values[np.clip(i + k, 0, times.size - 1)] for k in (-1, 0, 1, 2))
-    inner = (i > 0) & (i < times.size - 2)
+    inner = ((i > 0) & (i < times.size - 2)).reshape(s.shape)
     bend = 0.5 * (s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0))
     return np.where(inner, p1 + bend, p1 + s * (p2 - p1))
 

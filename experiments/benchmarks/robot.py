@@ -1,0 +1,106 @@
+"""How long `hmmseg diagnose --mjcf` takes for a minute of an arm of six joints, logged at 500 Hz.
+
+    python -m experiments.benchmarks.robot MODELS [--seconds S] [--interrupt]
+
+MODELS as in experiments.robots_check. Two faults are planted; all candidates are asked. Writes
+experiments/results/benchmark_robot.json: time and processor time of the whole command; with --interrupt also
+of one that gets Ctrl-C after half of that time, and of the same command again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.robots_check.faults import drawn
+from experiments.robots_check.robots import ROBOTS, map_toml, nominal_xml
+from experiments.robots_check.worlds import NOISE, motion, run, usual, world_of
+from experiments.saving import save
+
+OUT = Path(__file__).parents[1] / "results" / "benchmark_robot.json"
+RATE = 500.0  # Hz
+SEED = 11
+FAULTS = ("friction", "armature")
+
+
+def drawn_arm(models: Path, seconds: float, folder: Path) -> list[str]:
+    """Write model, map and log; the faults in words."""
+    arm = next(r for r in ROBOTS if r.name == "ur5e")
+    rng = np.random.default_rng(SEED)
+    xml = nominal_xml(arm, models, rng)
+    sizes = usual(arm, xml)
+    plain = world_of(xml, [], sizes)
+    faults = [drawn(arm, plain, kind, rng) for kind in FAULTS]
+    wanted = motion(arm, rng)
+    shown = pd.DataFrame(run(replace(arm, seconds=seconds), world_of(xml, faults, sizes), wanted, rate=RATE))
+    for joint in arm.read:
+        shown[f"q_{joint}"] += NOISE * rng.standard_normal(len(shown))
+    shown.to_csv(folder / "log.csv", index=False, float_format="%.7g")
+    (folder / "robot.xml").write_text(xml, encoding="utf-8")
+    (folder / "map.toml").write_text(map_toml(arm, NOISE), encoding="utf-8")
+    return [f"{f.kind} of {f.thing}" for f in faults]
+
+
+def timed(folder: Path, interrupt: float | None = None) -> dict[str, Any]:
+    """Time and processor time [s] of the command, and its exit code; with Ctrl-C after so many seconds."""
+    files = ("log.csv", "--mjcf", "robot.xml", "--map", "map.toml", "--json", "found.json", "--quiet")
+    command = [sys.executable, "-m", "hmmseg_cli.main", "diagnose", *files]
+    here = os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    process = subprocess.Popen(command, cwd=folder, env=here, stderr=subprocess.DEVNULL)
+    try:
+        code = process.wait(interrupt)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+        code = process.wait()
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall": round(wall, 1), "processor": round(processor, 1), "exit": code}
+
+
+def main() -> None:
+    """Draw, time, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("models", type=Path)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--interrupt", action="store_true")
+    parser.add_argument("--output", type=Path, default=OUT)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        faults = drawn_arm(given.models, given.seconds, folder)
+        whole = timed(folder)
+        found = json.loads((folder / "found.json").read_text(encoding="utf-8"))
+        out: dict[str, Any] = {
+            "seconds": given.seconds,
+            "rate": RATE,
+            "cores": os.cpu_count(),
+            "load": [round(v, 1) for v in os.getloadavg()],
+            "planted": faults,
+            "whole": whole,
+            "found": {k: found[k] for k in ("verdict", "causes", "indistinguishable")},
+        }
+        if given.interrupt:
+            first = timed(folder, 0.5 * whole["wall"])
+            again = timed(folder)
+            same = json.loads((folder / "found.json").read_text(encoding="utf-8")) == found
+            out["interrupted"] = {"first": first, "again": again, "same_document": same}
+    save(given.output, out)
+    print(json.dumps(out, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""Tables of docs/robots_results.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from experiments.table_text import load, markdown
+
+GOALS = {
+    "false_alarms": ("false alarms on healthy robots", "2 %"),
+    "named_right": ("named right, all", "90 %"),
+    "single": ("one fault", ""),
+    "pair": ("two", ""),
+    "dense": ("four", ""),
+    "outside_held_back": ("faults of no known kind held back", "85 %"),
+    "intervals_cover": ("intervals that hold the fault", "87 to 93 %"),
+}
+
+
+def minute() -> str | None:
+    """How long a minute of an arm takes."""
+    found = load("benchmark_robot")
+    if found is None:
+        return None
+    runs = {"whole": found["whole"]}
+    if "interrupted" in found:
+        runs |= {k: found["interrupted"][k] for k in ("first", "again")}
+    label = {"whole": "in one go", "first": "interrupted half way", "again": "the same command again"}
+    rows = [[label[k], f"{v['processor']:.0f} s", f"{v['wall']:.0f} s"] for k, v in runs.items()]
+    note = (
+        f"A log of {found['seconds']:.0f} s at {found['rate']:.0f} Hz of six joints; {found['cores']} cores, "
+        f"on which on average {found['load'][1]:.0f} processes ran, these among them. Planted: "
+        f"{' and '.join(found['planted'])}. Verdict: {found['found']['verdict']}, "
+        f"{' + '.join(found['found']['causes']) or 'no cause'}."
+    )
+    return f"{markdown(['', 'processor', 'time'], rows)}\n\n{note}"
+
+
+def check() -> str | None:
+    """Seeded faults in robots by others."""
+    found = load("robots_check")
+    if found is None:
+        return None
+    told: dict[str, Any] = {**found, **found["named_right_by_kind"]}
+    rows = []
+    for key, (label, goal) in GOALS.items():
+        one = told[key]
+        if not one["of"]:
+            continue
+        low, high = (100 * v for v in one["interval_90"])
+        share = f"{100 * one['share']:.0f} % ({low:.0f} to {high:.0f})"
+        rows.append([label, f"{one['hits']} of {one['of']}", share, goal])
+    seconds = ", ".join(f"{robot} {s:.0f} s" for robot, s in found["processor_seconds"].items())
+    note = f"{found['cases']} cases; in brackets 90 % intervals. Processor time a case: {seconds}."
+    return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"

@@ -1,0 +1,159 @@
+"""The likelihood of one block's rows, by parts that nothing but the start ties.
+
+In flight a discrepancy is of one channel, and only the uncertain start ties channels: the covariance is
+B + U U' with B in blocks and few columns U, one for each state. By Woodbury's identity
+
+    square = |z|^2 - |w|^2,  log det = log det B + log det M,   z = L^-1 r,  Z = L^-1 U,  B = L L',
+    M = 1 + Z'Z,  M = K K',  w = K^-1 Z'z,
+
+so that of a block of six channels six small factors are made in place of a large one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_solve, lapack, solve_triangular
+
+from simgap.robots.whiten import Block, Source
+
+dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
+dpotri: Any = lapack.dpotri  # type: ignore[attr-defined]  # inverse from a Cholesky factor
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Rows that no other part's share a source with but such as tie none: their `variance` (m,), `start`
+    (m, S), `residual` (m,), and sources by number."""
+
+    variance: np.ndarray
+    start: np.ndarray
+    residual: np.ndarray
+    sources: tuple[tuple[int, Source], ...]
+
+
+@dataclass(frozen=True)
+class Tied:
+    """A block's parts; `trace` (K,) of every source's covariance at s = 1."""
+
+    parts: tuple[_Part, ...]
+    size: int
+    trace: np.ndarray
+
+    @classmethod
+    def of(cls, block: Block, residual: np.ndarray, names: Sequence[str]) -> Tied:
+        """Of a block with a residual (n,); sources are numbered as in `names`."""
+        label = _labels(block)
+        parts = []
+        for number in np.unique(label):
+            mine = np.flatnonzero(label == number)
+            place = np.full(label.size, -1)
+            place[mine] = np.arange(mine.size)
+            own = []
+            for k, name in enumerate(names):
+                if name in block.sources:
+                    source = block.sources[name]
+                    here = place[source.rows] >= 0
+                    if here.any():
+                        covariance = source.covariance[here]
+                        covariance = covariance if covariance.ndim == 1 else covariance[:, here]
+                        own.append((k, Source(place[source.rows[here]], covariance)))
+            parts.append(_Part(block.variance[mine], block.start[mine], residual[mine], tuple(own)))
+        trace = np.array([block.sources[n].trace if n in block.sources else 0.0 for n in names])
+        return cls(tuple(parts), label.size, trace)
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the residual."""
+        return sum(float(p.residual @ p.residual) for p in self.parts)
+
+    def solved(self, variance: np.ndarray) -> Solved:
+        """With sources of these variances (K,); LinAlgError where noise is lost in rounding."""
+        states = self.parts[0].start.shape[1]
+        inner, pull = np.eye(states), np.zeros(states)
+        square = half = 0.0
+        factors, whites, moved = [], [], []
+        for part in self.parts:
+            whole = np.diag(part.variance)
+            for k, source in part.sources:
+                if variance[k] > 0:
+                    source.add(whole, variance[k])
+            factor = _factor(whole)
+            both = solve_triangular(
+                factor, np.column_stack([part.residual, part.start]), lower=True, check_finite=False
+            )
+            white, start = both[:, 0], both[:, 1:]
+            inner += start.T @ start
+            pull += start.T @ white
+            square += float(white @ white)
+            half += float(np.log(np.diag(factor)).sum())
+            factors.append(factor)
+            whites.append(white)
+            moved.append(start)
+        if not states:
+            return Solved(self, factors, whites, moved, inner, pull, square, half)
+        factor = _factor(inner)
+        gone = solve_triangular(factor, pull, lower=True, check_finite=False)
+        back = cho_solve((factor, True), np.column_stack([pull, np.eye(states)]), check_finite=False)
+        square -= float(gone @ gone)
+        half += float(np.log(np.diag(factor)).sum())
+        return Solved(self, factors, whites, moved, back[:, 1:], back[:, 0], square, half)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A block's `square` r' C^-1 r and `half` its log determinant; of its parts the factors, and residual and
+    start whitened by them; `inverse` (S, S) of M, and it times Z'z (S,)."""
+
+    tied: Tied
+    factors: list[np.ndarray]
+    whites: list[np.ndarray]
+    moved: list[np.ndarray]
+    inverse: np.ndarray
+    back: np.ndarray
+    square: float
+    half: float
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """By every source's variance (K,): trace of C^-1 Q, and r' C^-1 Q C^-1 r."""
+        trace, pull = np.zeros(self.tied.trace.size), np.zeros(self.tied.trace.size)
+        for part, factor, white, start in zip(
+            self.tied.parts, self.factors, self.whites, self.moved, strict=True
+        ):
+            both = solve_triangular(
+                factor, np.column_stack([white - start @ self.back, start]),
+                lower=True, trans=1, check_finite=False,
+            )  # fmt: skip
+            alpha, columns = both[:, 0], both[:, 1:]
+            inverse = np.tril(dpotri(factor, lower=1)[0])
+            inverse += np.tril(inverse, -1).T
+            inverse -= columns @ self.inverse @ columns.T
+            for k, source in part.sources:
+                at, own = source.rows, source.covariance
+                if own.ndim == 1:
+                    trace[k] += float(np.diag(inverse)[at] @ own)
+                    pull[k] += float(alpha[at] ** 2 @ own)
+                else:
+                    trace[k] += float(np.sum(inverse[np.ix_(at, at)] * own))
+                    pull[k] += float(alpha[at] @ own @ alpha[at])
+        return trace, pull
+
+
+def _labels(block: Block) -> np.ndarray:
+    """The part (n,) of each row: what shares a source is one part."""
+    label = np.arange(block.rows.size)
+    for source in block.sources.values():
+        if source.covariance.ndim == 2 and source.rows.size:
+            label[np.isin(label, np.unique(label[source.rows]))] = label[source.rows].min()
+    return label
+
+
+def _factor(matrix: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor; LinAlgError where there is none."""
+    factor, fault = dpotrf(matrix, lower=1, clean=1)
+    if fault:
+        raise np.linalg.LinAlgError("not positive definite")
+    return factor
