@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from hmmseg.hand.carried import ACTIVE, contradiction, grip_force_of, held_by
 from hmmseg.hand.force_units import tool_warnings
@@ -154,6 +153,8 @@ def _inertia(t: np.ndarray, pose: Pose, tool: Tool, turns: bool, gravity: float)
     square). What free motion leaves unexplained is the tool's own too, and a tilt that is not recorded turns
     its weight sideways.
     """
+    from scipy.ndimage import uniform_filter1d  # slow to import
+
     axes = np.stack([pose.across, pose.up], axis=1)
     once, wider = (smooth(t, pose.position, 2, times * pose.window) @ axes for times in (1, 2))
     mean = uniform_filter1d((wider - once) ** 2, _around(t, pose), axis=0)
@@ -169,6 +170,8 @@ def _timing(t: np.ndarray, pose: Pose, wrong: np.ndarray, load: np.ndarray, nois
 
     A load that changes by so much per second is off by that much of its time.
     """
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
     pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(load), t)), _around(t, pose))
     return np.minimum(wrong / np.maximum(pace, noise / float(np.median(np.diff(t)))), pose.window / 2)
 

@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from itertools import repeat
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
-from scipy.signal import lfilter
 
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.emissions import TAIL, Parameters
 from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.lagging import lagging
 from hmmseg.segmentation.stretches import SIGNIFICANT
 from hmmseg.segmentation.toe import DEPENDENT
 
@@ -116,8 +115,9 @@ def _log_shifted(s: Squeeze, compliances: np.ndarray, loads: np.ndarray) -> np.n
 
 def _log_filtered(s: Squeeze, compliances: np.ndarray, loads: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_constants) of one squeeze."""
-    smooth = [_at(_smoothed(loads, constant), s.t - s.t[0]) for constant in CONSTANTS]
-    load, pace = np.stack(smooth, axis=-1)
+    with np.errstate(divide="ignore"):
+        kept = np.exp(-STEP / CONSTANTS)
+    load, pace = lagging(loads, kept, *_steps(s.t - s.t[0], loads.shape[-1]))
     return _log_likelihood(s, compliances, load, pace)
 
 
@@ -127,23 +127,32 @@ def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     holds = there >= HOLD * np.quantile(there, FIRMEST)
     width = np.median(s.distance[holds] + compliances[:, None] * there[holds], axis=1, keepdims=True)
     clock = np.minimum(np.arange(s.t[0], s.t[-1] + STEP, STEP), s.t[-1])
-    distance = CubicHermiteSpline(s.t, s.distance, s.rate)(clock)
+    distance = _joined(s, clock)
     load = np.maximum(width - distance, 0.0) / compliances[:, None]
     return np.stack([load, np.abs(np.gradient(load, STEP, axis=1))])
 
 
+def _joined(s: Squeeze, clock: np.ndarray) -> np.ndarray:
+    """Distances [m] at times [s] of cubic Hermite pieces through the samples with their rates."""
+    before = np.clip(np.searchsorted(s.t, clock, side="right") - 1, 0, s.t.size - 2)
+    width = np.diff(s.t)[before]
+    u = (clock - s.t[before]) / width
+    left, right = s.distance[before], s.distance[before + 1]
+    start, end = width * s.rate[before], width * s.rate[before + 1]
+    bend = start + end - 2 * (right - left)
+    return left + u * (start + u * (3 * (right - left) - 2 * start - end + u * bend))
+
+
+def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """The STEP before each time [s] since the first, and how far it is on the way to the next."""
+    place = np.minimum((clock / STEP).astype(int), num_steps - 2)
+    return place, clock / STEP - place
+
+
 def _at(values: np.ndarray, clock: np.ndarray) -> np.ndarray:
     """Values (..., num_steps) at times [s] since the first of them, linear between two."""
-    whole = np.minimum((clock / STEP).astype(int), values.shape[-1] - 2)
-    share = clock / STEP - whole
-    return (1 - share) * values[..., whole] + share * values[..., whole + 1]
-
-
-def _smoothed(values: np.ndarray, constant: float) -> np.ndarray:
-    if constant == 0:
-        return values
-    kept = float(np.exp(-STEP / constant))
-    return lfilter([1 - kept], [1, -kept], values, zi=kept * values[..., :1])[0]
+    place, share = _steps(clock, values.shape[-1])
+    return (1 - share) * values[..., place] + share * values[..., place + 1]
 
 
 def _log_likelihood(s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray) -> np.ndarray:

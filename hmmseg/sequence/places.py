@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import convolve1d, shift
 
 from hmmseg.segmentation.spans import Place, Question, Segmentation
 from hmmseg.sequence.model import NamedCourse
@@ -37,6 +36,8 @@ def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], la
     `lag` (num_boundaries,) [cells]. The gain is the mutual information of naming and label: what the
     entropy of the mixture exceeds that of its parts by.
     """
+    from scipy.ndimage import convolve1d, shift  # slow to import
+
     mixture, gain = [], []
     for b, scale in enumerate(lag):
         parts, weights = [], []

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from hmmseg.hmm.kernels.blocks import FIRST, PAD, any_missing, doubles, load, row_width
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.compile import compiled, part
 from hmmseg.hmm.kernels.simd import ahead, at, doubles_at, singles_at, value_at
 from hmmseg.hmm.kernels.steps import viterbi_step
 
 LENGTH = 512  # numerics: samples of a block
 
 
-@compiled
+@part
 def decide(delta, rows, count, num_states, stay, advance, stay_step, advance_step, entered, begin):
     """Best log weights over `count` samples; which states are entered goes to entered[begin:]."""
     vectors = (num_states + 6) // 8

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.compile import compiled, part
 from hmmseg.hmm.kernels.simd import ahead, at, bits_of, double_of, doubles_at, singles_at, value_at
 from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, exponentials, forward_step, highest, renormalise
 
@@ -19,7 +19,7 @@ RENORMALISE = 16  # numerics: samples; mantissas change by less than 2^4 a sampl
 CELLS = 1 << 12  # numerics: of a block
 
 
-@compiled
+@part
 def block_length(num_states):
     """Samples of a block."""
     return max(128, min(1024, CELLS // num_states))
@@ -31,7 +31,7 @@ def row_width(num_states):
     return PAD + 8 * ((num_states + 6) // 8)
 
 
-@compiled
+@part
 def number(address, single, index):
     """Number of a table in single or double precision."""
     if single:
@@ -39,7 +39,7 @@ def number(address, single, index):
     return value_at(ahead(doubles_at(address), index))
 
 
-@compiled
+@part
 def load(address, single, num_states, start, stop, out):
     """Rows [start, stop) of a table into `out` from PAD on; rows of NaN alone become zeros, no evidence.
 
@@ -69,7 +69,7 @@ def load(address, single, num_states, start, stop, out):
     return -1
 
 
-@compiled
+@part
 def load_part(address, single, num_states, start, stop, first, width, out):
     """`load` of `width` states from `first` on, of rows that are known to be sound."""
     if width == num_states:
@@ -82,7 +82,7 @@ def load_part(address, single, num_states, start, stop, first, width, out):
             out[PAD + r * width + k] = 0.0 if value != value else value
 
 
-@compiled
+@part
 def most_gained(ll, single, num_states, start, stop):
     """Log weight of the emissions of samples [start, stop) along the best of all states at each."""
     gained = 0.0
@@ -111,7 +111,7 @@ def most_gained(ll, single, num_states, start, stop):
     return gained
 
 
-@compiled
+@part
 def any_missing(rows, count):
     """Whether there is a NaN among `count` numbers."""
     missing = 0
@@ -121,13 +121,13 @@ def any_missing(rows, count):
     return missing > 0
 
 
-@compiled
+@part
 def begin_of_line(numbers):
     """First of these numbers that begins a line of the cache: vectors across two lines are slow."""
     return (-(numbers.ctypes.data >> 3)) & 7
 
 
-@compiled
+@part
 def doubles(size, value):
     """So many doubles of one value, on lines of the cache (np.full takes seconds to compile)."""
     room = np.empty(size + 7)
@@ -138,7 +138,7 @@ def doubles(size, value):
     return out
 
 
-@compiled
+@part
 def integers(size, value):
     """So many integers of one value, on lines of the cache."""
     room = np.empty(size + 7, np.int64)
@@ -149,27 +149,27 @@ def integers(size, value):
     return out
 
 
-@compiled
+@part
 def row_table(count, width):
     """Rows of weights, not yet known."""
     return doubles(count * width, 1.0).reshape(count, width), integers(count * width, 0).reshape(count, width)
 
 
-@compiled
+@part
 def copy_row(from_m, from_e, i, to_m, to_e, j):
     """Row i of one table of weights into row j of another."""
     for k in range(from_m.shape[1]):
         to_m[j, k], to_e[j, k] = from_m[i, k], from_e[i, k]
 
 
-@compiled
+@part
 def to_weights(logs, size, mantissa, exponent):
     """exp of `size` numbers from PAD on."""
     for i in range(PAD, PAD + size, 8):
         exponentials(at(logs, i), at(mantissa, i), at(exponent, i))
 
 
-@compiled
+@part
 def emissions(address, single, num_rows, num_states, start, stop, x, mantissa, exponent):
     """Rows [start, stop) of log-likelihoods as weights, x for a copy where one is needed; as `load`.
 
@@ -194,7 +194,7 @@ def emissions(address, single, num_rows, num_states, start, stop, x, mantissa, e
     return bad
 
 
-@compiled
+@part
 def weights_of(address, size):
     """Weights of a small array of doubles, with room at both ends."""
     x, mantissa = doubles(size + 2 * PAD, 0.0), doubles(size + 2 * PAD, 1.0)
@@ -204,21 +204,21 @@ def weights_of(address, size):
     return mantissa, exponent
 
 
-@compiled
+@part
 def empty_row(num_states):
     """A row of weights that are all zero."""
     width = row_width(num_states)
     return doubles(width, 1.0), integers(width, ZERO_EXPONENT)
 
 
-@compiled
+@part
 def renormalise_row(m, e, width):
     """Mantissas of a row back to [1, 2)."""
     for i in range(0, width, 8):
         renormalise(at(m, i), at(e, i))
 
 
-@compiled
+@part
 def add(m1, e1, m2, e2):
     """Sum of two weights."""
     if e1 < e2:
@@ -230,7 +230,7 @@ def add(m1, e1, m2, e2):
     return m1 * double_of((1023 - shift) << 52), e1 + shift
 
 
-@compiled
+@part
 def first_row(am, ae, initial_m, initial_e, pm, pe, num_states):
     """Row 0 of forward weights: those at the first sample, whose emissions stand from PAD on."""
     for k in range(am.shape[1]):
@@ -240,7 +240,7 @@ def first_row(am, ae, initial_m, initial_e, pm, pe, num_states):
         ae[0, FIRST + k] = initial_e[PAD + k] + pe[PAD + k]
 
 
-@compiled
+@part
 def forward_block(am, ae, pm, pe, sm, se, vm, ve, stay_step, advance_step, first, count, num_states):
     """Rows 1 to `count` of forward weights from row 0; emissions of row r + 1 stand in p's row r.
 

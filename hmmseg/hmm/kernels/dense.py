@@ -33,8 +33,13 @@ def dense_evidence(x, initial, first, source, weight):
             else:
                 new[k] = -np.inf
         alpha, new = new, alpha
-    top = alpha.max()
-    return top + math.log(np.exp(alpha - top).sum()) if math.isfinite(top) else top
+    top = -np.inf  # written out: the same by NumPy's functions takes a third of a second to compile
+    for k in range(num_states):
+        top = max(top, alpha[k])
+    total = 0.0
+    for k in range(num_states):
+        total += math.exp(alpha[k] - top)
+    return top + math.log(total) if math.isfinite(top) else top
 
 
 @compiled
@@ -54,7 +59,10 @@ def dense_path(x, initial, first, source, weight, path):
                     best, at = value, source[i]
             new[k], came[t, k] = best + x[t, k], at
         delta, new = new, delta
-    k = delta.argmax()
+    k = 0
+    for i in range(1, num_states):
+        if delta[i] > delta[k]:
+            k = i
     best = delta[k]
     for t in range(num_rows - 1, -1, -1):
         path[t] = k

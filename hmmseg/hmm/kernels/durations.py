@@ -15,12 +15,12 @@ import math
 
 import numpy as np
 
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.compile import compiled, part
 
 NOTHING = -45.0  # numerics: nats below the largest summand; together they are below rounding
 
 
-@compiled
+@part
 def summed(values, count):
     """Log of the summed exponentials of the first `count` values."""
     top = -np.inf
@@ -35,7 +35,7 @@ def summed(values, count):
     return top + math.log(total)
 
 
-@compiled
+@part
 def ways_in(x, pmf, longest, enter, t, k, values):
     """Log weights of a state k that ends right before t, by its duration, into `values`; how many."""
     emitted, count = 0.0, min(longest[k], t)
@@ -47,7 +47,7 @@ def ways_in(x, pmf, longest, enter, t, k, values):
     return count
 
 
-@compiled
+@part
 def ways_on(x, pmf, survival, longest, leave, t, k, final, values):
     """Log weights of a state k that begins at t, by its duration, from what follows it; how many."""
     num_rows, emitted = x.shape[0], 0.0
@@ -138,7 +138,7 @@ def draw_durations(x, pmf, survival, longest, jumps, final, enter, leave, rng, s
         starts[i, :k] = 0
 
 
-@compiled
+@part
 def _drawn(values, count, rng):
     """Index drawn by log weights."""
     total = summed(values, count)

@@ -28,14 +28,14 @@ from hmmseg.hmm.kernels.blocks import (
     to_weights,
     weights_of,
 )  # fmt: skip
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.compile import compiled, part
 from hmmseg.hmm.kernels.simd import bits_of, double_of
 from hmmseg.hmm.kernels.steps import IMPOSSIBLE_EXPONENT, ZERO_EXPONENT
 
 LN2 = math.log(2)  # physics: a logarithm
 
 
-@compiled
+@part
 def log_of(m, e):
     """Logarithm of a weight; -inf for zero."""
     shift = (bits_of(m) >> 52) - 1023
@@ -44,7 +44,7 @@ def log_of(m, e):
     return math.log(m * double_of((1023 - shift) << 52)) + (e + shift) * LN2
 
 
-@compiled
+@part
 def total(am, ae, r, final_m, final_e, num_states):
     """Sum over the states of row r of the weights times `final`."""
     sum_m, sum_e = 1.0, ZERO_EXPONENT
@@ -54,7 +54,7 @@ def total(am, ae, r, final_m, final_e, num_states):
     return add(sum_m, sum_e, sum_m, sum_e - 2000)  # the second is nothing: mantissa to [1, 2)
 
 
-@compiled
+@part
 def read_block(ll, single, num_rows, num_states, stay, advance, varying, start, stop, x, pm, pe, sm, se,
                vm, ve):  # fmt: skip
     """Emissions of samples [start, stop) as weights, and the transitions into them where they vary."""
@@ -67,7 +67,7 @@ def read_block(ll, single, num_rows, num_states, stay, advance, varying, start, 
     return bad
 
 
-@compiled
+@part
 def put_filtered(am, ae, first, last, num_states, logs, out, start):
     """Rows `first` to `last` of forward weights, each normalised, into out[start:]."""
     for r in range(first, last + 1):
@@ -85,7 +85,7 @@ def put_filtered(am, ae, first, last, num_states, logs, out, start):
                 out[start + r - first, k] = 0.0 if apart < -1000 else share * double_of((apart + 1023) << 52)
 
 
-@compiled
+@part
 def forward_pass(ll, single, num_rows, num_states, stay, advance, varying, initial, final, filtered, logs,
                  gains):  # fmt: skip
     """Forward weights, kept at the start of each block; fills `filtered` if it has rows.

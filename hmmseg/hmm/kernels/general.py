@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.compile import compiled, part
 
 
-@compiled
+@part
 def log_add(a, b):
     """Log of a sum of two exponentials."""
     if a < b:

@@ -29,7 +29,7 @@ from hmmseg.hmm.kernels.blocks import (
     to_weights,
     weights_of,
 )  # fmt: skip
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.hmm.kernels.compile import compiled, part
 from hmmseg.hmm.kernels.forward import forward_pass, log_of, total
 from hmmseg.hmm.kernels.simd import at, bits_of, double_of
 from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, probable_step, turn
@@ -38,19 +38,19 @@ NOTHING = -1010  # numerics: exponent of a probability that counts as zero; one 
 _LOG2E = 1.4426950408889634  # physics: a logarithm
 
 
-@compiled
+@part
 def magnitude(m, e):
     """Exponent of a weight whose mantissa is any: the weight is at least 2^e, and less than twice that."""
     return e + (bits_of(m) >> 52) - 1023
 
 
-@compiled
+@part
 def plain(m, e):
     """A probability as an ordinary number, zero below 1e-300."""
     return m * double_of((e + 1023) << 52) if e > -1000 else 0.0
 
 
-@compiled
+@part
 def log2_of_moves(sm, se, vm, ve, num_states):
     """The most that a step's transitions multiply a weight by, as a power of two."""
     most = -np.inf
@@ -65,7 +65,7 @@ def log2_of_moves(sm, se, vm, ve, num_states):
     return most * _LOG2E
 
 
-@compiled
+@part
 def lowest_state(kept_m, kept_e, b, hi, gain):
     """The lowest of the states up to `hi` whose forward weight times 2^gain is not nothing."""
     for k in range(hi):
@@ -143,7 +143,7 @@ def probabilities(ll, single, num_rows, num_states, stay, advance, varying, init
     return log_evidence, -1
 
 
-@compiled
+@part
 def spread(rows, count, width, out, lo, begin):
     """A block's probabilities (count, width), from PAD on, into the rows lo, lo + 1, ... of `out`."""
     flat, length = out.reshape(out.size), out.shape[1]
@@ -156,7 +156,7 @@ def spread(rows, count, width, out, lo, begin):
             out[lo + k, begin + r] = rows[PAD + r * width + k]
 
 
-@compiled
+@part
 def backward_block(am, ae, bm, be, pm, pe, sm, se, vm, ve, stay_step, advance_step, first, count,
                    num_states, state, crossed):  # fmt: skip
     """Probabilities of the samples first - 1 to first + count - 2 from the weights of the rest in b.
