@@ -20,11 +20,8 @@ TURNED = ("x1", "y1", "x2", "y2", "fx1", "fy1", "fx2", "fy2")
 def without_roll(aligned: AlignedTrials) -> AlignedTrials:
     """The same with what each carry shows of a roll taken out of trials and signals.
 
-    Trials whose roll was recorded are level as they were read. Fingers with joints of their own do not
-    turn together, whatever a block between them does.
+    Trials whose roll was recorded are level as they were read.
     """
-    if aligned.rig.jointed:
-        return aligned
     return replace(aligned, trials=tuple(_levelled(trial, aligned) for trial in aligned.trials))
 
 

@@ -46,6 +46,7 @@ class Signals:
     timing: np.ndarray | None = None  # sd of when a force changed that changes there [s]
     free: np.ndarray | None = None  # share of a sample in which nothing is held for sure
     roll: np.ndarray | None = None  # of the hand [rad], where recorded; the rest is as if it had none
+    coupled: bool = False  # both fingers are one gripper's: what they differ by in height is a roll
 
     @property
     def x(self) -> np.ndarray:
@@ -132,7 +133,7 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
     force = np.nan if noise.force is None else noise.force
     return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,  # type: ignore[arg-type]
                    touches=trial.touches, timing=trial.timing, free=trial.free,
-                   roll=channels.get(ROLL))  # fmt: skip
+                   roll=channels.get(ROLL), coupled=not rig.jointed)  # fmt: skip
 
 
 def _square(sd: float | None) -> float:

@@ -20,8 +20,11 @@ def tilts(
     """Of each carry its samples (num_timesteps,) and, on them, the block's tilt [rad], and its error [rad].
 
     Against how it stood when it was gripped: as the recorded roll of the hand says, else as the pads'
-    places on the block show. `ends` (num_subtasks, 2) [s]: first and last time of every subtask.
+    places on the block show, of fingers that are one gripper's. `ends` (num_subtasks, 2) [s]: first and last
+    time of every subtask.
     """
+    if s.roll is None and not s.coupled:  # a block slips along one finger and stays upright
+        return
     offset = block_offset(s.offset, s.fy1, s.fy2, pads)
     for before, step in pairwise(steps):
         start, end = ends[step.index]

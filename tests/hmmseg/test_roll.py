@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,14 +12,18 @@ from rolling_scene import rolling_trial
 import estimation.identification
 import hmmseg.segmentation.posteriors
 from estimation import identify
+from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.scoring import boundaries_covered, boundary_residuals
 from experiments.sweeps.trials import scene
-from hmmseg.contact.equations import corner_drop, rolled_offset, turned
+from hmmseg.contact.decompose import subtasks
+from hmmseg.contact.equations import corner_drop, pads_of, rolled_offset, turned
 from hmmseg.errors import InputError
 from hmmseg.hand.roll import levelled, slow_roll
+from hmmseg.hand.signals import task_space
 from hmmseg.io.trial import CARTESIAN_CHANNELS, ROLL, read_trial
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
+from hmmseg.segmentation.tilt import tilts
 from simgap.world.properties import random_properties
 
 NUMBERS = range(76100, 76106)
@@ -121,3 +126,12 @@ def test_a_watcher_takes_the_roll_out_row_by_row():
         level.update(t, [flat.channels[n][k] for n in CARTESIAN_CHANNELS])
     for (_, a), (_, b) in zip(rolled.filter.rows, level.filter.rows, strict=True):
         np.testing.assert_allclose(a[[0, 1, 4, 5, 6, 7, 10, 11]], b[[0, 1, 4, 5, 6, 7, 10, 11]], atol=1e-12)
+
+
+def test_fingers_with_joints_of_their_own_do_not_roll():
+    """Their heights differ by a block that slips along one of them; landings had come 6 ms early."""
+    (judged,) = trials_of(WORLDS["slipping"], [77001])
+    steps, s = subtasks(scene()[1]), task_space(judged.trial, judged.rig)
+    edges = [float(s.t[0]), *judged.boundaries, float(s.t[-1])]
+    assert not list(tilts(s, pads_of(judged.rig), list(pairwise(edges)), steps))
+    assert list(tilts(replace(s, coupled=True), pads_of(judged.rig), list(pairwise(edges)), steps))
