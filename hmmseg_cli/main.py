@@ -6,6 +6,7 @@ Any other exception is a bug and shows its traceback.
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -30,6 +31,9 @@ from hmmseg_cli import (
     watch,
 )
 from hmmseg_cli.interrupts import heard
+
+# numerics: objects between two garbage collections: most are modules' and compilers', which stay anyway
+COLLECTED = 10_000
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -73,6 +77,7 @@ def _hmmseg(
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code (0 or 2; 130 when interrupted)."""
+    gc.set_threshold(COLLECTED, *gc.get_threshold()[1:])
     configure()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
     args = diagnose.spread_against(args)

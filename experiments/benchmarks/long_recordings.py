@@ -1,8 +1,9 @@
 """Segmenting ever longer recordings of a repeated task from disk: time and peak memory against their length.
 
-    python -m experiments.benchmarks.long_recordings CASE
+    python -m experiments.benchmarks.long_recordings LAB
 
-CASE holds rig.toml, task.toml and trial_01.csv, which is performed again and again. Each length and kind of
+LAB holds rig.toml and task.toml; its virtual model performs the task once at 1 kHz, and this round is
+recorded again and again. Each length and kind of
 file is written piece by piece and segmented by a process of its own, whose peak memory includes Python and
 all libraries; up to a length that memory allows, the same in one piece, with the answers compared. Writes
 experiments/results/benchmark_long.json.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -34,10 +36,23 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import segment, segment_long
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_long.json"
+RATE = 1000.0  # Hz
+SEED = 2_300_000  # of a round that nothing else uses
 ROUNDS = (1, 10, 100, 360, 1000)  # an hour of 10 s rounds among them
 SAME = 1e-9  # numerics: s; what the order of sums may change from process to process
 KINDS = (".parquet", ".npz")
 IN_MEMORY = 100  # numerics: rounds up to which the same is done in one piece
+
+
+def simulated(lab: Path, case: Path) -> None:
+    """The lab's task performed once at RATE into a folder: rig.toml, task.toml and trial_01.csv."""
+    faster, found = re.subn(r"(?m)^rate *=.*", f"rate = {RATE}", (lab / "rig.toml").read_text())
+    assert found == 1, "rig.toml states one rate"
+    rig = case.parent / "rig_faster.toml"
+    rig.write_text(faster)
+    given = ["--task", str(lab / "task.toml"), "--rig", str(rig), "--seed", str(SEED), "--output", str(case)]
+    # In a process of its own: those that are measured inherit the peak memory of this one.
+    subprocess.run([sys.executable, "-m", "hmmseg_cli.main", "simulate", *given, "--quiet"], check=True)
 
 
 def performed(case: Path) -> tuple[BlockTask, Rig]:
@@ -95,25 +110,27 @@ def measure(case: Path, path: Path, in_memory: bool) -> dict:
 def main() -> None:
     """Measure every length, print, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("case", type=Path)
+    parser.add_argument("lab", type=Path, help="with --file: the folder of the round")
     parser.add_argument("--file", type=Path, help="measure this recording alone, as JSON")
     parser.add_argument("--in-memory", action="store_true")
     parser.add_argument("--rounds", type=int, nargs="+", default=ROUNDS)
     parser.add_argument("--kinds", nargs="+", default=KINDS, help="of files; what is not measured stays")
     args = parser.parse_args()
     if args.file is not None:
-        print(json.dumps(measure(args.case, args.file, args.in_memory)))
+        print(json.dumps(measure(args.lab, args.file, args.in_memory)))
         return
     rows = []
-    _, rig = performed(args.case)
     with tempfile.TemporaryDirectory() as folder:
+        case = Path(folder) / "round"
+        simulated(args.lab, case)
+        _, rig = performed(case)
         for rounds in args.rounds:
             for kind in args.kinds:
                 path = Path(folder) / f"long{kind}"
-                write(args.case, rig, rounds, path)
-                row = _row(args.case, path, rounds, False)
+                write(case, rig, rounds, path)
+                row = _row(case, path, rounds, False)
                 if rounds <= IN_MEMORY and kind == ".parquet":
-                    whole = _row(args.case, path, rounds, True)
+                    whole = _row(case, path, rounds, True)
                     row["same_answer"] = bool(
                         np.allclose(whole.pop("answer"), row["answer"], rtol=0, atol=SAME)
                     )

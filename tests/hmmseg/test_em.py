@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.hmm.em import em
+from hmmseg.segmentation.fit import MeanShares
 
 STAY = 0.8
 
@@ -90,6 +91,17 @@ def test_evidence_never_decreases():
                 for n in range(1, 12)]  # fmt: skip
     assert np.diff(evidence).min() > -1e-9
     assert evidence[-1] > evidence[0] + 0.1
+
+
+def test_what_the_order_forbids_stays_exactly_zero_while_durations_are_learned():
+    trials = recorded()
+    shares = MeanShares(tuple(x.size for x in trials), np.array([0.9, 0.1]))
+    fit = em(Levels(trials, 0.7), shares, len(trials))
+    assert abs(fit.durations.shares[0] - 0.9) > 0.1  # learned they were
+    for found in fit.alignments:
+        assert (found.smoothed[0, 1], found.smoothed[-1, 0]) == (0.0, 0.0)
+        assert set(np.diff(found.path)) <= {0, 1}
+        assert len(found.moves) == 1  # and none past a state
 
 
 def test_a_trial_too_short_says_which_state_starves():
