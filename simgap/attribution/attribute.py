@@ -20,6 +20,7 @@ from simgap.attribution.search import sought, weights
 from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import ALARM, LEAST, Explanation, acting, conclude, known
 
+DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
 JUDGED = 6  # numerics: sets of which it is asked whether they are the cause
 
 
@@ -60,6 +61,9 @@ def attribute(
     small = None
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
         small = _small(f, models, parts, by_group, absorbed)
+    if small is not None and gap.usual:  # a cause that is surely found can be mended
+        chance = conclude(sets, found.p_value).probabilities
+        small = small if chance["none"] + chance["unknown"] > DOUBT else None
     first = next(iter(judged), ())
     verdict = conclude(sets, found.p_value, small is None, _names(f, first) if forced else ())
     causes = next((j.causes for j in judged.values() if _names(f, j.causes) == verdict.causes), ())

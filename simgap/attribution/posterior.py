@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import expit, gammaln
 
 from simgap.attribution.background import Background
 from simgap.attribution.carried import of_noise, products
@@ -20,7 +20,6 @@ from simgap.bounded import least
 
 STEPS = 30  # numerics: of an iteration, at most
 CLOSE = 0.02  # numerics: nats
-FREED = 0.9  # prior: chance of a group to be off where an effect that acts gives it a variance of its own
 
 
 @dataclass(frozen=True)
@@ -70,23 +69,32 @@ class Forms:
 
     @cached_property
     def freed(self) -> np.ndarray:
-        """Which groups (J, G) each candidate gives a variance of their own."""
-        out = np.zeros((len(self.gap.candidates), self.count.size), bool)
+        """By how much (J, G) the variance of each group may be larger where a candidate acts."""
+        out = np.zeros((len(self.gap.candidates), self.count.size))
         for j, c in enumerate(self.gap.candidates):
             if c.frees is not None:
-                out[j] = np.bincount(self.spectrum.group, c.frees, self.count.size) > 0.5 * self.count
+                out[j] = np.bincount(self.spectrum.group, c.frees, self.count.size) / self.count
         return out
 
     def marginal(
         self, effects: tuple[int, ...], energy: np.ndarray, background: Background | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (G,) of groups with these squares under a set of effects, and expected precisions."""
-        shift = self.shift(effects)
-        density, precision = (background or self.background).marginal(energy, self.count, shift, self.most)
-        freed = self.freed[list(effects)].any(0)
+        """Log density (G,) of groups with these squares under a set of effects, and expected precisions.
+
+        An effect frees all of its groups or none, one as likely beforehand as the other.
+        """
+        shift, background = self.shift(effects), background or self.background
+        density, precision = background.marginal(energy, self.count, shift, self.most)
+        more = self.freed[list(effects)].sum(0)
+        freed = more > 0
         if freed.any():
-            own = Background.usual(off=FREED).marginal(energy, self.count, shift, self.most)
-            density, precision = np.where(freed, own[0], density), np.where(freed, own[1], precision)
+            most = 1 + more if self.most is None else self.most + more
+            own = background.marginal(energy, self.count, shift, most)
+            bound, loose = float(density[freed].sum()), float(own[0][freed].sum())
+            share = float(expit(loose - bound))
+            precision = np.where(freed, share * own[1] + (1 - share) * precision, precision)
+            both = np.logaddexp(bound, loose) - np.log(2.0)
+            density = np.where(freed, both / freed.sum(), density)
         return density, precision
 
     @cached_property
@@ -253,5 +261,5 @@ def squares_left(
         matrix, pull = taken.weighed(weight)
         x, _ = least(matrix + np.diag(prior), pull, taken.low, taken.high)
     squares = weight * taken.energy(x)
-    freed = f.freed[list(effects)].any(0)
-    return np.append(np.where(freed, np.minimum(squares, f.count), squares), x[:z] @ x[:z])
+    more = f.count * f.freed[list(effects)].sum(0)  # of the squares, so much is what they free
+    return np.append(np.maximum(squares - more, np.minimum(squares, f.count)), x[:z] @ x[:z])

@@ -63,8 +63,8 @@ class Candidate:
     which share the effect's own form is usually off from one part of a recording to another. `hidden`:
     parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
     a parameter is a share of; its deviation from neutral where that is not given, or not finite.
-    `frees` (n,): mask of the cosine coefficients of cells that have a variance of their own where it acts,
-    whatever that is.
+    `frees` (n,): by how much, at most, the variance of cosine coefficients of cells may be larger
+    where it acts, in units of the noise's.
     """
 
     name: str
@@ -100,7 +100,7 @@ class Gap:
     `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
     trials tell nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
     from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
-    of its noise.
+    of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same.
     """
 
     rows: Rows
@@ -111,13 +111,14 @@ class Gap:
     own: tuple[int, ...] = ()
     carried: Float[np.ndarray, "d n m"] | None = None
     tolerance: Float[np.ndarray, " n"] | None = None
+    usual: bool = False
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
         return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
                    tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
                    None if self.carried is None else self.carried[:, rows],
-                   None if self.tolerance is None else self.tolerance[rows])  # fmt: skip
+                   None if self.tolerance is None else self.tolerance[rows], self.usual)  # fmt: skip
 
     @property
     def raw_columns(self) -> Float[np.ndarray, "n m"]:

@@ -149,7 +149,8 @@ class Effect:
     usual one first; all are free where none is listed. `admitted(rig)`: key of a form, and standard
     deviations by parameter, as rig.toml has them under [systematic]. `wrist`: its first form shows in a
     sensor in the wrist. `played`: values at which it is felt in a played world where none are given,
-    by default from its priors; empty for one that cannot be felt.
+    by default from its priors; empty for one that cannot be felt. `turns`: the parameter
+    [rad] by up to which blocks turn in the grip on the ground where it acts, as they please.
 
     `called`: the effect in plain words, `told(means, rig)` where its parameters decide them, and what to
     `check` on the rig. `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]:
@@ -185,6 +186,7 @@ class Effect:
     restored: Callable[[dict[str, np.ndarray], dict[str, float]], dict[str, np.ndarray]] | None = None
     patched: Callable[[Any, Mapping[str, Any]], dict[str, str] | None] | None = None
     wrong: Callable[[Any, np.ndarray], list[Any]] | None = None
+    turns: str = ""
 
     def neutral(self) -> dict[str, float]:
         """Values at which nothing is changed (where that exists)."""

@@ -44,7 +44,7 @@ def _scatter(given, residual: np.ndarray):
         return None
     found = on_grid("hand_roll", square, unit, ROLLS, rows.cell)
     # How much of it there is in which carry and how fast nobody knows: what lies there has its own variance.
-    return replace(found, variance=np.zeros_like(unit), known=0.0, frees=lever > 0)
+    return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 
 
 def _apply(performance: Performance, values, rng) -> Performance:

@@ -1,4 +1,7 @@
-"""A support inclined from the horizontal."""
+"""A support inclined from the horizontal.
+
+A block of which one foot touches first turns in the grip until the other one does, and pads slide on it.
+"""
 
 from __future__ import annotations
 
@@ -17,5 +20,6 @@ EFFECT = Effect(
     correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),
     scene=lambda v: {"tilt": v["angle"]},
     wrist=True,
+    turns="angle",
     played={"angle": 0.06},
 )

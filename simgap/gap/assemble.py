@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hmmseg.io.rig import Tolerance
 from simgap.attribution.problem import BANDS, Candidate, Gap, Rows
 from simgap.effects import catalogue, decoys, fitted, name_of
 from simgap.gap.carried import again, carried
@@ -17,7 +18,7 @@ from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.spread import Spread
 from simgap.gap.tolerance import tolerated
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.trial_arrays import CHANNELS, PHASES
 
 
 def rows_of(given: Problem) -> Rows:
@@ -40,6 +41,7 @@ def gap_of(
     """The gap with a candidate for every fit (of one effect each), every spread, and the properties that were
     measured apart. What sensors' noise makes of them is seen on `redrawn` recordings."""
     rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
+    usual = given.frame.rig.tolerance == Tolerance()
     scattering, tolerance = [_spreading(s, rows) for s in spreads], tolerated(given)
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
@@ -50,7 +52,7 @@ def gap_of(
         wrong = [e.wrong for e in catalogue().values() if e.wrong is not None]
         measured = [c for candidates in wrong for c in candidates(problem, healthy.push)]
         every = (*shifting, *scattering, *measured)
-        return Gap(rows, start, nuisance, every, tolerance=tolerance)
+        return Gap(rows, start, nuisance, every, tolerance=tolerance, usual=usual)
 
     gap = at(given, healthy, fits)
     if not redrawn:
@@ -116,6 +118,23 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
     return out
 
 
+def _turning(given: Problem, angle: float) -> np.ndarray:
+    """Variance (n,) of cosine coefficients where standing blocks turn in the grip by up to an angle [rad].
+
+    It shows in the fingers' distance and offset, and in their height, but not in its mean: there the block
+    stands.
+    """
+    rows, weight, arrays = rows_of(given), given.whitening.weight, given.frame.arrays
+    width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
+    size, there = weight * (angle * width)[..., None], weight > 0
+    stands = arrays.phase[..., [PHASES.index("pickup"), PHASES.index("place")]].sum(-1) > 0
+    stands = np.repeat(stands[..., None], len(CHANNELS), -1)[there]
+    mean = np.zeros(stands.size, bool)
+    mean[np.unique(rows.cell, return_index=True)[1]] = True
+    y, distance, offset = (rows.channel == CHANNELS.index(c) for c in ("y", "distance", "offset"))
+    return np.square(size[there]) * (stands & (distance | offset | (y & ~mean)))
+
+
 def _shifting(given: Problem, f: Fitted, start: np.ndarray, push: np.ndarray) -> Candidate:
     """A fit as a candidate: what it takes off the residual, at properties' own nominal."""
     k = given.num_properties
@@ -135,12 +154,14 @@ def _candidate(
     """One form of an effect at coordinates u, of which it has the columns `own`."""
     free, effect = free_of(key), fitted()[name_of(key)]
     low, high = (edge[own] for edge in limits(given))
+    turned = sum(float(p.value(u[c])) for p, c in zip(free, own, strict=True) if p.name == effect.turns)
     return Candidate(
         effect.name, tuple(p.name for p in free), u[own], neutral(given)[own], np.ones(own.size), shift,
         -push,
         low, high, evidence=-doubts, named=effect.name not in decoys(),
         hidden=tuple(p.name for p in free if p.hidden or p.shape),
         size=np.array([1 / p.sd if p.log else np.nan for p in free]),
+        frees=_turning(given, turned) if effect.turns else None,
     )  # fmt: skip
 
 

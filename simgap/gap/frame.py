@@ -22,8 +22,9 @@ TRIALS = 4  # numerics: arrays are padded to multiples of it, so that few progra
 class Arrays(NamedTuple):
     """Constants of the contact equations: T trials, N samples, C channels, M moves, O objects.
 
-    `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): its sensor noise
-    in units of the channel; `kind` (T, N): 2 * phase, + 1 beside a contact change; `subtask` (T, N);
+    `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): how far it
+    is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `kind` (T, N):
+    2 * phase, + 1 beside a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
     `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
     forces as they stand in `World`.
@@ -31,6 +32,7 @@ class Arrays(NamedTuple):
 
     there: np.ndarray
     sd: np.ndarray
+    plain: np.ndarray
     kind: np.ndarray
     subtask: np.ndarray
     onehot: np.ndarray
@@ -88,6 +90,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
     arrays = Arrays(
         stack["there"],
         stack["sd"],
+        stack["plain"],
         stack["kind"].astype(int),
         stack["subtask"].astype(int),
         onehot,

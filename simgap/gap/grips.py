@@ -12,6 +12,7 @@ from simgap.gap.trial_arrays import CHANNELS
 HELD = 0.1  # chosen: N; a grip below this holds nothing,
 # chosen: nor one below this share of its usual force: pads that let go slide by what shears they bear
 LOOSE = 0.35
+USUAL = 11.0  # numerics: logit of the weight of a grip of the usual force
 SLIDE = 2e-3  # prior: m; how far a pad may slide from one sample to the next
 ANYWHERE = 0.05  # prior: m; sd of where a grip takes its block
 
@@ -21,7 +22,7 @@ def firmness(grip: jax.Array, held: jax.Array, moves: jax.Array, loose: float = 
     mine = moves * held[..., None]
     usual = jnp.einsum("tnm,tn->tm", mine, grip) / jnp.maximum(mine.sum(1), 1.0)
     least = jnp.maximum(HELD, loose * jnp.einsum("tnm,tm->tn", moves, usual))
-    return jax.nn.sigmoid((grip / least - 1) * 6)
+    return jax.nn.sigmoid((grip / least - 1) * USUAL / (1 / loose - 1))
 
 
 def recorded(arrays: Arrays, channel: str) -> jax.Array:

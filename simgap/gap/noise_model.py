@@ -26,6 +26,7 @@ BANDS = 6  # numerics: of which medians are taken
 SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
 OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it
 FEWEST = 12  # numerics: coefficients of a band
+CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they tell nothing of it
 MEDIAN = 0.4549  # physics: of the square of a standard normal number
 
 
@@ -37,12 +38,14 @@ def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
     square = cosines(rows, residual[:, None])[0][:, 0] ** 2 / shape
     arrays = given.frame.arrays
     there = given.whitening.weight > 0
+    doubt = np.square(arrays.sd[there] / arrays.plain[there])
+    sure = (np.bincount(rows.cell, doubt) < CLEAN * np.bincount(rows.cell))[rows.cell]
     phase = arrays.phase.argmax(-1)[..., None].repeat(len(CHANNELS), -1)[there]
     quiet = (None, (PHASES.index("pickup"), PHASES.index("place")), (PHASES.index("free"),))
     variance = shape.copy()
     for names, at in zip(KINDS, quiet, strict=True):
         mine = np.isin(rows.channel, [CHANNELS.index(n) for n in names])
-        seen = mine & (frequency > SLOWEST) & (True if at is None else np.isin(phase, at))
+        seen = mine & sure & (frequency > SLOWEST) & (True if at is None else np.isin(phase, at))
         level, colour = _likeliest(turn[seen], square[seen])
         variance[mine] *= level**2 * _density(turn[mine], colour)
     return replace(rows, sd=np.sqrt(variance), shape=shape)

@@ -55,10 +55,12 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
     step = float(np.median(np.diff(world.t[0])))
     velocity = np.asarray(tips(tree)[1])
     mean = (velocity[..., :2] + velocity[..., 2:]) / 2
-    rate = np.asarray(gradient(tree.t, jnp.asarray(mean)))
-    bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
     position = np.asarray(tips(tree)[0])
     place = (position[..., :2] + position[..., 2:]) / 2
+    # Of the quieter of both: a column that holds the residual's own noise would be fitted to smooth it.
+    calm = _quieter(given, mean, np.asarray(gradient(tree.t, jnp.asarray(place))), step)
+    rate = np.asarray(gradient(tree.t, jnp.asarray(calm)))
+    bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
     # What a drive that takes differences of its own readings from sample to sample would say.
     before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
     own = np.asarray(tips(tree._replace(rates=jnp.asarray((world.joints - before) / step)))[1])
@@ -72,6 +74,16 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
             c = CHANNELS.index(channel)
             column[..., c] = usual * change[..., k] * weight[..., c]
         out.append(column[weight > 0][:, None])
+    return out
+
+
+def _quieter(given: Problem, speed: np.ndarray, difference: np.ndarray, step: float) -> np.ndarray:
+    """Speeds (T, N, 2) as they were read or as differences of positions, whichever has less noise."""
+    sample, out = given.frame.arrays.sample, speed.copy()
+    for k, (place, rate) in enumerate((("x", "vx"), ("y", "vy"))):
+        shaken = np.median(sample[..., CHANNELS.index(place)]) / step
+        if shaken < np.median(sample[..., CHANNELS.index(rate)]):
+            out[..., k] = difference[..., k]
     return out
 
 

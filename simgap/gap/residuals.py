@@ -72,14 +72,14 @@ def residuals(
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
     y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
-    # Fingers that close push the block until both hold it: only then it rests.
+    # Fingers that close push the block and slide on it until both hold it: only then it rests.
     lesser = jnp.minimum(force[..., 0], -force[..., 2])
     both = firmness(lesser, held, jnp.asarray(arrays.onehot), CLOSED)
-    still = firm * both * (arrays.phase[..., 1] + place)
-    onground = firm * world.ground
-    offset, loose_offset = in_grip(offset, firm * held, "offset", arrays, noise, world)
+    closed = firm * both
+    still = closed * (arrays.phase[..., 1] + place)
+    offset, loose_offset = in_grip(offset, closed * held, "offset", arrays, noise, world)
     x = less_mean(x, arrays, still * recorded(arrays, "x"), place)
-    y, loose_y = in_grip(y, onground, "y", arrays, noise, world)
+    y, loose_y = in_grip(y, closed * world.ground, "y", arrays, noise, world)
 
     acceleration, _ = fivepoint(world, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))

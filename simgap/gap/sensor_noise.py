@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.features import noise_sd
+from simgap.gap.unresolved import kinks, of_a_kink, pushed, speed_jumps
 
 MISFIT = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
 FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
-SEEN = 2.0  # prior: sds of a fourth difference below which it is noise
-FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)  # numerics: weights of a fourth difference
-MEDIAN = 0.4549  # physics: of the square of a standard normal number
-JUMPS = 64  # numerics: moments between two samples that a mean is taken over
-MOVES = 3.0  # chosen: sds of a difference by which fingers move
+ROCKING = 0.1  # prior: a block that is pushed rocks: its sides rise by so much of how far it goes, sd
 NUDGE = 1e-4  # prior: m; fingers that push unequally move a resting block by about as much
 
 
@@ -67,73 +62,39 @@ def channel_noise(one: dict[str, np.ndarray]) -> np.ndarray:
                      root2 * f, root2 * f, f / root2, f / root2], 1)  # fmt: skip
 
 
-def residual_noise(
-    s: Signals, one: dict[str, np.ndarray], rig: Rig, step: float, group: int = 1
-) -> np.ndarray:
+def residual_noise(one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndarray:
     """Noise (N, C) of each channel's residual: positions with the pads' yielding taken out, velocities less
-    differences of positions `step` s apart, all of them means over `group` samples.
-
-    Where the speed changes within a sample, as that of a pressed fingertip that is let go, no rule gives it.
-    """
+    differences of positions `step` s apart."""
     pad, root2 = rig.fingertip, np.sqrt(2.0)
     x, y, vx, vy, f = (one[k] for k in ("x", "y", "vx", "vy", "force"))
     gn, gs = f / pad.normal_stiffness, f / pad.shear_stiffness
     columns = [
-        np.hypot(np.hypot(x, gn) / root2, NUDGE), np.hypot(y, gs) / root2,
-        root2 * np.hypot(x, gn), root2 * np.hypot(y, gs),
+        np.hypot(x, gn) / root2, np.hypot(y, gs) / root2, root2 * np.hypot(x, gn), root2 * np.hypot(y, gs),
         np.hypot(0.5 * vx, 0.5 * x / step), np.hypot(0.5 * vy, 0.5 * y / step),
         root2 * f, root2 * f, f / root2, f / root2,
     ]  # fmt: skip
-    out = np.stack(columns, 1)
-    out[:, 0] = np.hypot(out[:, 0], _moving((s.x1 + s.x2) / 2, x / root2))
-    for channel, place, noise in ((4, (s.x1 + s.x2) / 2, x), (5, (s.y1 + s.y2) / 2, y)):
-        out[:, channel] = np.hypot(out[:, channel], _unresolved(place, noise / root2, step, group))
+    return np.stack(columns, 1)
+
+
+def motion_doubt(s: Signals, one: dict[str, np.ndarray], step: float, group: int) -> np.ndarray:
+    """How far (N, C) residuals are off beyond noise where motion is not what equations take it for, sd.
+
+    Fingers that push a block move it, and speeds that change within a sample, as that of a pressed fingertip
+    that is let go, no rule gives. Samples are means over `group` finer ones.
+    """
+    root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))
+    push = pushed(mean_of(s, "x"), one["x"] / root2)
+    out[:, 0], out[:, 1], out[:, 3] = np.hypot(NUDGE, push), ROCKING * push, 2 * ROCKING * push
+    for channel, axis in ((4, "x"), (5, "y")):
+        place, speed = (mean_of(s, name) for name in (axis, f"v{axis}"))
+        jump = speed_jumps(place, one[axis] / root2, step, group)
+        out[:, channel] = np.hypot(jump, of_a_kink(group)[0] * kinks(speed, one[f"v{axis}"] / root2))
     return out
 
 
-def _moving(place: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """By how much (N,) fingers move from sample to sample beyond noise: what they hold does not rest then.
-
-    The finger that touches first pushes the block for a while, and so does a hand that closes.
-    """
-    step = np.pad(np.abs(np.nan_to_num(np.diff(place))), (1, 1))
-    return np.maximum(np.maximum(step[:-1], step[1:]) - MOVES * np.sqrt(2.0) * noise, 0.0)
-
-
-def _unresolved(place: np.ndarray, noise: np.ndarray, step: float, group: int) -> np.ndarray:
-    """How far (N,) the rule for speeds is off where they jump between samples, rms over when they do.
-
-    The jump shows in the fourth difference of the positions, which are known far better than speeds: how
-    loud those are makes it no smaller. What irregular sample times do wherever a finger moves is no jump.
-    """
-    bend, speed, norm = np.zeros_like(place), np.zeros_like(place), np.linalg.norm(FOURTH)
-    place = np.nan_to_num(place)
-    bend[2:-2] = np.abs(np.convolve(place, FOURTH, "valid"))
-    speed[1:-1] = np.abs(place[2:] - place[:-2]) / (2 * step)
-    near = np.maximum(np.maximum(bend, np.roll(bend, 1)), np.roll(bend, -1))
-    moving = speed > np.sqrt(np.mean(speed**2))
-    late = 0.0
-    if moving.any():
-        seen = (bend**2 / (MEDIAN * norm**2) - noise**2)[moving]
-        late = max(float(np.median(seen / speed[moving] ** 2)), 0.0)  # s^2, variance of the sample times
-    usual = SEEN * norm * np.sqrt(noise**2 + late * speed**2)
-    return _of_a_jump(group) / step * np.sqrt(np.maximum(near**2 - usual**2, 0.0))
-
-
-@cache
-def _of_a_jump(group: int) -> float:
-    """What the rule (1, 4, 1) / 6 for speeds leaves where one jumps, over the fourth difference of positions.
-
-    In the mean square over when it jumps between two samples, each a mean over `group` finer ones.
-    """
-    when = (np.arange(JUMPS) + 0.5) / JUMPS
-    t = (np.arange(15 * group) - 7 * group + 0.5) / group - when[:, None]
-    place, speed = (z.reshape(JUMPS, 15, group).mean(2) for z in (np.maximum(t, 0.0), 1.0 * (t > 0)))
-    rule = (speed[:, :-2] + 4 * speed[:, 1:-1] + speed[:, 2:]) / 6 - (place[:, 2:] - place[:, :-2]) / 2
-    bend = np.abs(np.stack([np.convolve(row, FOURTH, "valid") for row in place]))
-    bend = np.pad(bend, ((0, 0), (2, 2)))
-    near = np.maximum(np.maximum(bend[:, :-2], bend[:, 2:]), bend[:, 1:-1])
-    return float(np.sqrt(np.square(rule).sum() / np.square(near).sum()))
+def mean_of(s: Signals, name: str) -> np.ndarray:
+    """Mean (N,) of both fingers' x, y, vx or vy."""
+    return (s.__dict__[f"{name}1"] + s.__dict__[f"{name}2"]) / 2
 
 
 def misfit(

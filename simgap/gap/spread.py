@@ -16,8 +16,8 @@ from simgap.gap.problem import Problem
 class Spread:
     """`variance` (n,) over the noise's that an effect of size `value` adds to each cosine coefficient of a
     cell (in the order of `assemble.rows_of`), log sd of that value, and evidence [nats] `known` of another
-    kind. `same`: whether its size is the same everywhere. Coefficients that it `frees` (n,) have a variance
-    of their own, whatever that is."""
+    kind. `same`: whether its size is the same everywhere. The variance of
+    coefficients that it `frees` may be larger by so much (n,), whatever it is."""
 
     effect: str
     value: float

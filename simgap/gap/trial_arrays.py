@@ -8,13 +8,22 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
 from hmmseg.hand.grouping import group_size, grouped
-from hmmseg.hand.signals import task_space
+from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.segmentation.align import TrialAlignment
 from simgap.effects.base import FORCES
-from simgap.gap.sensor_noise import channel_noise, misfit, residual_noise, sample_noise, sensor_sd
+from simgap.gap.sensor_noise import (
+    channel_noise,
+    mean_of,
+    misfit,
+    motion_doubt,
+    residual_noise,
+    sample_noise,
+    sensor_sd,
+)
+from simgap.gap.unresolved import kinks, of_a_kink
 from simgap.gap.wrist_gap import absent
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
@@ -88,11 +97,16 @@ def trial_arrays(
     there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, rig, group)
-    sd = residual_noise(signals, sample, rig, step, group)
+    plain = residual_noise(sample, rig, step)
+    sd = np.hypot(plain, motion_doubt(signals, sample, step, group))
     sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, edge & (phase == 2), boundaries))
+    shaken = _shaken(signals, sample, force, phase == 2, subtask, step, group) / rig.gravity
+    sd[:, 6:8] = np.hypot(sd[:, 6:8], shaken[:, None])
+    sd[:, 3] = np.hypot(sd[:, 3], shaken / rig.fingertip.shear_stiffness)
     if trial.inertia is not None:
         sd[:, 6:8] = np.hypot(sd[:, 6:8], trial.inertia)
     there[:, np.isin(CHANNELS, absent(trial))] = 0.0
+    there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
     lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
     there[lone, CHANNELS.index("fx") :] = 0.0
     carried = np.array([_phase(s) == 2 for s in steps])
@@ -109,6 +123,7 @@ def trial_arrays(
         "events": boundaries,
         "there": there,
         "sd": sd,
+        "plain": plain,
         "sensor": sensor_sd(joints, rates, sample, rig, group),
         "sample": channel_noise(sample) * np.sqrt(group),  # of one as it was recorded
         "kind": (2 * phase + edge).astype(float),
@@ -116,6 +131,28 @@ def trial_arrays(
         "move": _moves(t, boundaries, steps, subtask).astype(float),
         "phase": np.eye(len(PHASES))[phase],
     }
+
+
+def _struck(force: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Samples (N,) beside a finger's touch or letting go, where its speed jumps as no difference tells."""
+    touches = np.hypot(force[:, ::2], force[:, 1::2]) > SURE * sd[:, None]
+    change = np.pad((touches[1:] != touches[:-1]).any(axis=1), (2, 2))
+    return change[:-3] | change[1:-2] | change[2:-1] | change[3:]
+
+
+def _shaken(
+    signals: Signals, sample: dict[str, np.ndarray], force: np.ndarray, carried: np.ndarray,
+    subtask: np.ndarray, step: float, group: int,
+) -> np.ndarray:  # fmt: skip
+    """By how much (N,) a carried block's load jumps near each sample, times gravity."""
+    weight, root2 = np.zeros(carried.size), np.sqrt(2.0)
+    for s in np.unique(subtask[carried]):
+        mine = subtask == s
+        weight[mine] = max(float(np.median(force[mine, 1] + force[mine, 3])), 0.0)
+    jumps = np.hypot(*(kinks(mean_of(signals, v), sample[v] / root2) for v in ("vx", "vy")))
+    # Differences of speeds have one or the other beside a jump, and what pads hold rings as much again, both
+    # ways, for it turns in the grip as well.
+    return weight * root2 * of_a_kink(group)[1] / step * jumps
 
 
 def _one_finger(

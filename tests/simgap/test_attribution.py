@@ -186,7 +186,7 @@ def test_what_has_a_variance_of_its_own_explains_its_cells():
     residual = np.random.default_rng(5).standard_normal(rows.time.size) * np.where(loud, 6.0, 1.0)
     nothing, n = np.zeros(0), rows.time.size
     own = Candidate("roll", (), nothing, nothing, nothing, np.zeros(n), np.zeros((n, 0)), nothing, nothing,
-                    frees=loud)  # fmt: skip
+                    frees=np.where(loud, 1e3, 0.0))  # fmt: skip
     found = attribute(Gap(rows, residual, np.zeros((n, 0)), (own,)), nested=False)
     assert found.causes == ("roll",) and found.remainder.share < 0.1
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
-from simgap.effects.backlash import play, side
+from simgap.effects.backlash import play, within
 from simgap.gap.between import sensed
 from simgap.gap.grips import ANYWHERE, SLIDE, _followed
 from simgap.gap.memory import driven
@@ -62,13 +62,31 @@ def test_a_joint_lies_where_it_was_pushed_to():
     rng = np.random.default_rng(0)
     t, width = np.arange(200) / 20, 4e-3
     true = 0.05 * np.sin(2 * np.pi * 0.2 * t)[:, None] * np.ones(4)
-    recorded = play(true, width) + 1e-4 * rng.standard_normal(true.shape)
-    place, variance = (np.asarray(z)[0] for z in side(jnp.asarray(recorded)[None]))
-    off = (true - recorded)[10:-10] / (width / 2) - place[10:-10]
-    sure = variance[10:-10] < 0.02
+    played = play(true, width)
+    recorded = played + 1e-4 * rng.standard_normal(true.shape)
+    half, inner = width / 2, slice(10, -10)
+
+    def off_and_variance(rates, unseen: float) -> tuple[np.ndarray, np.ndarray]:
+        world = as_jax(world_of(performance()))._replace(
+            t=jnp.asarray(t)[None], joints=jnp.asarray(recorded)[None], rates=jnp.asarray(rates)[None]
+        )
+        place, variance = (
+            np.asarray(z)[0, inner] for z in within(world, jnp.asarray(half), jnp.asarray(unseen))
+        )
+        return ((true - recorded)[inner] - place) / half, variance / half**2
+
+    # An encoder's speeds say nothing of the dead band.
+    off, blind = off_and_variance(np.gradient(recorded, t, axis=0), 1.0)
+    sure = blind < 0.02
     assert sure.mean() > 0.7
     assert np.sqrt(np.mean(off[sure] ** 2)) < 0.15
-    assert 0.3 < np.sqrt(np.mean(off[~sure] ** 2 / variance[10:-10][~sure])) < 1.5
+    assert 0.3 < np.sqrt(np.mean(off[~sure] ** 2 / blind[~sure])) < 1.5
+    # A tachometer's say how the joint crosses it.
+    off, variance = off_and_variance(
+        np.gradient(true, t, axis=0) + 2e-3 * rng.standard_normal(true.shape), 0.0
+    )
+    assert variance.sum() < 0.2 * blind.sum()
+    assert np.sqrt(np.mean(off**2)) < 0.15
 
 
 def _ringing(frequency=6.0, damping=0.05, drive=0.3):

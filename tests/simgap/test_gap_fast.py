@@ -14,10 +14,10 @@ from simgap.gap.evaluation import residual_at
 from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.problem import neutral, problem
-from simgap.gap.sensor_noise import _unresolved
 from simgap.gap.spread import spreads
 from simgap.gap.synthetic import performed, recorded
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.trial_arrays import CHANNELS, _struck
+from simgap.gap.unresolved import kinks, of_a_kink, pushed, speed_jumps
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
@@ -73,13 +73,13 @@ def test_five_samples_give_slopes_to_fourth_order():
 def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
     rng, step = np.random.default_rng(0), 0.05
     sd = np.full(4000, 3e-5)
-    assert (_unresolved(sd * rng.standard_normal(4000), sd, step, 1) > 0).mean() < 0.14  # largest of three
+    assert (speed_jumps(sd * rng.standard_normal(4000), sd, step, 1) > 0).mean() < 0.14  # largest of three
     t = step * np.arange(40)
-    doubt = _unresolved(0.2 * np.maximum(t - 0.975, 0.0), sd[:40], step, 1)
+    doubt = speed_jumps(0.2 * np.maximum(t - 0.975, 0.0), sd[:40], step, 1)
     assert doubt[19] > 0.005 and doubt[20] > 0.005 and not doubt[:16].any() and not doubt[24:].any()
     irregular = step * np.arange(400) + 0.004 * rng.standard_normal(400)
-    assert (_unresolved(0.1 * np.sin(irregular), sd[:400], step, 1) > 0).mean() < 0.25
-    assert (_unresolved(np.full(40, np.nan), sd[:40], step, 1) == 0).all()
+    assert (speed_jumps(0.1 * np.sin(irregular), sd[:400], step, 1) > 0).mean() < 0.25
+    assert (speed_jumps(np.full(40, np.nan), sd[:40], step, 1) == 0).all()
 
 
 def test_the_doubt_of_a_jump_is_as_large_as_the_rule_is_off():
@@ -88,6 +88,45 @@ def test_the_doubt_of_a_jump_is_as_large_as_the_rule_is_off():
         t = step * np.arange(40)
         place, speed = np.maximum(t - when, 0.0), 1.0 * (t > when)
         rule = (speed[:-2] + 4 * speed[1:-1] + speed[2:]) / 6 - (place[2:] - place[:-2]) / (2 * step)
-        found.append((np.sum(rule**2), np.sum(_unresolved(place, np.full(40, 1e-9), step, 1) ** 2)))
+        found.append((np.sum(rule**2), np.sum(speed_jumps(place, np.full(40, 1e-9), step, 1) ** 2)))
     off, doubt = np.sqrt(np.mean(found, axis=0))
     assert doubt == pytest.approx(off, rel=0.15)
+
+
+@pytest.mark.parametrize("group", [1, 4])
+def test_the_doubt_of_a_kink_is_as_large_as_the_rules_are_off(group):
+    """A jump of the acceleration, in the rule for speeds and in the slope of five of them."""
+    step, found = 0.05, []
+    for when in np.linspace(0.95, 1.0, 21):
+        t = (step * (np.arange(40 * group) + 0.5) / group).reshape(40, group)
+        ramp = np.maximum(t - when, 0.0)
+        place, speed, rate = (z.mean(1) for z in (ramp**2 / 2, ramp, 1.0 * (t > when)))
+        rule = (speed[:-2] + 4 * speed[1:-1] + speed[2:]) / 6 - (place[2:] - place[:-2]) / (2 * step)
+        near, far = speed[3:-1] - speed[1:-3], speed[4:] - speed[:-4]
+        slope = (8 * near - far) / (12 * step) - rate[2:-2]
+        doubt = kinks(speed, np.full(40, 1e-12))
+        found.append([np.sum(z**2) for z in (rule, slope, doubt)])
+    rule, slope, doubt = np.sqrt(np.mean(found, axis=0))
+    mean, difference = of_a_kink(group)
+    assert mean * doubt == pytest.approx(rule, rel=0.15)
+    assert difference * doubt / step == pytest.approx(slope, rel=0.15)
+
+
+def test_noise_and_smooth_motion_have_no_kinks():
+    rng, t = np.random.default_rng(0), 0.05 * np.arange(4000)
+    assert (kinks(1e-3 * rng.standard_normal(4000), np.full(4000, 1e-3)) > 0).mean() < 0.25  # largest of five
+    assert kinks(0.1 * np.sin(3 * t), np.full(4000, 1e-3)).max() == 0
+
+
+def test_what_fingers_push_does_not_rest():
+    place = np.where(np.arange(40) < 20, 0.0, 2e-3)
+    push = pushed(place, np.full(40, 2e-5))
+    assert push[19] == push[20] == pytest.approx(2e-3, rel=0.05)
+    assert np.count_nonzero(push) == 2
+
+
+def test_speeds_say_nothing_where_a_finger_touches():
+    force = np.zeros((20, 4))
+    force[8:14, 0] = 1.0
+    struck = np.flatnonzero(_struck(force, np.full(20, 0.01)))
+    assert struck.tolist() == [6, 7, 8, 9, 12, 13, 14, 15]
