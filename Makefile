@@ -147,7 +147,7 @@ calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds 
 	$(BIN)/python -m experiments.write_tables
 
 boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/segmentation_results.md
-	$(BIN)/python -m experiments.calibration_boundaries --trials 8
+	$(BIN)/python -m experiments.calibration_boundaries
 	$(BIN)/python -m experiments.table_boundaries
 
 sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL, PANDA, HANDS: folders; fills docs/sequences.md
@@ -177,7 +177,7 @@ fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, i
 	PYTHONPATH=tests $(BIN)/python -m experiments.fuzz --cases 100000 --keep build/fuzz
 
 identified: $(INSTALLED)  ## properties and boundaries in labs drawn anew (build/drawn) and in folders of RECORDINGS
-	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 830001 --fastest 200 --out build/drawn
+	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 1124001 --fastest 200 --out build/drawn
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --keep
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --pooled 1 --keep
 	$(BIN)/python -m experiments.write_tables

@@ -14,10 +14,11 @@ HEAD = """# Boundaries in worlds that differ
 
 Written by `make boundaries` (`experiments/calibration_boundaries.py` and `table_boundaries.py`): worlds of
 `experiments/boundary_worlds.py`, the project's own simulator, single trials of two blocks restacked.
-Before: trials from number 70000 on by commit 69677d2; now: trials from {first} on, which no code had seen.
+Before: commit {before}, trials from number {before_first} on; now: commit {now}, from {first} on, which it
+had not seen.
 Error is the median (and 95th percentile) of |found - true|; half width is of the 90 % intervals, which should
-cover 86 to 94 %. {trials} trials of 8 boundaries a row, so that a row's coverage is known to about 5 %.
-(Grips that slip until they lose their block are left out now.)
+cover 86 to 94 %. {trials} trials of 8 boundaries a row, so that a row's coverage is known to about 3 %.
+Grips that slip until they lose their block are left out.
 
 | world | misfits before | now | error before [ms] | now | cover before | now | half width now [ms] |
 | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
@@ -49,7 +50,16 @@ def main() -> None:
     trials = max(entry["trials"] for entry in now.values())
     lines = [row(name, before.get(name), entry) for name, entry in now.items()]
     PAGE.write_text(
-        HEAD.format(trials=trials, first=latest["first"]) + "\n".join(lines) + "\n", encoding="utf-8"
+        HEAD.format(
+            trials=trials,
+            first=latest["first"],
+            before_first=earlier["first"],
+            before=earlier["made_by"],
+            now=latest["made_by"],
+        )
+        + "\n".join(lines)
+        + "\n",
+        encoding="utf-8",
     )
 
 
