@@ -52,8 +52,10 @@ def within(world: World, half: jax.Array, unseen: jax.Array) -> tuple[jax.Array,
     """Where in the dead band of so much to either side [rad] each joint lies (T, N, 4): mean and variance.
 
     A recorded angle that moves pins its joint to the side it moves to. At rest the joint goes from one pin
-    to the next: as its speed says, unless that is `unseen`; then no one knows when.
+    to the next: as its speed says, unless that is `unseen`; then no one knows when. A band narrower than what
+    an angle must turn on by to be seen moving is not seen either.
     """
+    half = half * jnp.clip(2 * half / (HUSH * _noise(world.joints)[:, None]) - 1, 0.0, 1.0)
     moves, calm = _moves(world.joints)
     (last, ago), (following, ahead) = _nearest(moves, False), _nearest(moves, True)
     rest = ago + ahead - 1
