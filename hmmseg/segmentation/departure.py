@@ -40,9 +40,11 @@ def settled(
     settle = min(0.5, stages * free.interval / SETTLING)
     index = np.r_[[-1 if c is None else c for c in columns], np.arange(len(free.states))]
     table = scored(free, columns)
-    settling = _settling_table(table, index, free.states)
-    every = np.hstack([np.tile(settling, stages), table])
-    return every, stages, _settling(log_initial, log_transition, stages, settle)
+    every = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
+    every[:, -1] = table
+    every[:, :-1] = _settling_table(table, index, free.states)[:, None]
+    model = _settling(log_initial, log_transition, stages, settle)
+    return every.reshape(len(table), -1), stages, model
 
 
 def departing(

@@ -16,6 +16,7 @@ from hmmseg.segmentation.toe import DEPENDENT, NONE, Toe
 
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
+FARTHEST = 0.5  # numerics: s; values further from a contact than any delay that is tried are not kept
 KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there
 
 
@@ -72,7 +73,9 @@ def stretches(
         before, step = np.r_[filled[0], filled[:-1]], np.diff(s.t, prepend=2 * s.t[0] - s.t[1])
         known = np.isfinite(stated)
         sd = float(np.median(stated[known])) if known.any() else noise_sd(value)
-        out.append(Stretch(s.t[use], load[use], before[use], step[use], s.t[there], value[there],
+        t = s.t[use]
+        there &= (s.t >= t[0] - FARTHEST) & (s.t <= t[-1] + FARTHEST)
+        out.append(Stretch(t, load[use], before[use], step[use], s.t[there], value[there],
                            max(sd, 1e-9), sure))  # fmt: skip
     return out[0], out[1]
 
