@@ -173,13 +173,25 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(
         j for j, p in zip(effects, part, strict=True)
-        if j in scattering or (p >= least and same[j].log_bayes_factor > POSITIVE)
+        if j in scattering or (p >= least and same[j].log_bayes_factor > POSITIVE and _there(f, model, j))
     )  # fmt: skip
     shifting = [same[j] for j in causes if j not in scattering]
     left = explained.inside if shifting else 0.0
     factors = [i.log_bayes_factor for i in shifting]
     sure = known(left, 1 - explained.remainder, factors) if causes else 0.0
     return _Judged(effects, model, explained, same, causes, sure)
+
+
+def _there(f: Forms, model: Model, effect: int) -> bool:
+    """Whether an effect acts by itself: what it frees may be off for other reasons, and is no sign of it."""
+    c, before = f.gap.candidates[effect], [j for j in model.effects if j < effect]
+    if c.frees is None:
+        return True
+    start = f.spectrum.num_nuisances + sum(f.gap.candidates[j].at.size for j in before)
+    own = slice(start, start + c.at.size)
+    loose = ~model.at_bound[own]
+    x, covariance = model.x[own][loose], model.covariance[own, own][np.ix_(loose, loose)]
+    return 0.5 * float(x @ np.linalg.solve(covariance, x)) > POSITIVE
 
 
 def _effects(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from simgap.attribution.attribute import attribute
+from simgap.attribution.attribute import _there, attribute
 from simgap.attribution.background import Background
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
@@ -189,6 +189,20 @@ def test_what_has_a_variance_of_its_own_explains_its_cells():
                     frees=np.where(loud, 1e3, 0.0))  # fmt: skip
     found = attribute(Gap(rows, residual, np.zeros((n, 0)), (own,)), nested=False)
     assert found.causes == ("roll",) and found.remainder.share < 0.1
+
+
+@pytest.mark.parametrize(("size", "there"), [(0.0, False), (1.0, True)])
+def test_an_effect_is_there_by_itself_and_not_by_what_it_frees(size, there):
+    rows = rows_of(samples=40)
+    loud = (rows.channel == 2) & (rows.part == 0)
+    n, zero, one = rows.time.size, np.zeros(1), np.ones(1)
+    push = np.where(rows.channel == 1, 1.0, 0.0)[:, None]
+    noise = np.random.default_rng(5).standard_normal(n) * np.where(loud, 6.0, 1.0)
+    own = Candidate("tilt", ("angle",), zero, zero, one, np.zeros(n), push, -9 * one, 9 * one,
+                    frees=np.where(loud, 1e3, 0.0))  # fmt: skip
+    f = forms(Gap(rows, noise + size * push[:, 0], np.zeros((n, 0)), (own,)))
+    assert fitted(f, (0,)).score > fitted(f, ()).score
+    assert _there(f, fitted(f, (0,)), 0) == there
 
 
 def test_a_planted_cell_is_the_one_listed():
