@@ -60,13 +60,13 @@ def limits(length: int, rate: float) -> tuple[float, float] | None:
     return (low, high) if length >= LEAST and low < high else None
 
 
-def screen(windows: np.ndarray, rate: float) -> tuple[float, float, float, float]:
+def screen(windows: np.ndarray, rate: float, at_least: float = 0.0) -> tuple[float, float, float, float]:
     """Best frequency [Hz] and damping on a grid, the share of the square about the parabola explained and
     its mean square; zeros where windows are too short."""
     edges = limits(windows.shape[1], rate)
-    if edges is None:
+    if edges is None or max(edges[0], at_least) >= edges[1]:
         return np.nan, np.nan, 0.0, 0.0
-    grid = [(f, z) for f in np.geomspace(edges[0], edges[1], FREQUENCIES) for z in DAMPINGS]
+    grid = [(f, z) for f in np.geomspace(max(edges[0], at_least), edges[1], FREQUENCIES) for z in DAMPINGS]
     shares = [1 - _left(windows, rate, *g)[0] for g in grid]
     best = int(np.argmax(shares))
     t = np.linspace(-1, 1, windows.shape[1])
@@ -74,12 +74,13 @@ def screen(windows: np.ndarray, rate: float) -> tuple[float, float, float, float
     return *grid[best], float(shares[best]), float(shares[best] * (plain**2).mean())
 
 
-def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
+def fit_ring(windows: np.ndarray, rate: float, at_least: float = 0.0) -> Ring | None:
     """A ring common to windows (trials, n) of samples at `rate` [Hz]; None where they are too short."""
     edges = limits(windows.shape[1], rate)
-    start = screen(windows, rate)
+    start = screen(windows, rate, at_least)
     if edges is None or not np.isfinite(start[0]):
         return None
+    edges = max(edges[0], at_least), edges[1]
     best = _refined(windows, rate, start[:2], edges)
     left, amplitude = _left(windows, rate, *best)
     inside = edges[0] * 1.01 < best[0] < edges[1] * 0.99 and best[1] < 0.99 * HEAVIEST

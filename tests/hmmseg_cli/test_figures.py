@@ -69,7 +69,7 @@ def make_segmentation() -> Segmentation:
 
 
 def make_signals() -> Signals:
-    channels = set(Signals.__dataclass_fields__) - {"t", "sd_force", "derived", "touches"}
+    channels = set(Signals.__dataclass_fields__) - {"t", "sd_force", "derived", "touches", "coupled"}
     values = {name: np.sin(T) for name in channels}
     return Signals(t=T, **values, sd_force=0.01)
 
