@@ -51,5 +51,10 @@ def check() -> str | None:
         share = f"{100 * one['share']:.0f} % ({low:.0f} to {high:.0f})"
         rows.append([label, f"{one['hits']} of {one['of']}", share, goal])
     seconds = ", ".join(f"{robot} {s:.0f} s" for robot, s in found["processor_seconds"].items())
-    note = f"{found['cases']} cases; in brackets 90 % intervals. Processor time a case: {seconds}."
+    cases = [c["robot"] for c in found["each"]]
+    counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
+    note = (
+        f"{found['cases']} cases ({counts}); in brackets 90 % intervals. Processor time a case: {seconds}. "
+        f"Code of {found['made_by']}."
+    )
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
