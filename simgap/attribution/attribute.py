@@ -14,7 +14,7 @@ from simgap.attribution.findings import Attribution, EffectPosterior, ParameterP
 from simgap.attribution.heldout import how_far
 from simgap.attribution.invariance import POSITIVE, Invariance, invariance, residual_left
 from simgap.attribution.noise import channel_of, noise_of, small_gap, stated
-from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought, weights
 from simgap.attribution.shares import Shares, shares
@@ -184,13 +184,11 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
 
 def _there(f: Forms, model: Model, effect: int) -> bool:
     """Whether an effect acts by itself: what it frees may be off for other reasons, and is no sign of it."""
-    c, before = f.gap.candidates[effect], [j for j in model.effects if j < effect]
-    if c.frees is None:
+    if f.gap.candidates[effect].frees is None:
         return True
-    start = f.spectrum.num_nuisances + sum(f.gap.candidates[j].at.size for j in before)
-    own = slice(start, start + c.at.size)
-    loose = ~model.at_bound[own]
-    x, covariance = model.x[own][loose], model.covariance[own, own][np.ix_(loose, loose)]
+    own = coordinates(f, model.effects)[effect]
+    own = own[~model.at_bound[own]]
+    x, covariance = model.x[own], model.covariance[np.ix_(own, own)]
     return 0.5 * float(x @ np.linalg.solve(covariance, x)) > POSITIVE
 
 
@@ -216,9 +214,9 @@ def _effects(
         share, interval = 0.0, (0.0, 0.0)
         if found is not None:
             share, interval = found.shares.of_effect(found.effects.index(j))
-        z = f.spectrum.num_nuisances + sum(f.gap.candidates[i].at.size for i in model.effects if i < j)
-        sd = c.scale * np.sqrt(np.diag(model.covariance)[z : z + c.at.size])
-        mean = c.neutral + c.scale * model.x[z : z + c.at.size]
+        own = coordinates(f, model.effects)[j]
+        sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
+        mean = c.neutral + c.scale * model.x[own]
         same = None if found is None else found.invariance[j]
         wide = np.hypot(sd, _wander(same) * np.abs(mean - c.neutral))
         out[name] = EffectPosterior(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from simgap.attribution.posterior import Forms, Model
+from simgap.attribution.posterior import Forms, Model, coordinates
 
 WANDER = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5])  # prior: shares of the parameters
 OTHER = 0.5  # chosen: wander from which on it is not one cause
@@ -38,11 +38,8 @@ def invariance(f: Forms, model: Model, effect: int, part: np.ndarray) -> Invaria
 
     What the set has besides it stays as it is. With one part, or no parameters, there is nothing to compare.
     """
-    c, z = f.gap.candidates[effect], f.spectrum.num_nuisances
-    k = c.at.size
-    start = z + sum(f.gap.candidates[j].at.size for j in model.effects if j < effect)
-    x = model.x[start : start + k]
-    loose = ~model.at_bound[start : start + k]
+    c, own = f.gap.candidates[effect], coordinates(f, model.effects)[effect]
+    x, loose = model.x[own], ~model.at_bound[own]
     shared = np.array([n not in c.hidden for n in c.parameters], bool)
     parts = range(int(part.max()) + 1)
     names = c.neutral + c.scale * np.tile(x, (len(parts), 1))

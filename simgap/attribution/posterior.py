@@ -136,7 +136,7 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
     found = [mode(f, taken, np.ones(f.count.size))]
     if effects:
         x = np.zeros(taken.low.size)
-        for j, mine in taken.blocks:
+        for j, mine in taken.blocks.items():
             c = f.gap.candidates[j]
             x[mine] = (c.at - c.neutral) / c.scale
         found.append(mode(f, taken, f.marginal(effects, taken.energy(x))[1], x))
@@ -153,7 +153,7 @@ class QuadraticForms:
     bend: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    blocks: list[tuple[int, np.ndarray]]
+    blocks: dict[int, np.ndarray]
     shift: np.ndarray
 
     def energy(self, x: np.ndarray) -> np.ndarray:
@@ -177,9 +177,8 @@ def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
     # One row a group: sums over groups, and squares, are then products of a matrix and a vector.
     places = (free[:, None] * f.product.shape[1] + free).ravel()
     bend = np.take(f.product.reshape(f.count.size, -1), places, axis=1)
-    return QuadraticForms(
-        effects, square, pull, bend, *_limits(f, effects, z), _blocks(f, effects, z), f.shift(effects)
-    )
+    limits, blocks = _limits(f, effects, z), coordinates(f, effects)
+    return QuadraticForms(effects, square, pull, bend, *limits, blocks, f.shift(effects))
 
 
 def mode(
@@ -191,7 +190,7 @@ def mode(
     value, prior, energy = -np.inf, np.ones(size), taken.square
     held = np.zeros(size, bool)
     for _ in range(steps):
-        for _, mine in taken.blocks:
+        for mine in taken.blocks.values():
             prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
         matrix, pull = taken.weighed(precision)
         matrix[np.diag_indices(size)] += prior
@@ -201,7 +200,7 @@ def mode(
         last, value = value, float(density.sum()) + _log_prior(x, z, taken.blocks)
         if abs(value - last) < CLOSE:
             break
-    for _, mine in taken.blocks:
+    for mine in taken.blocks.values():
         prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
     matrix = taken.weighed(precision)[0] + np.diag(prior)
     loose = ~held
@@ -213,12 +212,12 @@ def mode(
     return Model(taken.effects, value + volume + known, x, covariance, energy, precision, held)
 
 
-def _blocks(f: Forms, effects: tuple[int, ...], z: int) -> list[tuple[int, np.ndarray]]:
-    """Coordinates of each effect in x."""
-    out, at = [], z
+def coordinates(f: Forms, effects: tuple[int, ...]) -> dict[int, np.ndarray]:
+    """Places of each effect's parameters in a set's x, after those of the nuisances."""
+    out, at = {}, f.spectrum.num_nuisances
     for j in effects:
         k = f.gap.candidates[j].at.size
-        out.append((j, np.arange(at, at + k)))
+        out[j] = np.arange(at, at + k)
         at += k
     return out
 
@@ -231,10 +230,10 @@ def _limits(f: Forms, effects: tuple[int, ...], z: int) -> tuple[np.ndarray, np.
     return np.concatenate(low), np.concatenate(high)
 
 
-def _log_prior(x: np.ndarray, z: int, blocks: list[tuple[int, np.ndarray]]) -> float:
+def _log_prior(x: np.ndarray, z: int, blocks: dict[int, np.ndarray]) -> float:
     """Log prior density of x, nuisances' (2 pi)^(-K/2) left out as it cancels."""
     out = -0.5 * float(x[:z] @ x[:z])
-    for _, mine in blocks:
+    for mine in blocks.values():
         k = mine.size
         if k:
             out += gammaln((1 + k) / 2) - gammaln(0.5) - 0.5 * k * np.log(np.pi)
@@ -256,7 +255,7 @@ def squares_left(
     weight = weight * np.exp(-taken.shift)
     if x is None:
         prior = np.ones(taken.low.size)
-        for _, mine in taken.blocks:
+        for mine in taken.blocks.values():
             prior[mine] = 1e-3
         matrix, pull = taken.weighed(weight)
         x, _ = least(matrix + np.diag(prior), pull, taken.low, taken.high)

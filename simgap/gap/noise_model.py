@@ -17,6 +17,7 @@ import numpy as np
 from simgap.attribution.problem import Rows, cosines
 from simgap.gap.problem import Problem
 from simgap.gap.trial_arrays import CHANNELS, PHASES
+from simgap.gap.unresolved import MEDIAN
 
 KINDS = (("x", "y", "distance", "offset"), ("vx", "vy"), ("fx", "fy", "grip", "shear"))
 LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; beyond that it is an effect
@@ -27,7 +28,6 @@ SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
 OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it
 FEWEST = 12  # numerics: coefficients of a band
 CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they tell nothing of it
-MEDIAN = 0.4549  # physics: of the square of a standard normal number
 
 
 def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,11 @@ from hmmseg.io.trial import read_trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
+from simgap.gap.assemble import _turning as turned_variance
 from simgap.gap.frame import build
 from simgap.gap.marginal import Nuisances
 from simgap.gap.noise_model import _density, _likeliest, with_noise
-from simgap.gap.nuisances import _settling, _turning
+from simgap.gap.nuisances import _late_rates, _settling, _turning
 from simgap.gap.problem import problem
 from simgap.gap.trial_arrays import CHANNELS
 
@@ -77,3 +80,34 @@ def test_blocks_turn_and_settle_in_the_offset_and_height_alone(given):
     # Firmly on its support a block does not turn: the offset moves in the air.
     mine = channel == CHANNELS.index("offset")
     assert turning[1][mine & carried].std() > 0
+
+
+@double_precision
+def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
+    """Fitted to it they would smooth it, and its level would come out too low."""
+    world, shape = given.frame.world, given.frame.world.rates.shape
+    noise = 0.03 * np.random.default_rng(0).standard_normal(shape)
+    louder = replace(given, frame=replace(given.frame, world=world._replace(rates=world.rates + noise)))
+    arrays, step = given.frame.arrays, float(np.median(np.diff(world.t[0])))
+    place, speed = (np.median(arrays.sample[..., CHANNELS.index(c)]) for c in ("x", "vx"))
+    assert place / step < speed  # here positions are the quieter
+    for before, after in zip(_late_rates(given)[1:], _late_rates(louder)[1:], strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+@double_precision
+def test_a_block_that_turns_frees_all_but_where_it_stands(given):
+    free = np.zeros(given.whitening.weight.shape)
+    there = given.whitening.weight > 0
+    free[there] = turned_variance(given, 0.02)
+    phase = given.frame.arrays.phase
+    for c, name in enumerate(CHANNELS):
+        cells = (free[..., c] > 0) & there[..., c]
+        assert cells.any() == (name in ("y", "distance", "offset"))
+        assert not (cells & (phase[..., 1] + phase[..., 3] == 0)).any()
+    y = there[..., CHANNELS.index("y")] & (free[..., CHANNELS.index("y")] == 0)
+    standing = phase[..., 1] + phase[..., 3] > 0
+    grips = {(t, s) for t, n in zip(*np.nonzero(y & standing), strict=True)
+             for s in [int(given.frame.arrays.subtask[t, n])]}  # fmt: skip
+    assert (y & standing).sum() == len(grips)  # one coefficient of a cell, its mean
+    np.testing.assert_allclose(turned_variance(given, 0.04), 4 * turned_variance(given, 0.02))
