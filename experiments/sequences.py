@@ -24,9 +24,8 @@ from experiments.saving import save
 from experiments.sequence_worlds import World, draw
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation, most_telling
 from hmmseg.sequence.fit import fit_sequence
-from hmmseg.sequence.places import most_telling
 from hmmseg.sequence.segment import segment_sequence
 
 OUT = Path(__file__).parent / "results" / "sequences.json"

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hmmseg.errors import InputError
+from hmmseg_cli.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from hmmseg.io.rig import Rig
@@ -121,7 +122,7 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Processes of this machine, or a cluster's workers."""
     if scheduler is None:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare) as pool:
             yield pool
         return
     try:
@@ -142,7 +143,8 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
         yield client.get_executor()
 
 
-def _one_thread() -> None:
+def _prepare() -> None:
     """Before NumPy is imported in a worker: as many threads as there are workers are enough."""
+    keep_freed_memory()
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from hmmseg.example import example_folder
-from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import diagnose, identify
 from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption
 
@@ -19,6 +18,7 @@ def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: See
          quiet: QuietOption = False) -> None:  # fmt: skip
     """Identify two blocks, then find out why rigid fingertips would measure them too narrow; see demo/."""
     from hmmseg.io.rig import read_rig
+    from hmmseg.io.task import BlockTask, read_task
 
     page, finding = figures / "report.html", figures / "diagnosis.html"
     figures.mkdir(parents=True, exist_ok=True)

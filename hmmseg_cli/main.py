@@ -31,6 +31,7 @@ from hmmseg_cli import (
     watch,
 )
 from hmmseg_cli.interrupts import heard
+from hmmseg_cli.memory import keep_freed_memory
 
 # numerics: objects between two garbage collections: most are modules' and compilers', which stay anyway
 COLLECTED = 10_000
@@ -78,6 +79,7 @@ def _hmmseg(
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code (0 or 2; 130 when interrupted)."""
     gc.set_threshold(COLLECTED, *gc.get_threshold()[1:])
+    keep_freed_memory()
     configure()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
     args = diagnose.spread_against(args)

@@ -186,7 +186,7 @@ def _segment_sequence(
 
 def ask(out: Output, found: Sequence[Segmentation]) -> Question | None:
     """Say that boundaries may lie elsewhere, and which label would decide most, if so."""
-    from hmmseg.sequence.places import most_telling
+    from hmmseg.segmentation.spans import most_telling
 
     question = most_telling(found)
     if question is not None:

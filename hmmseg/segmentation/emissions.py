@@ -20,6 +20,7 @@ Derivation and sources: docs/model.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.special import gammaln, log_ndtr
@@ -78,7 +79,12 @@ class Features:
         """Height of what is held (num_timesteps,) [m]; as if rigid where a force is missing."""
         return block_y(self.y, *_pair(self.force - bias, 1, 3), self.pads)
 
-    @property
+    @cached_property
+    def usual(self) -> dict[str, float]:
+        """Median noise of `d` and `y` [m]."""
+        return {"d": float(np.median(self.sd_d)), "y": float(np.median(self.sd_y))}
+
+    @cached_property
     def carrying(self) -> np.ndarray:
         """Net vertical force on a lifted block in units of its weight (num_timesteps,)."""
         return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)

@@ -153,7 +153,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
             bias: np.ndarray, every: np.ndarray) -> tuple[dict[str, float], float]:  # fmt: skip
     """Distance of the fingers per held object, pads' squeeze taken out, and its scale."""
     unsqueezed = np.concatenate([f.block_width(bias) for f in features])
-    spread = float(np.hypot(np.median(features[0].sd_d), old.scale["width"]))
+    spread = float(np.hypot(features[0].usual["d"], old.scale["width"]))
     width, residuals, weights = {}, [], []
     for name in old.weight:
         held = [i for i, s in enumerate(subtasks) if s.object == name and s.state != FREE]
@@ -166,7 +166,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
         width[name] = _location(unsqueezed, gamma, spread, start)
         residuals.append(unsqueezed - width[name])
         weights.append(gamma)
-    least = 0.3 * float(np.median(features[0].sd_d))
+    least = 0.3 * features[0].usual["d"]
     if not width:
         return width, old.scale["width"]
     residual, weight = np.concatenate(residuals), np.concatenate(weights)
@@ -182,7 +182,7 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
         resting = f.block_y(bias)
         found = {}
         for k in columns:
-            spread = np.hypot(np.median(f.sd_y), old.scale["level"])
+            spread = np.hypot(f.usual["y"], old.scale["level"])
             if not (np.isfinite(resting) & (gamma[:, k] > 0)).any():
                 continue  # nothing tells where the block rests
             start = old.levels[i].get(k) if old.levels else None

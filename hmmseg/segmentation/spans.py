@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -155,3 +156,9 @@ class Segmentation:
 
         draw = draw_signals if hasattr(self.recorded, "grip") else draw_channels
         return draw(self.recorded, self, None if path is None else Path(path))
+
+
+def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
+    """The one label, over all trials, that would decide most; None where nothing is open."""
+    questions = [s.question for s in segmentations if s.question is not None]
+    return max(questions, key=lambda question: question.gain, default=None)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.segmentation.spans import Place, Question, Segmentation
+from hmmseg.segmentation.spans import Place
 from hmmseg.sequence.model import NamedCourse
 from hmmseg.sequence.naming import NEAR, WEIGHING
 
@@ -99,12 +99,6 @@ def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Plac
     if found[0].probability >= SURE or len(found) == 1:
         return ()
     return tuple(place for place in found if place.probability >= LISTED)
-
-
-def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
-    """The one label, over all trials, that would decide most; None where nothing is open."""
-    questions = [s.question for s in segmentations if s.question is not None]
-    return max(questions, key=lambda question: question.gain, default=None)
 
 
 def _entropy(p: np.ndarray) -> float:
