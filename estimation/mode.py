@@ -71,7 +71,9 @@ def _climb() -> Callable[[np.ndarray, Tables], Any]:
     def climb(start: Any, tables: Tables) -> Any:
         return optimistix.minimise(loss, solver, start, tables, max_steps=MAX_STEPS, throw=False).value
 
-    program, processor = jax.jit(climb), jax.devices("cpu")[0]
+    # It runs for milliseconds: what optimising the program takes is more than what that could save.
+    quickly_compiled = {"xla_backend_optimization_level": 0}
+    program, processor = jax.jit(climb, compiler_options=quickly_compiled), jax.devices("cpu")[0]
 
     def on_processor(start: np.ndarray, tables: Tables) -> Any:
         with jax.default_device(processor):

@@ -1,7 +1,8 @@
 """Memory that is freed stays with the process, up to a bound, instead of being asked for anew.
 
 The C library gives arrays of more than 128 kB back to the system as soon as they are freed, and touching
-new pages then takes a tenth of a segmentation. Only for processes of our own: a library leaves its user's alone.
+new pages then takes a tenth of a segmentation. Only for processes of our own: a library leaves its user's
+alone.
 """
 
 from __future__ import annotations

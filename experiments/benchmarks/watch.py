@@ -186,7 +186,7 @@ def draw(by_lag: dict) -> None:
         axes.set(xlabel="lag [s]", ylabel="error of a boundary [ms]", yscale="log", xlim=(-0.005, 2.4))
         axes.set_xscale("symlog", linthresh=0.05)
         axes.set_xticks(lags, [f"{lag:g}" for lag in lags])
-        axes.legend()
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2)
 
 
 if __name__ == "__main__":
