@@ -10,7 +10,7 @@ last subtask, or starting outside of the first one, is leaving as well.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,13 +21,8 @@ from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED
 from hmmseg.segmentation.departure import column, departing, leaving, scored, settled
 from hmmseg.segmentation.emissions import Features
-from hmmseg.segmentation.free_contacts import (
-    Block,
-    FreeContacts,
-    fit_free_contacts,
-    log_evidence,
-    most_probable,
-)
+from hmmseg.segmentation.first_look import Block
+from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts, log_evidence, most_probable
 
 ENDING = 1e-3  # prior: and that its recording stops before the task's end
 MAX_RATE = 50.0  # chosen: Hz
@@ -105,10 +100,10 @@ def _consensus(others: Sequence[Conformity]) -> dict[str, Block]:
         if len(blocks) < 2:
             continue
         weights = [b.weight for b in blocks if np.isfinite(b.weight)]
-        median = Block(float(np.median([b.width for b in blocks])),
-                       float(np.median(weights)) if weights else np.nan)  # fmt: skip
-        if 2 * sum(not _differ(b, median) for b in blocks) > len(blocks):
-            out[name] = median
+        weight = float(np.median(weights)) if weights else np.nan
+        usual = Block(float(np.median([b.width for b in blocks])), weight)
+        if 2 * sum(not _differ(b, usual) for b in blocks) > len(blocks):
+            out[name] = usual
     return out
 
 
@@ -145,10 +140,9 @@ def conformity(
     """Compare the task's order with the alternative.
 
     Which of the trial's blocks is which object is the assignment of highest evidence among all
-    distinct ones (the first with which the trial fits, if any), unless `known` blocks say it.
+    tried (the first with which the trial fits, if any), unless `known` blocks say it.
     """
-    names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
-    candidates = assignments(free, names)
+    candidates = assignments(free, steps)
     if known:
         fixed = _recognised(free, known)
         candidates = [assignment | fixed for assignment in candidates]
@@ -169,17 +163,52 @@ def _recognised(free: FreeContacts, known: dict[str, Block]) -> dict[str, int | 
     return out
 
 
-def assignments(free: FreeContacts, names: list[str]) -> list[dict[str, int | None]]:
-    """Assignments of objects to the trial's blocks: distinct ones as long as there are enough."""
+def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, int | None]]:
+    """Assignments of the task's objects to the trial's blocks, likeliest first, MAX_ASSIGNMENTS at most.
+
+    Distinct ones as long as there are enough blocks, else all blocks are some object's. First as the trial
+    grips them, one after the other, and as if it had one grip more, or one less, than the task; then any.
+    """
+    names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
     numbers = range(len(free.blocks))
     if not numbers:
         return [dict.fromkeys(names)]
-    if len(numbers) < len(names):  # some objects look alike, or are never touched
-        orders = itertools.product(numbers, repeat=len(names))
-        orders = (order for order in orders if len(set(order)) == len(numbers))
-    else:
-        orders = itertools.permutations(numbers, len(names))
-    return [dict(zip(names, order, strict=True)) for order in itertools.islice(orders, MAX_ASSIGNMENTS)]
+    few = len(numbers) < len(names)  # some objects look alike, or are never touched
+    orders = (
+        itertools.product(numbers, repeat=len(names)) if few else itertools.permutations(numbers, len(names))
+    )
+    least = len(numbers) if few else len(names)
+    out: list[dict[str, int | None]] = []
+    for order in itertools.chain(_as_gripped(free, steps, names), orders):
+        each: dict[str, int | None] = dict(zip(names, order, strict=True))
+        if len(set(order)) == least and each not in out:
+            out.append(each)
+        if len(out) == MAX_ASSIGNMENTS:
+            break
+    return out
+
+
+def _as_gripped(
+    free: FreeContacts, steps: Sequence[Subtask], names: Sequence[str]
+) -> Iterator[tuple[int, ...]]:
+    """Blocks of the objects (num_objects,) as they are held when it is their turn.
+
+    Objects whose turn never comes are the blocks that are left, if any is.
+    """
+    moved = [str(then.object) for s, then in itertools.pairwise(steps) if s.state == FREE != then.state]
+    gripped = free.gripped
+    ways = [(moved, gripped)]
+    ways += [(moved, gripped[:k] + gripped[k + 1 :]) for k in range(min(len(gripped), len(moved)))]
+    ways += [(moved[:k] + moved[k + 1 :], gripped) for k in range(len(moved))]
+    for objects, blocks in ways:
+        first: dict[str, int] = {}
+        for name, block in zip(objects, blocks, strict=False):
+            first.setdefault(name, block)
+        left = [block for block in range(len(free.blocks)) if block not in first.values()]
+        for name in names:
+            if name not in first:
+                first[name] = left.pop(0) if left else 0
+        yield tuple(first[name] for name in names)
 
 
 def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[str, int | None]) -> Conformity:

@@ -43,6 +43,9 @@ def settled(
     every = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
     every[:, -1] = table
     every[:, :-1] = _settling_table(table, index, free.states)[:, None]
+    for i, c in enumerate(columns):  # a block is let go by fingers that open; a path that leaves may lose it
+        if c is not None and i > 0 and free.states[c][0] == FREE:
+            every[:, 0, i] += free.opened[: len(table)]
     model = _settling(log_initial, log_transition, stages, settle)
     return every.reshape(len(table), -1), stages, model
 

@@ -14,21 +14,19 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
-from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
-from hmmseg.segmentation.features import noise_sd
-from hmmseg.segmentation.fit import maximisation, otsu
+from hmmseg.segmentation.first_look import Block, blocks_of, filled, median, runs, ungripped
+from hmmseg.segmentation.fit import maximisation
 from hmmseg.segmentation.standing import standing
 
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
-SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
-SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
-APART = 10  # chosen: noise sds of the grip force between free and gripped
-# chosen: m from the heights at a grip's ends (medians of so many samples) to be lifted
-RAISED, ENDS = 3e-3, 3
+CLOSED = (
+    1e-3  # prior: share of blocks let go where they stand by fingers that slide off them, without opening
+)
 ROUNDS = 8  # numerics: of an iteration that settles sooner
 # cited: s; no touch that ends sooner can have been meant to lift: grip forces rise for about as long before a
 # lift as loads do in it, 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
@@ -38,29 +36,14 @@ IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never sh
 
 
 @dataclass(frozen=True)
-class Block:
-    """A block as one trial shows it: `width` [m] and `weight` [N] (NaN: never lifted)."""
-
-    width: float
-    weight: float
-
-    def like(self, other: Block, slack: float = 1.0) -> bool:
-        """Whether both can be the same block: like widths, and weights where both are known.
-
-        `slack` multiplies the tolerances.
-        """
-        narrow = abs(self.width - other.width) <= slack * SAME_WIDTH
-        apart = abs(self.weight - other.weight)  # NaN where either is unknown, which excludes nothing
-        return bool(narrow and not apart > slack * SAME_WEIGHT * max(self.weight, other.weight))
-
-
-@dataclass(frozen=True)
 class FreeContacts:
     """The fitted alternative: `table` (num_timesteps, num_states) of log-likelihoods of `states`.
 
     Samples are `interval` s apart. A state is (contact state, number of its block in `blocks`; None in
-    free motion); `path` (num_timesteps,) is the most probable sequence of states. `taps` [s] are touches of a
-    block before its grip: to the path they are free motion, in the table they say nothing.
+    free motion); `path` (num_timesteps,) is the most probable sequence of states. `opened` (num_timesteps,):
+    log-likelihoods of how far apart the fingers are, if they just let go of a block that stays where it is.
+    `taps` [s] are touches of a block before its grip: to the path they are free motion, in the table they say
+    nothing.
     """
 
     parameters: Parameters
@@ -68,20 +51,22 @@ class FreeContacts:
     states: tuple[tuple[str, int | None], ...]
     table: np.ndarray
     path: np.ndarray
+    opened: np.ndarray
     interval: float
     taps: tuple[tuple[float, float], ...] = ()
 
     @property
-    def num_grips(self) -> int:
-        """How many separate grips the path has."""
-        held = np.array([state != FREE for state, _ in self.states])[self.path]
-        return int((np.diff(held.astype(int), prepend=0) == 1).sum())
+    def gripped(self) -> list[int]:
+        """The block of each separate grip of the path, in order."""
+        block = np.array([-1 if number is None else number for _, number in self.states])[self.path]
+        begins = (block >= 0) & (np.r_[-1, block[:-1]] < 0)
+        return [int(number) for number in block[begins]]
 
 
 def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
     """Fit the alternative to one trial; `sliding`: whether the task has slides."""
-    bias, scale, held = _ungripped(f)
-    blocks = _blocks(f, bias, held)
+    bias, scale, held = ungripped(f)
+    blocks = blocks_of(f, bias, held)
     span = f.span["force"]
     weights = [b.weight for b in blocks if np.isfinite(b.weight)]
     parameters = Parameters(bias, {}, {
@@ -117,9 +102,29 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
     interval = float(np.median(np.diff(f.t)))
     tapped = _tapped(states, path, interval, f)
     taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
+    opened = _opened(f, states, path, parameters.bias)
     for span in tapped:
         table[span], path[span] = 0.0, 0
-    return FreeContacts(parameters, blocks, states, table, path, interval, taps)
+    return FreeContacts(parameters, blocks, states, table, path, opened, interval, taps)
+
+
+def _opened(
+    f: Features, states: tuple[tuple[str, int | None], ...], path: np.ndarray, bias: np.ndarray
+) -> np.ndarray:
+    """Log-likelihoods (num_timesteps,) of the fingers' distance, if they let go of what stays between them.
+
+    Pads that come off a block have been relaxed first: fingers are as far apart as it is wide. Where they are
+    no farther apart than while they held it, it has left them. Half of what pads give by the rig is enough,
+    as they may be stiffer. Over the density of any distance; 0 where nothing is known.
+    """
+    held = np.array([state != FREE for state, _ in states])[path]
+    given = f.block_width(bias) - f.d
+    least = np.full(f.t.size, -np.inf)
+    for start, stop in runs(held):
+        known = slice(start, stop)
+        least[start:] = median(f.d[known], -np.inf) + median(given[known], 0.0) / 2
+    chance = log_ndtr(np.where(np.isfinite(f.d), (f.d - least) / f.sd_d, np.inf))
+    return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED))
 
 
 def _tapped(
@@ -131,9 +136,8 @@ def _tapped(
     what is no block.
     """
     held = np.array([state != FREE for state, _ in states])[path]
-    force, stands = _filled(f.grip), standing(f.t, f.force, np.nan, ~held)
-    edges = np.flatnonzero(np.diff(np.r_[False, held, False].astype(int)))
-    grips = [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    force, stands = filled(f.grip), standing(f.t, f.force, np.nan, ~held)
+    grips = [slice(*run) for run in runs(held)]
     out = []
     for grip, following in itertools.pairwise(grips):
         touched = {states[k] for k in path[grip]}
@@ -199,84 +203,3 @@ def _subtasks(states: tuple[tuple[str, int | None], ...]) -> tuple[Subtask, ...]
         Subtask(i, state, None if block is None else str(block), state, None)
         for i, (state, block) in enumerate(states)
     )
-
-
-def _ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
-    """Force biases (4,), force scale and which samples are gripped: a start from the grip force.
-
-    Otsu's split always finds two groups. They are free and gripped only where they lie far
-    apart in terms of noise; where the lower one carries force as well, all is gripped.
-    """
-    found = np.array([noise_sd(f.force[:, c]) for c in range(4)])
-    noise = max(_median(found, 0.0), 1e-3 * f.span["force"])
-    grip = f.grip
-    there = np.isfinite(grip)
-    every = np.ones(grip.size, bool)
-    if there.sum() < 2:
-        return np.zeros(4), noise, ~every
-    split = otsu(grip)
-    low, high = grip[there & (grip <= split)], grip[there & (grip > split)]
-    apart = high.size > 0 and np.median(high) - np.median(low) > APART * noise
-    # Where one group alone is there, opposed forces far above the noise are a grip, others a bias.
-    opposed = abs(_median(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
-    if np.median(low) > (0.3 * np.median(high) if apart else 3 * APART * noise) and opposed:
-        return np.zeros(4), noise, every
-    threshold = np.median(low) + 0.25 * (np.median(high) - np.median(low)) if apart else np.inf
-    held = _filled(grip) > threshold
-    free = f.force[~held]
-    bias = np.array([_median(free[:, c], 0.0) for c in range(4)])
-    spread = np.array([1.4826 * _median(np.abs(free[:, c] - bias[c]), np.nan) for c in range(4)])
-    return bias, max(_median(spread, 0.0), noise), held
-
-
-def _median(values: np.ndarray, otherwise: float) -> float:
-    """Median of what is there."""
-    there = values[np.isfinite(values)]
-    return float(np.median(there)) if there.size else otherwise
-
-
-def _filled(values: np.ndarray) -> np.ndarray:
-    """Values with what is missing interpolated; zeros where all are."""
-    there = np.flatnonzero(np.isfinite(values))
-    return np.interp(np.arange(values.size), there, values[there]) if there.size else np.zeros(values.size)
-
-
-def _blocks(f: Features, bias: np.ndarray, held: np.ndarray) -> tuple[Block, ...]:
-    """Distinct blocks among the grips, each grip's width and weight by robust means."""
-    edges = np.flatnonzero(np.diff(np.r_[False, held, False].astype(int)))
-    fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
-    fx1, fx2 = (_filled(f.force[:, c] - bias[c]) for c in (0, 2))
-    widths = block_width(f.d, fx1, fx2, f.pads)
-    noise = noise_sd(f.force[:, 1])
-    found: list[Block] = []
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        span = slice(start, stop)
-        width = _median(widths[span], np.nan)
-        if stop - start < 2 or not np.isfinite(width):
-            continue
-        lifted = (fy / f.carrying)[span][_lifted(f, span)]
-        lifted = lifted[np.isfinite(lifted)]
-        weight = float(np.median(lifted)) if lifted.size > 2 else np.nan
-        # Of the median of n sums of two forces, whose standard error is sqrt(pi / 2) sqrt(2 / n) sds of one.
-        significant = weight > 3 * noise * np.sqrt(np.pi / max(lifted.size, 1))
-        block = Block(width, weight if significant else np.nan)
-        match = next((i for i, other in enumerate(found) if block.like(other)), None)
-        if match is None:
-            found.append(block)
-        elif not np.isfinite(found[match].weight):
-            found[match] = block
-    return tuple(found)
-
-
-def _lifted(f: Features, span: slice) -> np.ndarray:
-    """Which samples of one grip, (stop - start,), are surely of a lifted block.
-
-    Whatever is lifted moves vertically; a block that is pushed or only gripped does not. Velocities
-    tell it where they are known and exact; heights, which last longer, tell it of poor recordings: far
-    from where the grip begins and from where it ends.
-    """
-    moving = np.abs(f.vy[span]) > 6 * f.sd_vy[span]
-    height = _filled(f.y)[span]
-    least = np.maximum(4 * f.sd_y[span], RAISED)
-    ends = np.median(height[:ENDS]), np.median(height[-ENDS:])
-    return moving | np.all([np.abs(height - end) > least for end in ends], axis=0)

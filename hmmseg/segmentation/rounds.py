@@ -47,9 +47,8 @@ def cut(f: Features, task: BlockTask) -> list[float]:
     """
     free = fit_free_contacts(f, any(move.slide for move in task.moves))
     steps = subtasks(one_round(task))
-    names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
-    leave = min(0.5, max(4 * free.num_grips + 1, len(steps)) / len(f.t))
-    tried = assignments(free, names)
+    leave = min(0.5, max(4 * len(free.gripped) + 1, len(steps)) / len(f.t))
+    tried = assignments(free, steps)
     if len(tried) > 1:  # only the best one's table is made for the whole of a recording that may be long
         glance = replace(free, table=free.table[:GLANCE])
         tried = [max(tried, key=lambda each: _glanced(glance, steps, each, leave))]

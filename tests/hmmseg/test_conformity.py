@@ -9,15 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.boundary_worlds import WORLDS, trials_of
+from experiments.boundary_worlds import WORLDS, World, trials_of
+from experiments.calibration_worlds import ROWS, replicates
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import list_cases, read_case
+from experiments.sweeps.cells import Cell
 from experiments.sweeps.trials import scene
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial, read_trial
 from hmmseg.segmentation import align as segmentation
+from hmmseg.segmentation.conformity import MAX_RATE, judge
+from hmmseg.segmentation.features import features, thin
 
+RECORDINGS = Path(__file__).parents[2] / "recordings"
 STACK = Path(__file__).parents[1] / "data" / "stack"
 RIG = read_rig(STACK / "rig.toml")
 MOVES = (Move("block1", "ground"), Move("block2", "block1"))
@@ -154,6 +160,43 @@ def test_a_touch_as_long_as_a_grip_is_one():
     (found,) = segment(tap)
     assert found.complete
     assert found.spans[1].start == pytest.approx(b[0] + 0.9, abs=0.06)
+
+
+@pytest.mark.parametrize("case, which", [("none_1", 1), ("grip_slip_1", 0)])
+def test_a_block_that_falls_while_it_halts_in_the_air_was_not_put_down(case, which):
+    """Held still for three samples and then let go it would be placed, had the fingers opened."""
+    found = read_case(RECORDINGS / case)
+    fallen, expected = EDITS["drop_second"](found.trials[which], found.truth[which])
+    (verdict,) = judge([features(thin(task_space(fallen, found.rig), MAX_RATE), found.rig)], [found.task])
+    assert verdict.failing == expected
+    assert verdict.log_odds > 5  # without a look at the fingers' distance -0.3
+
+
+def test_pads_half_as_stiff_or_twice_as_stiff_as_stated_open_far_enough():
+    _, task = scene()
+    for factor in (0.5, 2.0):
+        values = {"normal_stiffness": 4000.0 * factor, "shear_stiffness": 2500.0 * factor}
+        world = World("pads", Cell(rate=50.0), effects={"fingertip_compliance": values})
+        for judged in trials_of(world, [70000, 70001]):
+            f = features(thin(task_space(judged.trial, judged.rig), MAX_RATE), judged.rig)
+            (verdict,) = judge([f], [task])
+            assert verdict.failing is None and verdict.log_odds < -5
+
+
+def test_a_tower_of_six_is_recognised_though_blocks_look_alike():
+    """Three of four such towers have two blocks within a millimetre: five look different, and there are
+    more ways to call them than can be tried."""
+    found = list(replicates(ROWS["6 blocks"], 2))
+    for replicate in found:
+        f = features(thin(task_space(replicate.trials[0], replicate.rig), MAX_RATE), replicate.rig)
+        (verdict,) = judge([f], [replicate.task])
+        assert verdict.failing is None
+        assert len(verdict.free.blocks) == 5
+    amid = float(found[0].boundaries[0][15:17].mean())  # in the release after the fourth move
+    short = join(found[0].trials[0], (-np.inf, amid))
+    f = features(thin(task_space(short, found[0].rig), MAX_RATE), found[0].rig)
+    (verdict,) = judge([f], [found[0].task])
+    assert verdict.failing == 17  # the fifth block's pickup
 
 
 def test_a_longer_recording_than_the_task():
