@@ -16,6 +16,7 @@ from experiments.blind_check.scene import PAD, PIVOT, STEP, TIP, Block, Servo, W
 from experiments.blind_check.tasks import GROUND, Task
 
 CLEAR = 0.016  # m between a carried block and what it passes over
+CLEARANCE = 0.001  # m between pads and what the block that they hold stands on
 OPEN = (0.010, 0.013)  # m that fingers are opened wider than a block
 
 
@@ -194,7 +195,8 @@ def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffnes
           pace: float) -> None:  # fmt: skip
     """One block from centre `start` to centre `end` past anything up to `top` [m]."""
     u = k.rng.uniform
-    lowest = PAD + TIP + 0.001 - start[1] if not style.untidy else -1.0  # pads keep clear of the table
+    # Pads keep clear of what the block stands on, also where they are sheared as it is pressed down.
+    lowest = PAD + TIP + CLEARANCE + style.press[1] / 2 / world.shear_stiffness - block.height / 2
     grasp = max(u(*style.height), lowest)
     over = max(top + block.height / 2 + CLEAR, k.value["y"])
     wide = block.width + u(*OPEN)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
+from hmmseg.contact.equations import block_width
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
-from hmmseg.segmentation.emissions import Features
+from hmmseg.segmentation.emissions import Features, Parameters
 from hmmseg.segmentation.features import features, thin
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.misfit import Plan, at, explain, plan, task_boundaries
@@ -22,14 +24,15 @@ from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes,
 from hmmseg.segmentation.recorded import Parts, Recorded
 from hmmseg.segmentation.rounds import cut, merge_point, one_round, round_tasks, slices
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
-from hmmseg.segmentation.standing import standing
+from hmmseg.segmentation.standing import astride, standing
 
 
 @dataclass(frozen=True)
 class Piece:
     """One round of one recording (of a task done once: all of it), aligned.
 
-    `first`, `last` [s] are its ends; `failed` counts subtasks from its own first.
+    `first`, `last` [s] are its ends; `failed` counts subtasks from its own first. `remarks`: what was done
+    beside the task.
     """
 
     boundaries: tuple[BoundaryPosterior, ...]
@@ -38,6 +41,7 @@ class Piece:
     evidence: float
     first: float
     last: float
+    remarks: tuple[str, ...] = ()
 
 
 def aligned_rounds(
@@ -104,7 +108,29 @@ def _aligned(reading: Reading, steps: tuple[Subtask, ...], pool: Pool, j: int) -
     alignment, t = pool.fit.posteriors[j], reading.thinned.t
     boundaries = boundary_posteriors(pool.changes[j], pool.disagreement, t, alignment, reading.fine.touches)
     evidence = float(alignment.log_evidence)
-    return Piece(boundaries, to_spans(steps, boundaries, *reading.ends), None, evidence, *reading.ends)
+    spans = to_spans(steps, boundaries, *reading.ends)
+    remarks = _closed_on_others(reading, spans, pool.fit.parameters)
+    return Piece(boundaries, spans, None, evidence, *reading.ends, remarks)
+
+
+def _closed_on_others(reading: Reading, spans: Sequence[Span], p: Parameters) -> tuple[str, ...]:
+    """What is said of fingers that closed on something wider before they held their block."""
+    s, out = reading.fine, []
+    force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1) - p.bias
+    press = np.stack([force[:, 0], -force[:, 2]], axis=1)
+    apart = block_width(s.distance, force[:, 0], force[:, 2], reading.features.pads)
+    noise = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    for before, grip in itertools.pairwise(spans):
+        width = p.width.get(str(grip.object))
+        if before.state != FREE or grip.state == FREE or width is None:
+            continue
+        met = astride(s.t, press, apart, noise, width, grip.start)
+        if met is not None:
+            out.append(
+                f"the fingers closed on something {1e3 * met[1]:.0f} mm wide at {met[0]:.2f} s, before they "
+                f"held {grip.object}: on what it stands on, or on what the task does not name"
+            )
+    return tuple(out)
 
 
 def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity, pool: Pool) -> Piece:
@@ -170,7 +196,8 @@ def joined(
         failures.append(Failure(step.index, step.name, step.object, reason, len(pieces) + 1))
     segmentation = Segmentation(
         file, rate, sum(p.evidence for p in pieces), tuple(spans), failures[0] if failures else None,
-        len(pieces) if number > 1 or open_end else None, tuple(failures), recorded, remarks,
+        len(pieces) if number > 1 or open_end else None, tuple(failures), recorded,
+        (*remarks, *(f"{file}: {r}" for piece in pieces for r in piece.remarks)),
     )  # fmt: skip
     return segmentation, tuple(boundaries), present
 

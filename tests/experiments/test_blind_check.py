@@ -17,7 +17,7 @@ from experiments.blind_check.generate import NOMINAL, generate  # noqa: E402
 from experiments.blind_check.hand import angles, load_rig, rates, tips  # noqa: E402
 from experiments.blind_check.judge import judge_case  # noqa: E402
 from experiments.blind_check.operator import Style, plan  # noqa: E402
-from experiments.blind_check.perform import perform  # noqa: E402
+from experiments.blind_check.perform import SETTLE, perform  # noqa: E402
 from experiments.blind_check.scene import PIVOT, STEP, Block, Servo, World, mjcf  # noqa: E402
 from experiments.blind_check.score import figures  # noqa: E402
 from experiments.blind_check.sealing import BrokenSeal, unseal  # noqa: E402
@@ -95,6 +95,27 @@ def test_pads_are_linear_and_do_not_slip(motion):
     offset = p[:, 3] - p[:, 1] - (f[:, 3] - f[:, 1]) / RIG.shear_stiffness
     turned = offset - motion.turns[held, 0] * BLOCKS["block1"].width
     assert np.quantile(np.abs(turned - np.median(turned)), 0.99) < 8e-6
+
+
+def test_pads_touch_no_block_but_the_one_that_is_moved(monkeypatch):
+    """Low blocks on wide ones, pressed hard: what is beneath is as near to the pads as it can be."""
+    touched: set[tuple[str, int]] = set()
+    step = mujoco.mj_step
+
+    def watched(model, data, count=1):
+        step(model, data, count)
+        for pair in data.contact.geom[: data.ncon].tolist():
+            names = sorted(model.geom(i).name for i in pair)
+            if names[1].startswith("tip"):
+                touched.add((names[0], round(data.time / STEP)))
+
+    monkeypatch.setattr("experiments.blind_check.perform.mujoco.mj_step", watched)
+    low = {"block1": Block(0.5, 0.017, 0.013, 0.6), "block2": Block(0.35, 0.026, 0.013, 0.6)}
+    style = Style(press=(1.7, 1.7), height=(-0.0012, -0.0012))
+    done = perform(plan(TASK, low, HEALTHY, style, np.random.default_rng(4)), low, HEALTHY)
+    amid = (done.boundaries[3] + done.boundaries[4]) / 2 + SETTLE
+    assert {name for name, n in touched if n * STEP < amid} == {"box_block1"}
+    assert {name for name, n in touched if n * STEP > amid} == {"box_block2"}
 
 
 def test_angles_and_tips_are_inverse(motion):
