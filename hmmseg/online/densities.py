@@ -1,4 +1,4 @@
-"""Log densities of single readings, compiled: Student-t, a uniform with soft edges."""
+"""Log densities of single readings, compiled: Student-t, a uniform with soft edges, as off line."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ def log_student(residual, variance):
 
 
 @compiled
-def _log_normal_cdf(z):
-    return math.log(0.5 * math.erfc(-z / _ROOT2)) if z > -30.0 else -450.0
+def _log_student_below(z):
+    root = math.sqrt(z * z + TAIL)
+    above = TAIL / (root * (root - z)) if z < 0.0 else 1.0 + z / root
+    return 2 * math.log(above) + math.log(3.0 - above) - math.log(4.0)
 
 
 @compiled
@@ -38,7 +40,7 @@ def log_between(value, low, high, scale, span):
     """Log density of a uniform on [low, high] of width `span` with noise-softened edges."""
     if math.isnan(value):
         return 0.0
-    soft = _log_normal_cdf((value - low) / scale) + _log_normal_cdf((high - value) / scale)
+    soft = _log_student_below((value - low) / scale) + _log_student_below((high - value) / scale)
     return max(soft, _LEAST) - math.log(span)
 
 

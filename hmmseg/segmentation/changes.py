@@ -18,15 +18,13 @@ from scipy.special import ndtr
 from hmmseg.levels import SURE
 from hmmseg.segmentation.boundaries import (
     ONSET,
-    POINTS,
     UNIFORM,
     BoundaryPosterior,
-    Crossing,
-    Kind,
     blurred,
     crossing_density,
     first_of,
 )
+from hmmseg.segmentation.motions import POINTS, Crossing, Kind
 from hmmseg.segmentation.switching import Penetration, switch_probability
 
 LIKELY = 1e-3  # chosen: least probability of an interval within which the crossing is looked at
@@ -288,7 +286,9 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
     before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
         found = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-        if n == 0 or len(change.contacts) == 1:  # a block is set down in several motions
+        if len(change.contacts) == 1:  # a block is set down in several motions
+            return replace(found, restless=c.restless(n))
+        if n == 0:
             return found
         then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
         return replace(found, earlier=then) if np.isfinite(then).all() else found

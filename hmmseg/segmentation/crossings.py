@@ -136,7 +136,8 @@ class Contacts:
         moved = self.sensing.delay * np.nan_to_num(rate)
         if not making and self.sensing.delay < 0:
             return replace(c, place=c.place - moved)
-        sure = c.pressed > SURE * c.sd_apart
+        # What its place says is apart has no compression that could be late: its force rings.
+        sure = (c.pressed > SURE * c.sd_apart) & ~(c.free_place < -SURE * c.sd_place)
         return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
 
 

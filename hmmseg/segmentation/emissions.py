@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln, log_ndtr
+from scipy.special import gammaln
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
@@ -120,9 +120,16 @@ def log_student(residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
     return np.where(np.isfinite(value), value, 0.0)
 
 
+def log_student_below(z: np.ndarray) -> np.ndarray:
+    """Log probability that a standard Student-t variable (of TAIL degrees of freedom) lies below z."""
+    root = np.sqrt(z**2 + TAIL)
+    above = np.where(z < 0, TAIL / (root * (root - z)), 1 + z / root)  # 1 + z / root without cancellation
+    return 2 * np.log(above) + np.log(3 - above) - np.log(4)
+
+
 def _log_between(value: np.ndarray, low: float, high: float, scale: float) -> np.ndarray:
     """Log density of a uniform on [low, high] with noise-softened edges; 0 where missing."""
-    soft = log_ndtr((value - low) / scale) + log_ndtr((high - value) / scale)
+    soft = log_student_below((value - low) / scale) + log_student_below((high - value) / scale)
     # Bounded below: one wild sample is a transient, not proof against a state.
     return np.where(np.isfinite(value), np.maximum(soft, -25.0) - np.log(high - low), 0.0)
 

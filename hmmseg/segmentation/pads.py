@@ -249,7 +249,7 @@ def _compliance(
     readings: Sequence[tuple[np.ndarray, np.ndarray, float]], prior: tuple[float, float]
 ) -> Compliance:
     """Common compliance of all stretches, each with a rest of its own; `prior`: mean and sd [m/N]."""
-    found = [fitted(load, place, sd)[:2] for load, place, sd in readings]
+    found = [_slope(*one) for one in readings]
     c, w = (np.array([f[i] for f in found if f[1] > 0]) for i in (0, 1))
     if not c.size:
         return Compliance(prior[0], prior[1], FORM)
@@ -265,6 +265,21 @@ def _compliance(
     total = trusted.sum() + prior[1] ** -2
     value = max(float((trusted @ c + prior[0] * prior[1] ** -2) / total), 0.0)
     return Compliance(value, float(total**-0.5), float(np.sqrt(between)) / max(value, RIGID))
+
+
+def _slope(load: np.ndarray, place: np.ndarray, sd: float) -> tuple[float, float]:
+    """Compliance [m/N] of one stretch, and its information.
+
+    Loads that ring while nothing moves flatten the line of places over loads, to none at the worst, and make
+    that of loads over places too steep: the truth lies between (Frisch 1934). How far they differ is doubt.
+    """
+    slope, told, _ = fitted(load, place, sd)
+    if told == 0:
+        return float(slope), 0.0
+    steep = float(fitted(place, load, sd * float(np.ptp(load) / max(np.ptp(place), sd)))[0])
+    moved = max(1.0 - sd**2 / max(float(np.var(place)), 1e-300), 0.0)  # the share that is no noise of places
+    apart = max(moved / steep - float(slope), 0.0) if steep > 0 else np.inf
+    return float(slope), float(1.0 / (1.0 / told + apart**2))
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

@@ -10,11 +10,11 @@ import numpy as np
 from hmmseg.contact.decompose import Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.segmentation.boundaries import Kind
 from hmmseg.segmentation.changes import Change, Disagreement, disagreements
 from hmmseg.segmentation.emissions import Features, Parameters
 from hmmseg.segmentation.features import WINDOW, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
+from hmmseg.segmentation.motions import Kind
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import contact_changes
 

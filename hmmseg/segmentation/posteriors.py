@@ -11,10 +11,11 @@ from hmmseg.contact.decompose import FREE, Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.alignment import Alignment
 from hmmseg.levels import DRIFTS
-from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal
+from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
 from hmmseg.segmentation.changes import Change, Disagreement, Prior, moment
 from hmmseg.segmentation.crossings import contacts
 from hmmseg.segmentation.emissions import Parameters
+from hmmseg.segmentation.motions import Kind
 from hmmseg.segmentation.pads import Sensing
 from hmmseg.segmentation.spans import Span
 from hmmseg.segmentation.tilt import corner_drops

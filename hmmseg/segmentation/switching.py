@@ -23,6 +23,7 @@ from scipy.special import log_ndtr
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
+LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 TAIL = 4.0  # prior: Student-t residuals, as in the emissions
@@ -55,6 +56,14 @@ class Penetration:
     def free_place(self) -> np.ndarray:
         """Place (num_samples,) [m] of a thing that is apart."""
         return self.place if self.ahead is None else self.place + self.ahead
+
+    def restless(self, n: int) -> float:
+        """How much the speed of what comes down wanders up to sample n: its variance a second [m^2/s^3]."""
+        last = slice(max(n - LOOKED_BACK, 0), n + 1)
+        change, step = np.diff(self.rate[0, last]), np.diff(self.t[last])
+        there = np.isfinite(change)
+        wandered = float(np.sum(change[there] ** 2)) - 2 * self.sd_rate**2 * there.sum()
+        return max(wandered, 0.0) / float(step[there].sum()) if there.any() else 0.0
 
 
 def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

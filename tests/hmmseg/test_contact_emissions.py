@@ -20,6 +20,7 @@ from hmmseg.segmentation.emissions import (
     _log_ungripped,
     log_likelihoods,
     log_student,
+    log_student_below,
 )
 
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
@@ -31,6 +32,11 @@ PARAMETERS = Parameters(
            "level": 1e-4, "width": 1e-4},
     levels=({1: 0.01, 2: 0.01, 3: 0.01},),
 )  # fmt: skip
+
+
+def test_edges_are_students_distribution_far_into_their_tails():
+    z = np.array([-1e5, -60.0, -4.0, -0.3, 0.0, 0.3, 4.0, 60.0])
+    np.testing.assert_allclose(log_student_below(z), stats.t.logcdf(z, TAIL), rtol=1e-12, atol=1e-15)
 
 
 def features(num, **columns):

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.boundary_worlds import World, trials_of
+from experiments.boundary_worlds import WORLDS, World, trials_of
 from experiments.sweeps.cells import Cell
 from experiments.sweeps.trials import scene
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import Parameters
-from hmmseg.segmentation.pads import Sensing, limited, read_again
+from hmmseg.segmentation.pads import Sensing, _compliance, limited, read_again
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest
 
 PRIOR = (2.5e-4, 0.75e-4)
@@ -52,6 +52,29 @@ def test_a_filter_is_told_from_a_delay():
     own = [squeeze(constant=0.03, seed=i) for i in range(8)]
     late, filtered = (evidence([own], [PRIOR], grid, which)[0] for which in (False, True))
     assert filtered.max() > late.max() and grid[filtered.argmax()] == pytest.approx(0.03, abs=0.0101)
+
+
+def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
+    """Half a second of ringing after one sample of the touch: the line of places over loads is flat."""
+    s = squeeze(step=0.05)
+    since = s.t - s.t[0]
+    held = np.where(since > 0, 4.0, 1.0)  # N
+    ring = 2.0 * np.sin(160 * since) * np.exp(-since / 0.3)
+    place = 0.02 - 2.5e-4 * held + 2e-5 * np.random.default_rng(1).standard_normal(s.t.size)
+    flat = fitted(held + ring, place, s.sd)
+    assert flat[0] < 0.5 * 2.5e-4 and flat[1] > (0.2 * 2.5e-4) ** -2  # and sure of it
+    found = _compliance([(held + ring, place, s.sd)], PRIOR)
+    assert found.value == pytest.approx(PRIOR[0], abs=found.sd) and found.sd > 0.5 * PRIOR[1]
+    clean = _compliance([(held, place, s.sd)], PRIOR)
+    assert clean.value == pytest.approx(2.5e-4, abs=3 * clean.sd) and clean.sd < 0.2 * PRIOR[1]
+
+
+def test_releases_of_grips_that_ring_are_not_early():
+    _, task = scene()
+    (judged,) = trials_of(WORLDS["ringing 1 N"], [78004])
+    (found,) = segment([judged.trial], task, judged.rig)
+    ends = np.array([s.start for s in found.spans[1:]])
+    assert np.abs(ends - judged.boundaries)[3::4].max() < 0.02  # 26 and 37 ms with pads taken to be rigid
 
 
 def with_wild_ends():
