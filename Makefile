@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: robots-check bench-robot gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate
+.PHONY: robots-check bench-robot gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -115,6 +115,7 @@ wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and o
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
 	$(BIN)/python -m experiments.readme_figures
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
+	$(BIN)/python -m experiments.stamps
 
 results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
@@ -159,12 +160,14 @@ paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills doc
 	$(BIN)/python -m paper_figs
 	$(BIN)/python -m experiments.paper.write_docs
 	$(BIN)/python -m experiments.sweeps --small --workers 2
+	$(BIN)/python -m experiments.stamps
 
 sweeps: $(INSTALLED)  ## robustness sweeps in full (half an hour on 2 cores), resumable; tables and figures
 	$(BIN)/python -m experiments.sweeps --workers 2
 	$(BIN)/python -m paper_figs.sweep_plane
 	$(BIN)/python -m paper_figs.sweep_lines
 	$(BIN)/python -m paper_figs.sweep_coverage
+	$(BIN)/python -m experiments.stamps
 
 CHECKED := build/check_gap
 SEALED := experiments/blind_check/sealed_small

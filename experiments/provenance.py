@@ -25,6 +25,13 @@ FIGURES = {
     ),
     "readme-figures": ("demo_segments", "play"),
 }  # fmt: skip
+# Pages whose tables a script of their own writes, by its target.
+PAGES_OF = {
+    "boundaries": "segmentation_results",
+    "constants": "constants",
+    "paper": "reproduction",
+    "sweeps": "sweeps",
+}
 
 
 def table(tables: Iterable[tuple[str, str, str]]) -> str:
@@ -32,6 +39,8 @@ def table(tables: Iterable[tuple[str, str, str]]) -> str:
     made: dict[str, list[str]] = {}
     for page, name, target in tables:
         made.setdefault(target, []).append(f"{page.removeprefix('docs/')} ({name.replace('_', ' ')})")
+    for target, page in PAGES_OF.items():
+        made.setdefault(target, []).append(f"{page}.md")
     rows = []
     for target in sorted(made.keys() | FIGURES.keys()):
         figures = ", ".join(FIGURES.get(target, ()))

@@ -11,10 +11,18 @@ ROOT = Path(__file__).parents[1]
 
 
 def commit_of(root: Path = ROOT) -> str | None:
-    """The commit of a checkout, with a plus sign where its code was changed since; None outside of one."""
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
-    try:
+    """The commit of a checkout, with a plus sign where its code was changed since; None outside of one.
+
+    Results and figures that were made anew since are no change of the code.
+    """
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(root), *words]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    try:
+        commit = git("rev-parse", "--short=12", "HEAD")
+        return commit + "+" * bool(git("status", "--porcelain", "--", "*.py", "*.toml"))
     except (OSError, subprocess.CalledProcessError):
         return None
 

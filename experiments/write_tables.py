@@ -2,7 +2,8 @@
 
     python -m experiments.write_tables
 
-Text between <!-- name --> and <!-- /name --> is replaced; what has no result yet stays as it is.
+Text between <!-- name --> and <!-- /name --> is replaced; what has no result yet stays as it is. Figures that
+were drawn on the way get the commit that drew them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from experiments import (
     patch_heldout,
     provenance,
     spent_sets,
+    stamps,
     table_blind_check,
     table_calibration,
     table_gap,
@@ -215,6 +217,7 @@ def main() -> None:
         if table is not None:
             path.write_text(fill(path.read_text(encoding="utf-8"), name, table), encoding="utf-8")
             print(f"{file}: {name}")
+    stamps.main()
 
 
 if __name__ == "__main__":

@@ -1,9 +1,15 @@
 """Every table and figure of the pages is made by a make target, and nothing is listed that is not there."""
 
+import io
 import re
 from pathlib import Path
 
-from experiments.provenance import FIGURES
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments.provenance import FIGURES, PAGES_OF
+from experiments.stamps import stamp_of, stamped
 from experiments.write_tables import TABLES, fill, targets
 
 ROOT = Path(__file__).parents[2]
@@ -43,3 +49,31 @@ def test_every_target_is_in_the_makefile_and_runs_what_it_says():
 def test_the_table_of_targets_is_of_this_code():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     assert fill(text, "targets", targets()) == text
+
+
+def test_pages_that_scripts_write_whole_are_listed():
+    text = {page.stem: page.read_text(encoding="utf-8") for page in PAGES}
+    for target, page in PAGES_OF.items():
+        assert f"make {target}" in text[page], page
+        assert re.search(rf"^{target}: ", MAKEFILE, re.MULTILINE), target
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs" / "figures").iterdir()), ids=lambda path: path.name)
+def test_every_figure_names_the_commit_that_made_it(path):
+    assert re.fullmatch(r"[0-9a-f]{7,12}", stamp_of(path.read_bytes()) or "")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "GIF"])
+def test_a_stamp_is_replaced_and_leaves_the_picture_alone(kind):
+    plain = io.BytesIO()
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (8, 9), dtype=np.uint8))
+    picture.save(plain, kind)
+    assert stamp_of(plain.getvalue()) is None
+    once = stamped(plain.getvalue(), "0123456789ab")
+    twice = stamped(once, "ba9876543210+")
+    assert stamp_of(once) == "0123456789ab" and stamp_of(twice) == "ba9876543210+"
+    assert len(twice) == len(once) + 1
+    for data in (once, twice):
+        np.testing.assert_array_equal(Image.open(io.BytesIO(data)).convert("L"), picture)
+    with pytest.raises(ValueError, match="neither"):
+        stamped(b"<svg>", "0123456789ab")

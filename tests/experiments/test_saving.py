@@ -27,6 +27,8 @@ def test_changed_code_is_told(tmp_path):
     git("commit", "-m", "first")
     clean = commit_of(tmp_path)
     assert clean is not None and not clean.endswith("+")
+    (tmp_path / "result.json").write_text("{}\n")
+    assert commit_of(tmp_path) == clean
     (tmp_path / "code.py").write_text("a = 2\n")
     assert commit_of(tmp_path) == clean + "+"
 
