@@ -1,4 +1,7 @@
-"""From subtask spans to block properties with uncertainty: `identify` gives an `Identification`."""
+"""From subtask spans to block properties with uncertainty: `identify` gives an `Identification`.
+
+Names that are not listed here are internal.
+"""
 
 from __future__ import annotations
 

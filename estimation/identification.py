@@ -27,14 +27,14 @@ from hmmseg.io.task import BlockTask
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg.tables import as_html, as_text
+from hmmseg.tables import Tabled
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # chosen
 
 
 @dataclass(frozen=True, repr=False)
-class Identification:
+class Identification(Tabled):
     """Everything `identify` found.
 
     `draws` (num_draws, num_properties) of the properties named by `names` (object, property) in
@@ -113,11 +113,9 @@ class Identification:
             "apart_from_laplace": found.apart,
         }  # fmt: skip
 
-    def __repr__(self) -> str:
-        return as_text(properties_table(self.to_json()))
-
-    def _repr_html_(self) -> str:
-        return as_html(properties_table(self.to_json()))
+    def tables(self):
+        """The properties, one a row."""
+        return [properties_table(self.to_json())]
 
     def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None):
         """Every property with its 68 and 95 % interval, against measured values where given; the axes."""

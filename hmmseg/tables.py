@@ -1,18 +1,40 @@
-"""Tables of results as text, for `repr`, and as HTML, for a notebook."""
+"""Results that read like the tables on the terminal: as text, for `repr`, and as HTML, for a notebook."""
 
 from __future__ import annotations
 
 import html
 import io
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.table import Table
+if TYPE_CHECKING:  # rich is loaded when something is shown
+    from rich.table import Table
 
 WIDTH = 120  # look: characters of a `repr`
 
 
+class Tabled:
+    """A result that shows itself as its `tables`, after its `words` if it has any."""
+
+    def tables(self) -> list[Table]:
+        """The tables that are shown."""
+        raise NotImplementedError
+
+    def words(self) -> str:
+        """What is said before them, a line or nothing."""
+        return ""
+
+    def __repr__(self) -> str:
+        return "\n".join([*filter(None, [self.words()]), *map(as_text, self.tables())])
+
+    def _repr_html_(self) -> str:
+        said = f"<p>{html.escape(self.words())}</p>" if self.words() else ""
+        return said + "".join(map(as_html, self.tables()))
+
+
 def as_text(table: Table) -> str:
     """The table as the terminal shows it, without colours."""
+    from rich.console import Console
+
     out = io.StringIO()
     Console(file=out, width=WIDTH, color_system=None).print(table, highlight=False, markup=False)
     return out.getvalue()

@@ -100,7 +100,6 @@ def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, fi
     """Trials by the model's own operator: files by name, and their part of the document."""
     import numpy as np
 
-    from hmmseg.hand.signals import task_space
     from simgap.world.animation import Scene, Trace
     from simgap.world.operator import OperatorSettings, read_operator
     from simgap.world.simulate import simulate_trials
@@ -119,12 +118,8 @@ def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, fi
         files |= trial_files(k, simulated.trial, simulated.boundaries, simulated.seed)
         if not np.isfinite(simulated.boundaries).all():
             out.warn(f"trial_{k:02d}: the task failed (a block was not lifted or was dropped)")
-        signals = task_space(simulated.trial, rig)
         if out.figures is not None and np.isfinite(simulated.boundaries).all():
-            from hmmseg.plot.signals import draw_signals
-
-            found = _segmentation(f"trial_{k:02d}.csv", signals, task, simulated.boundaries)
-            draw_signals(signals, found, out.figure(f"trial_{k:02d}_signals.png"))
+            simulated.plot(out.figure(f"trial_{k:02d}_signals.png"))
         t, force = simulated.t, simulated.motion.force
         traces = [Trace("Grip [N]", [("", t, np.minimum(force[:, 0, 0], -force[:, 1, 0]))]),
                   Trace("Net $f_y$ [N]", [("", t, force[..., 1].sum(1))]),
@@ -132,8 +127,7 @@ def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, fi
         scene = Scene(t, simulated.motion.position, simulated.motion.blocks,
                       {name: blocks[name] for name in task.objects}, rig)  # fmt: skip
         films.append((f"trial_{k:02d}", scene, traces))
-        rows.append({"file": f"trial_{k:02d}.csv", "seed": simulated.seed, "rate": simulated.trial.rate,
-                     "boundaries": simulated.boundaries})  # fmt: skip
+        rows.append({"file": f"trial_{k:02d}.csv", **simulated.to_json()})
     return files, {"trials": rows}
 
 
@@ -182,17 +176,6 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     document = {"replay": {"file": str(path), "boundaries": boundaries, "complete": segmentation.complete,
                            "net_force_residual_over_noise": summary}}  # fmt: skip
     return trial_files(1, predicted, boundaries, seed), document
-
-
-def _segmentation(file: str, signals, task, boundaries):
-    """The truth as a segmentation without uncertainty, for the figures."""
-    from hmmseg.contact.decompose import subtasks
-    from hmmseg.segmentation.spans import Segmentation, Span
-
-    edges = [float(signals.t[0]), *map(float, boundaries), float(signals.t[-1])]
-    spans = tuple(Span(s.name, s.object, s.state, a, b, 0.0, 0.0, (a, a), (b, b))
-                  for s, a, b in zip(subtasks(task), edges[:-1], edges[1:], strict=True))  # fmt: skip
-    return Segmentation(file, 1.0, 0.0, spans)
 
 
 def _residual_table(summary: dict[str, float]) -> Table:

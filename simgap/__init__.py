@@ -1,4 +1,7 @@
-"""The virtual model of a hand and its blocks, and the gap between it and a recording."""
+"""The virtual model of a hand and its blocks, and the gap between it and a recording.
+
+Names that are not listed here are internal.
+"""
 
 from __future__ import annotations
 

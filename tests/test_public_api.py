@@ -113,6 +113,29 @@ def test_results_read_like_the_terminals_table(found):
     assert "<table>" in found._repr_html_() and "<td>block1</td>" in found._repr_html_()
     segmentation = found.segmentations[0]
     assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
+    aligned = found.aligned
+    assert "trial_02.csv" in repr(aligned) and len(aligned.to_json()["trials"]) == 2
+
+
+def test_a_simulated_trial_shows_its_truth(found, tmp_path):
+    made = simgap.simulate(STACK / "task.toml", STACK / "rig.toml", seed=3)[0]
+    text = repr(made)
+    assert "pickup block1" in text and "0.343 N" in text and "1.59 cm" in text
+    starts = [span.start for span in made.segmentation.spans[1:]]
+    np.testing.assert_array_equal(starts, made.boundaries)
+    assert made.to_json()["seed"] == made.seed
+    made.plot(tmp_path / "truth.png")
+    assert (tmp_path / "truth.png").stat().st_size > 10_000
+
+
+def test_a_learned_model_says_how_long_its_states_last():
+    t = np.arange(0.0, 6.0, 0.02)
+    noise = np.random.default_rng(0).normal(0.0, 0.05, (4, t.size))
+    trials = [{"t": t, "force": np.where(t < 2.0 + 0.3 * k, 0.0, 3.0) + noise[k]} for k in range(4)]
+    model = hmmseg.fit(trials, {"sequence": ["approach", "press"]})
+    row = next(line for line in repr(model).splitlines() if "approach" in line)
+    assert float(row.split("│")[2]) == pytest.approx(2.45, abs=0.05)
+    assert "<td>press</td>" in model._repr_html_()
 
 
 def test_a_wrong_name_names_the_nearest(found):

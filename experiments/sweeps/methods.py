@@ -12,7 +12,7 @@ from hmmseg.contact.decompose import Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.segmentation.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.spans import Failure, Segmentation, Span, known
 from hmmseg.segmentation.thresholds import NUMBERS, StateLabels
 from simgap.world.properties import Block
 
@@ -51,13 +51,9 @@ def _placed(segmentation: Segmentation, steps: Sequence[Subtask]) -> list[tuple[
 
 def segmentation_from(steps: Sequence[Subtask], shown: Sequence[int], edges: Sequence[float]) -> Segmentation:
     """Segmentation of certain boundaries: subtasks `shown` between `edges` (one more) [s]."""
-    spans = tuple(
-        Span(steps[s].name, steps[s].object, steps[s].state, float(a), float(b), 0.0, 0.0, (a, a), (b, b))
-        for s, a, b in zip(shown, edges[:-1], edges[1:], strict=True)
-    )
     missing = [s for s in steps if s.index not in shown]
     failed = Failure(missing[0].index, missing[0].name, missing[0].object, "not shown") if missing else None
-    return Segmentation("", 0.0, None, spans, failed)
+    return known("", 0.0, [steps[s] for s in shown], edges, failed)
 
 
 def numbered_states(steps: Sequence[Subtask], boundaries: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 from hmmseg.contact.identifiability import FRICTION, FRICTION_ON, HEIGHT, WEIGHT, WIDTH, Source, Unknown
 from hmmseg.contact.states import ABOVE_GROUND, FREE, SLIDING
 from hmmseg.io.task import AnyTask
+from hmmseg.tables import Tabled
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Property:
 
 
 @dataclass(frozen=True, repr=False)
-class Decomposition:
+class Decomposition(Tabled):
     """A task's subtasks in order, and for each object's properties what reveals them."""
 
     task: AnyTask
@@ -127,17 +128,11 @@ class Decomposition:
 
         return decomposition_document(self)
 
-    def __repr__(self) -> str:
+    def tables(self) -> list[Any]:
+        """The subtasks and what each reveals."""
         from hmmseg.contact.tables import decomposition_table
-        from hmmseg.tables import as_text
 
-        return as_text(decomposition_table(self))
-
-    def _repr_html_(self) -> str:
-        from hmmseg.contact.tables import decomposition_table
-        from hmmseg.tables import as_html
-
-        return as_html(decomposition_table(self))
+        return [decomposition_table(self)]
 
 
 def _rank(name: str) -> int:

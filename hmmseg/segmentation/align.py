@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +25,7 @@ from hmmseg.segmentation.pieces import aligned_rounds, joined, performed
 from hmmseg.segmentation.recorded import InMemory, OnDisk
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.tables import trials_table
-from hmmseg.tables import as_html, as_text
+from hmmseg.tables import Tabled
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class TrialAlignment:
 
 
 @dataclass(frozen=True, repr=False)
-class AlignedTrials:
+class AlignedTrials(Tabled):
     """All trials of one task; those that fit it are aligned together by one fit.
 
     `fit` pools the trials, or the rounds of a repeated task, that fit, in order; without any it has no
@@ -62,11 +64,17 @@ class AlignedTrials:
         """One segmentation a trial."""
         return [trial.segmentation for trial in self.trials]
 
-    def __repr__(self) -> str:
-        return as_text(trials_table(self.segmentations))
+    def to_json(self) -> dict[str, Any]:
+        """The trials of `segment`'s JSON document."""
+        return {"trials": [s.to_json() for s in self.segmentations]}
 
-    def _repr_html_(self) -> str:
-        return as_html(trials_table(self.segmentations))
+    def tables(self) -> list[Any]:
+        """One row a trial: whether it fits its task."""
+        return [trials_table(self.segmentations)]
+
+    def plot(self, trial: int = 0, path: str | Path | None = None) -> list[Any]:
+        """One trial's signals over the coloured subtasks; the axes. Saved where a path is given."""
+        return self.segmentations[trial].plot(path)
 
 
 def align(

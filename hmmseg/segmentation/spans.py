@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+from hmmseg.contact.decomposition import Subtask
+from hmmseg.tables import Tabled
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class Failure:
 
 
 @dataclass(frozen=True, repr=False)
-class Segmentation:
+class Segmentation(Tabled):
     """Spans of one trial; `failed` where the recording does not fit its task.
 
     `log_evidence` is None from a method that has no likelihood. Of a repeated task, `repetitions` says
@@ -132,17 +135,15 @@ class Segmentation:
 
         return pd.DataFrame([span.to_json() for span in self.spans])
 
-    def __repr__(self) -> str:
+    def tables(self) -> list[Any]:
+        """The spans, one a row."""
         from hmmseg.segmentation.tables import spans_table
-        from hmmseg.tables import as_text
 
-        return as_text(spans_table(self)) + (f"{self.failed}\n" if self.failed else "")
+        return [spans_table(self)]
 
-    def _repr_html_(self) -> str:
-        from hmmseg.segmentation.tables import spans_table
-        from hmmseg.tables import as_html
-
-        return as_html(spans_table(self))
+    def words(self) -> str:
+        """Where it does not fit its task."""
+        return str(self.failed or "")
 
     def plot(self, path: str | Path | None = None) -> list[Any]:
         """Signals over the coloured subtasks; the axes, one a signal. Saved where a path is given.
@@ -162,3 +163,15 @@ def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
     """The one label, over all trials, that would decide most; None where nothing is open."""
     questions = [s.question for s in segmentations if s.question is not None]
     return max(questions, key=lambda question: question.gain, default=None)
+
+
+def known(
+    file: str, rate: float, shown: Iterable[Subtask], edges: Sequence[float],
+    failed: Failure | None = None, recorded: Any = None,
+) -> Segmentation:  # fmt: skip
+    """The subtasks `shown` between `edges` [s] (one more) that are known: without uncertainty or evidence."""
+    spans = tuple(
+        Span(s.name, s.object, s.state, float(a), float(b), 0.0, 0.0, (float(a),) * 2, (float(b),) * 2)
+        for s, a, b in zip(shown, edges[:-1], edges[1:], strict=True)
+    )
+    return Segmentation(file, rate, None, spans, failed, recorded=recorded)

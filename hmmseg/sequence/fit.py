@@ -163,7 +163,7 @@ def _finish(data: list[Features], task: SequenceTask, mapping: FeatureMap, learn
                           np.tile([0.0, np.inf], (2, 1)))  # fmt: skip
     per_trial = []
     for each in data:
-        judge = model.judge(each)
-        ll = judge.emissions.log_likelihoods(each.values)
-        per_trial.append(sequence_misfit.scores(ll, mean_cells, judge.align([each])[0]))
-    return replace(model, misfit=sequence_misfit.reference(per_trial))
+        plain = model.without_templates(each)
+        ll = plain.emissions.log_likelihoods(each.values)
+        per_trial.append(sequence_misfit.scores(ll, mean_cells, plain.align([each])[0]))
+    return replace(model, usual_scores=sequence_misfit.reference(per_trial))

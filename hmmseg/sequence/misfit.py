@@ -42,18 +42,19 @@ def reference(per_trial: Sequence[np.ndarray]) -> np.ndarray:
     return np.column_stack([center, widened])
 
 
-def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.ndarray, misfit: np.ndarray,
+def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.ndarray, usual: np.ndarray,
                  log_likelihoods: np.ndarray, mean_cells: np.ndarray,
                  alignment: Alignment) -> Failure | None:  # fmt: skip
     """The first subtask at which the trial leaves its task; None where it fits.
 
+    `usual` (2, 2): what `reference` gave of the trials learned from.
     The first subtask may be cropped to any length, so it is never called squeezed.
     """
     for k in range(1, len(names)):
         cells = float(alignment.smoothed[:, k].sum())
         if not optional[k] and typical[k] >= MEASURABLE and cells < max(SQUEEZED * typical[k], 2.0):
             return Failure(k, names[k], None, "is squeezed to almost nothing: it does not happen")
-    worse, poorer = (scores(log_likelihoods, mean_cells, alignment) - misfit[:, 0]) / misfit[:, 1]
+    worse, poorer = (scores(log_likelihoods, mean_cells, alignment) - usual[:, 0]) / usual[:, 1]
     if worse > SPREADS:
         path = ergodic.viterbi(*_free(log_likelihoods, mean_cells)).path
         k, reason = _first_departure(path, names, optional)

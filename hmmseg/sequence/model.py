@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,20 +16,21 @@ from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions
 from hmmseg.sequence.features import FeatureMap, Features
 from hmmseg.sequence.transitions import Transitions, transitions
+from hmmseg.tables import Tabled
 
 FORMAT = "hmmseg.sequence-model/3"
 INDEPENDENT = 250.0  # chosen: independent observations that one trial's fit is judged by in the limit of many
 
 
-@dataclass(frozen=True)
-class SequenceModel:
+@dataclass(frozen=True, repr=False)
+class SequenceModel(Tabled):
     """Emissions and durations of a plain ordered task, from `fit_sequence`.
 
     There is one state a subtask and, where unlabelled trials show it, one more, `settled`: they run on after
     the last event, and what then happens (decay, rest) belongs to the last subtask but looks
     different. `mean_cells`, `presence` (num_states,): mean duration in cells and the probability
     that an optional state occurs. `typical` (num_states,) is the median duration [cells] in the
-    trials learned from, `misfit` (2, 2) their median and spread of the two scores of
+    trials learned from, `usual_scores` (2, 2) their median and width of the two scores of
     hmmseg.sequence.misfit. Where not all labels of two trials were given, `courses` are the ways to align the
     trials and to name their changes, and boundaries are as uncertain as all of them together; `lag`
     (num_boundaries,) [cells] is how far they lie off such a change (the scale of a Laplace law), `sure`
@@ -43,7 +45,7 @@ class SequenceModel:
     settled: bool
     detectors: Detectors | None
     typical: np.ndarray
-    misfit: np.ndarray
+    usual_scores: np.ndarray
     courses: tuple[NamedCourse, ...] = ()
     lag: np.ndarray = field(default_factory=lambda: np.empty(0))
     sure: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -57,9 +59,23 @@ class SequenceModel:
         """Log-likelihoods (num_cells, num_states) and transition bands of one trial."""
         return weights(trial.values, self.emissions, self.detectors, self.transitions.bands)
 
-    def judge(self, trial: Features) -> SequenceModel:
-        """The model that tells whether a trial fits: without templates, which have no counterpart in free
-        switching; where no labels taught it, with evidence coarsened (hmmseg.sequence.naming)."""
+    def tables(self) -> list[Any]:
+        """Its states: how long they usually last, and how surely the model has their beginnings."""
+        from rich.table import Table
+
+        table = Table(title=f"a model of {', '.join(self.mapping.channels)}", title_justify="left")
+        for head in ("state", "usually lasts [s]", "occurs", "begins here with probability"):
+            table.add_column(head)
+        surely = ["", *(f"{p:.2f}" for p in self.sure)]
+        for k, name in enumerate(self.task.sequence):
+            there = f"{100 * self.presence[k]:.0f} %" if name in self.task.optional else "always"
+            lasts = f"{self.typical[k] * self.mapping.step:.3g}"
+            table.add_row(name, lasts, there, surely[k] if k < len(surely) else "")
+        return [table]
+
+    def without_templates(self, trial: Features) -> SequenceModel:
+        """The model that tells whether a trial fits: templates have no counterpart in free switching; where
+        no labels taught it, with evidence coarsened (hmmseg.sequence.naming)."""
         if self.detectors is not None:
             return replace(self, detectors=None)
         temper = self.emissions.temper
@@ -144,7 +160,8 @@ def save_model(model: SequenceModel, path: str | Path) -> None:
             step=model.mapping.step, window=model.mapping.window, center=model.mapping.center,
             scale=model.mapping.scale, loc=model.emissions.loc, spread=model.emissions.scale,
             temper=model.emissions.temper, mean_cells=model.mean_cells, presence=model.presence,
-            settled=model.settled, typical=model.typical, misfit=model.misfit, lag=model.lag, sure=model.sure,
+            settled=model.settled, typical=model.typical, misfit=model.usual_scores,
+            lag=model.lag, sure=model.sure,
             courses=len(model.courses), **detectors, **courses,  # type: ignore[arg-type]
         )  # fmt: skip
 

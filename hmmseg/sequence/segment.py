@@ -71,10 +71,10 @@ def _posterior(data: Features, model: SequenceModel, alignment: Alignment) -> Bo
 
 
 def _failure(data: Features, model: SequenceModel) -> Failure | None:
-    judge = model.judge(data)
+    plain = model.without_templates(data)
     return sequence_misfit.find_failure(
-        model.task.sequence, optional_states(model.task, False), model.typical, model.misfit,
-        judge.emissions.log_likelihoods(data.values), model.mean_cells, judge.align([data])[0],
+        model.task.sequence, optional_states(model.task, False), model.typical, model.usual_scores,
+        plain.emissions.log_likelihoods(data.values), model.mean_cells, plain.align([data])[0],
     )  # fmt: skip
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from simgap.attribution.document import entries
 from simgap.attribution.findings import Attribution, EffectPosterior
 from simgap.effects import catalogue
-from simgap.effects.base import Effect
 from simgap.gap.fit import Fitted
 from simgap.gap.located import where
 from simgap.gap.search import Search
@@ -80,26 +79,30 @@ def _described(found: Search, told: Attribution, name: str, seed: int) -> dict[s
 
 
 def parameters(found: Search, posterior: EffectPosterior, name: str, seed: int) -> dict[str, Any]:
-    """An effect's parameters as the interface names them, from draws of their coordinates."""
+    """An effect's parameters as the interface names them."""
+    every = drawn(found, posterior, name, seed)
+    return {key: _summary(values, unit) for key, (values, unit) in every.items()}
+
+
+def drawn(
+    found: Search, posterior: EffectPosterior, name: str, seed: int
+) -> dict[str, tuple[np.ndarray, str]]:
+    """Draws (DRAWS,) of an effect's parameters given that it acts, and their units, as the interface names
+    them."""
     effect, rng = catalogue()[name], np.random.default_rng(seed)
     of = {p.name: p for p in effect.parameters}
-    spread = next((s for s in found.spreads if s.effect == name), None)
-    if spread is not None:
+    scatter = next((s for s in found.spreads if s.effect == name), None)
+    if scatter is not None:
         p = effect.parameters[0]
-        return {p.name: _summary(spread.value * np.exp(spread.log_sd * rng.standard_normal(DRAWS)), p.unit)}
-    draws, out = {}, {}
+        return {p.name: (scatter.value * np.exp(scatter.log_sd * rng.standard_normal(DRAWS)), p.unit)}
+    draws = {}
     for key, p in posterior.parameters.items():
-        if key not in of:  # a property that was measured apart
-            return {key: _property(found, key, p.mean, p.sd)}
-        low, high = of[key].limits
-        u = np.clip(p.mean + p.sd * rng.standard_normal(DRAWS), low, high)
-        draws[key] = np.asarray(of[key].value(u))
-    for key, (values, unit) in _reported(effect, draws, found).items():
-        out[key] = _summary(values, unit)
-    return out
-
-
-def _reported(effect: Effect, draws: dict[str, np.ndarray], found: Search) -> dict[str, tuple]:
+        u = p.mean + p.sd * rng.standard_normal(DRAWS)
+        if key not in of:  # by how much a property that was measured apart is off
+            obj, kind = key.rsplit(".", 1)
+            one = found.problem.spread[found.problem.frame.task.objects.index(obj), PROPERTIES.index(kind)]
+            return {key: (u * float(one), UNITS[kind])}
+        draws[key] = np.asarray(of[key].value(np.clip(u, *of[key].limits)))
     if effect.report is not None:
         return effect.report(draws, found.problem.frame.rig)
     return {p.name: (draws[p.name], p.unit) for p in effect.parameters if p.name in draws and not p.hidden}
@@ -109,15 +112,6 @@ def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
     low, high = np.percentile(values, (5, 95))
     return {"mean": float(np.median(values)), "sd": float(np.std(values)),
             "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
-
-
-def _property(found: Search, key: str, mean: float, sd: float) -> dict[str, Any]:
-    """By how much a measured property is off."""
-    name, kind = key.rsplit(".", 1)
-    o, k = found.problem.frame.task.objects.index(name), PROPERTIES.index(kind)
-    one = float(found.problem.spread[o, k])
-    low, high = ((mean + side * 1.645 * sd) * one for side in (-1, 1))
-    return {"mean": mean * one, "sd": sd * one, "interval_90": [low, high], "unit": UNITS[kind]}
 
 
 def _evidence(told: Attribution, names: tuple[str, ...]) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
-from hmmseg.tables import as_html, as_text
+from hmmseg.tables import Tabled
 from simgap.attribution.attribute import attribute
 from simgap.attribution.findings import Attribution
 from simgap.attribution.posterior import Model, forms
@@ -25,7 +24,7 @@ from simgap.attribution.search import sought
 from simgap.attribution.verdict import ALARM
 from simgap.effects import free_parameters, name_of
 from simgap.gap.assemble import together
-from simgap.gap.body import body, parameters
+from simgap.gap.body import body, drawn, parameters
 from simgap.gap.evaluation import residual_at
 from simgap.gap.experiments import next_experiment
 from simgap.gap.fit import Fitted, Start, fit
@@ -45,7 +44,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis:
+class Diagnosis(Tabled):
     """Everything found; `body` is the JSON document's. Arrays are for figures and tests.
 
     `before`, `after` (T, N, C): whitened residuals without and with the verdict's effects, `cells` the first
@@ -60,6 +59,7 @@ class Diagnosis:
     after: np.ndarray
     cells: tuple[Tally, ...]
     warnings: tuple[str, ...] = ()
+    seed: int = 0
 
     @property
     def problem(self) -> Problem:
@@ -70,12 +70,28 @@ class Diagnosis:
         """The body of `diagnose`'s JSON document."""
         return self.body
 
-    def __repr__(self) -> str:
-        return "\n".join([sentence(self.body), *(as_text(table) for table in tables(self.body))])
+    def words(self) -> str:
+        """The verdict in a sentence."""
+        return sentence(self.body)
 
-    def _repr_html_(self) -> str:
-        head = f"<p>{html.escape(sentence(self.body))}</p>"
-        return head + "".join(as_html(table) for table in tables(self.body))
+    def tables(self):
+        """Probabilities, parameters of the causes, the largest cells."""
+        return tables(self.body)
+
+    def to_arviz(self):
+        """ArviZ InferenceData: draws of the described effects' parameters, `effect.parameter`, given that it
+        acts. Each effect is drawn by itself."""
+        import arviz
+
+        every = {
+            f"{name}.{key}": values[None]
+            for name in self.body["effects"]
+            if name in self.attribution.effects
+            for key, (values, _) in drawn(
+                self.search, self.attribution.effects[name], name, self.seed
+            ).items()
+        }
+        return arviz.from_dict(posterior=every)
 
     def plot_where(self, path: str | Path | None = None):
         """Share of the gap by channel and subtask; the axes. Saved where a path is given."""
@@ -139,7 +155,7 @@ def diagnose(
     before = residual_at(found.problem, (), found.healthy.u)
     after = residual_at(found.problem, causes.effects, causes.u)
     cells = tallies(found.problem, before)
-    return Diagnosis(document, found, causes, told, before, after, cells, warnings)
+    return Diagnosis(document, found, causes, told, before, after, cells, warnings, seed)
 
 
 def _inseparable(told: Attribution, following: dict[str, Any] | None) -> list[str]:

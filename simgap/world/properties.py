@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 from estimation.actual import read_actual
 from hmmseg.errors import InputError
@@ -45,6 +46,17 @@ def paper_blocks(task: BlockTask) -> dict[str, Block]:
     """The paper's blocks for the objects of a task: by their names, in turn where names differ."""
     known = list(PAPER_BLOCKS.values())
     return {name: PAPER_BLOCKS.get(name, known[k % len(known)]) for k, name in enumerate(task.objects)}
+
+
+def blocks_table(blocks: Blocks) -> Table:
+    """Blocks for people to read, lengths in cm as the paper has them."""
+    table = Table(title="blocks", title_justify="left")
+    for head in ("block", "weight", "width", "height", "friction"):
+        table.add_column(head)
+    for name, b in blocks.items():
+        lengths = (f"{100 * length:.4g} cm" for length in (b.width, b.height))
+        table.add_row(name, f"{b.weight:.4g} N", *lengths, f"{b.friction:.3g}")
+    return table
 
 
 def random_properties(task: BlockTask, seed: int) -> dict[str, Block]:

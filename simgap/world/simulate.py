@@ -5,21 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
+from hmmseg.segmentation.spans import Segmentation, known
+from hmmseg.segmentation.tables import spans_table
+from hmmseg.tables import Tabled
 from simgap.world.dynamics import Physics, State, resting_state
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
 from simgap.world.performance import CONTROL_PERIOD, Impedance, Record, perform
-from simgap.world.properties import Blocks
+from simgap.world.properties import Blocks, blocks_table
 from simgap.world.scene import Surroundings, physics, substeps_for
 from simgap.world.sensors import DEFAULT_RATE, record
 
@@ -29,13 +36,13 @@ BATCH = 16  # numerics: trials integrated side by side
 MOVING = 2e-3  # chosen: m/s; a slide begins and ends where the block's speed passes this
 
 
-@dataclass(frozen=True)
-class SimulatedTrial:
+@dataclass(frozen=True, repr=False)
+class SimulatedTrial(Tabled):
     """A synthetic recording with its truth.
 
     `trial` is as read from a file. `boundaries` (num_subtasks - 1,) [s] are the times between the
     subtasks, from the contacts (NaN where one never happened: a dropped block). `motion` is what truly
-    happened, one row per millisecond at times `t` [s], blocks in the order of `blocks`.
+    happened, one row per millisecond at times `t` [s], blocks in the order of `blocks`. `rig` recorded it.
     """
 
     trial: Trial
@@ -44,6 +51,27 @@ class SimulatedTrial:
     motion: Record
     blocks: Blocks
     seed: int
+    task: BlockTask
+    rig: Rig
+
+    @property
+    def segmentation(self) -> Segmentation:
+        """The true subtasks, without uncertainty."""
+        edges = [float(self.trial.t[0]), *self.boundaries, float(self.trial.t[-1])]
+        recorded = task_space(self.trial, self.rig)
+        return known(self.trial.file, self.trial.rate, subtasks(self.task), edges, recorded=recorded)
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry of one trial in the JSON of `simulate`, but for the name of its file."""
+        return {"seed": self.seed, "rate": self.trial.rate, "boundaries": self.boundaries}
+
+    def tables(self) -> list[Any]:
+        """The true subtasks, and the blocks."""
+        return [spans_table(self.segmentation), blocks_table(self.blocks)]
+
+    def plot(self, path: str | Path | None = None) -> list[Any]:
+        """Recorded signals over the true subtasks; the axes. Saved where a path is given."""
+        return self.segmentation.plot(path)
 
 
 def simulate_trial(task: BlockTask, rig: Rig, properties: Blocks, seed: int,
@@ -127,7 +155,7 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
     trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
     order = {name: k for k, name in enumerate(task.objects)}
     truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]
-    return SimulatedTrial(trial, np.array(truth), fine, motion, blocks, seed)
+    return SimulatedTrial(trial, np.array(truth), fine, motion, blocks, seed, task, rig)
 
 
 def _at(t: np.ndarray, fine: np.ndarray, values: np.ndarray) -> np.ndarray:

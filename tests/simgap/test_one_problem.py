@@ -62,3 +62,11 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
         [a.quantile(0.5) for a in told.search.aligned.trials[0].boundaries],
         [a.quantile(0.5) for a in found.aligned.trials[0].boundaries],
     )
+    # A result like others: it reads like the terminal, and its draws are what its document sums up.
+    assert repr(told).startswith(told.words()) and "probabilities" in repr(told)
+    assert "<td>none</td>" in told._repr_html_()
+    drawn = told.to_arviz().posterior
+    (name, entry), *_ = told.body["effects"].items()
+    for key, p in entry["parameters"].items():
+        assert np.median(drawn[f"{name}.{key}"]) == pytest.approx(p["mean"])
+        assert np.percentile(drawn[f"{name}.{key}"], (5, 95)) == pytest.approx(p["interval_90"])
