@@ -26,12 +26,18 @@ def forward(finger: Finger, q: Array) -> Array:
     return xp.stack([x, y], -1)
 
 
+def turning(length: Array, q: Array) -> tuple[Array, Array]:
+    """How the far end of each link moves with its angle q (..., links) [rad]: x and y (..., links) [m/rad].
+
+    Turned back by a right angle, (y, -x), it is the link itself.
+    """
+    xp = _module(q)
+    return -length * xp.sin(q), length * xp.cos(q)
+
+
 def jacobian(finger: Finger, q: Array) -> Array:
     """Derivatives (..., 2 axes, 2 links) [m/rad] of the tip by the link angles (..., 2) [rad]."""
-    xp, (first, second) = _module(q), finger.links
-    x = xp.stack([-first * xp.sin(q[..., 0]), -second * xp.sin(q[..., 1])], -1)
-    y = xp.stack([first * xp.cos(q[..., 0]), second * xp.cos(q[..., 1])], -1)
-    return xp.stack([x, y], -2)
+    return _module(q).stack(turning(np.asarray(finger.links), q), -2)
 
 
 def tip_velocity(finger: Finger, q: Array, rate: Array) -> Array:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from hmmseg.hand.kinematics import turning
 from hmmseg.io.rig import Rig
 
 Array = Any  # jax.Array under a trace, np.ndarray outside of one
@@ -70,7 +71,6 @@ class World(NamedTuple):
     free: Array
     ground: Array
     carry: Array
-    move: Array
     events: Array
 
 
@@ -197,10 +197,14 @@ class Effect:
 READOUT, FILTER, SCALE, MIX, HAND, KINEMATICS, CONTACT = range(7)
 
 
+def swung(world: World) -> tuple[Array, Array]:
+    """How the far ends of the links move with the angles: x and y (T, N, 4) [m/rad]."""
+    return turning((world.length * world.link)[None, None, :], world.joints)
+
+
 def tips(world: World) -> tuple[Array, Array]:
     """Tip positions and velocities (T, N, 4): x1, y1, x2, y2 [m, m/s]."""
-    length = (world.length * world.link)[None, None, :]
-    jx, jy = -length * jnp.sin(world.joints), length * jnp.cos(world.joints)
+    jx, jy = swung(world)
 
     def paired(x: Array, y: Array) -> Array:
         return jnp.stack(

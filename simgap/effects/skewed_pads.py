@@ -5,15 +5,14 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance, World, per_channel
+from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance, World, per_channel, swung
 
 GIVES = ("give1", "give2")
 
 
 def _correct(world: World, values, on) -> World:
     rise = per_channel(values, GIVES) * jnp.abs(world.force[..., 0::2])
-    length = (world.length * world.link)[None, None, :]
-    along_x, along_y = -length * jnp.sin(world.joints), length * jnp.cos(world.joints)
+    along_x, along_y = swung(world)
     inner, outer = along_x[..., 0::2], along_x[..., 1::2]
     turn = rise / (inner * along_y[..., 1::2] - outer * along_y[..., 0::2])
     joints = jnp.stack([-outer * turn, inner * turn], -1).reshape(world.joints.shape)

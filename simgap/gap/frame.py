@@ -106,7 +106,7 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         steps,
         task,
         rig,
-        _world(stack, events, onehot, rig),
+        _world(stack, events, rig),
         arrays,
         lengths,
     )
@@ -123,7 +123,7 @@ def _stacked(rows: list[np.ndarray], length: int, count: int) -> np.ndarray:
     return np.stack(padded + [padded[-1]] * (count - len(rows)))
 
 
-def _world(stack: dict[str, np.ndarray], events: np.ndarray, onehot: np.ndarray, rig: Rig) -> World:
+def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
     pad, zero = rig.fingertip, np.zeros(())
     base, length = np.zeros(4), np.zeros(4)
     if rig.jointed:
@@ -161,7 +161,6 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, onehot: np.ndarray,
         free=phase[..., 0],
         ground=phase[..., 1] + phase[..., 3] + phase[..., 4],
         carry=carry,
-        move=onehot,
         events=events,
     )
 

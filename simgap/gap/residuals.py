@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hmmseg.contact.equations import Pads, block_offset, block_width, block_x, block_y, support_load
-from simgap.effects.base import LATE, RINGING, SMOOTH, World, gradient, tips
+from simgap.effects.base import LATE, RINGING, SMOOTH, World, gradient, swung, tips
 from simgap.gap.between import (
     doubt_between,
     fivepoint,
@@ -110,11 +110,7 @@ def residuals(
 
 def _doubt(world: World, firm: jax.Array) -> jax.Array:
     """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of angles and forces."""
-    length = (world.length * world.link)[None, None, :]
-    turn_x, turn_y = length * jnp.sin(world.joints), length * jnp.cos(world.joints)
-    there = world.jointed > 0.5
-    turn_x, turn_y = (jnp.where(there, turn, 0.0) for turn in (turn_x, turn_y))
-
+    turn_x, turn_y = (jnp.where(world.jointed > 0.5, turn, 0.0) for turn in swung(world))
     pads = doubt_between(world)
 
     def finger(turn: jax.Array, give: jax.Array, force: int) -> tuple[jax.Array, jax.Array]:
