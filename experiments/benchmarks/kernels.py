@@ -161,13 +161,13 @@ def exactness(num_samples: int) -> dict:
     """Labels that single precision moves, states half a standard deviation apart."""
     import jax.numpy as jnp
 
-    from experiments.jax_hmm import alignment
+    from experiments import jax_viterbi
 
     single = problem(num_samples, 9, 2, 0.5, np.float32)
     chain = chain_of(num_samples, 9)
     starts = {"host": hmm.viterbi(single, chain).starts}
     bands = [jnp.asarray(band, jnp.float32) for band in chain.bands]
-    path = np.asarray(alignment.viterbi(single, *bands).path)
+    path = np.asarray(jax_viterbi.viterbi(single, *bands).path)
     starts["JAX"] = np.searchsorted(path, np.arange(9))
     reference = hmm.viterbi(single.astype(np.float64), chain).starts
     moved = {name: int(np.abs(found - reference).sum()) for name, found in starts.items()}

@@ -61,9 +61,9 @@ def paths(x: np.ndarray, chain: hmm.Chain, jax_too: bool = True) -> Functions:
     import jax
     import jax.numpy as jnp
 
-    from experiments.jax_hmm import alignment
+    from experiments import jax_viterbi
 
-    jitted = jax.jit(lambda ll, stay, advance: alignment.viterbi(ll, stay, advance).path)
+    jitted = jax.jit(lambda ll, stay, advance: jax_viterbi.viterbi(ll, stay, advance).path)
     for name, dtype in ((JAX_DOUBLE, jnp.float64), (JAX_SINGLE, jnp.float32)):
         inside = [jnp.asarray(a, dtype) for a in (x, *chain.bands)]
         found[name] = lambda inside=inside: np.asarray(jitted(*inside))

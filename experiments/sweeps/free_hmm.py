@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from experiments.jax_hmm.scans import log_sum_exp
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND
 from hmmseg.hand.signals import Signals
 from hmmseg.hmm.dense import viterbi
@@ -26,6 +25,16 @@ START = np.log(np.array([0.98, 0.01, 0.01]))  # a recording begins with the hand
 STICKY = 20.0  # prior counts of staying, against 1 of each change
 
 MIN_LENGTH = 256  # samples; recordings are padded to powers of two, so that few programs are compiled
+
+
+def log_sum_exp(x: jax.Array, axis: int) -> jax.Array:
+    """Log of a sum of exponentials that keeps values and gradients finite among -inf."""
+    top = lax.stop_gradient(jnp.max(x, axis, keepdims=True))
+    top = jnp.where(jnp.isneginf(top), 0.0, top)
+    total = jnp.sum(jnp.exp(x - top), axis)
+    positive = total > 0
+    value = jnp.log(jnp.where(positive, total, 1.0)) + jnp.squeeze(top, axis)
+    return jnp.where(positive, value, jnp.where(jnp.isnan(total), jnp.nan, -jnp.inf))
 
 
 def _log_evidence(ll, log_initial, log_transition, num_valid):

@@ -1,7 +1,6 @@
 """Most probable path and posterior of whole recordings, as EM and the segmentation take them.
 
-On the host kernels of hmmseg.hmm: nothing is compiled when it is called. experiments.jax_hmm has the same
-recursions in JAX.
+On the host kernels of hmmseg.hmm: nothing is compiled when it is called.
 """
 
 from __future__ import annotations

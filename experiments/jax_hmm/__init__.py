@@ -1,1 +1,0 @@
-"""The recursions of hmmseg.hmm in JAX, by themselves: what its kernels are compared with."""
