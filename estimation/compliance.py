@@ -16,13 +16,12 @@ import numpy as np
 from hmmseg.contact.equations import Pads, block_width, block_y, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import CONTRADICTS
+from hmmseg.levels import CONTRADICTS, TAIL
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
 UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
 CLOSED = 0.15  # chosen: of the grip's own force: below it, one finger may not touch yet
-MIN_SAMPLES = 6  # numerics
-TAIL = 4.0  # prior: of the residuals, Student-t, as everywhere (hmmseg.segmentation.emissions)
+MIN_SAMPLES = 6  # numerics: of a grip: fewer give a slope no interval of its own
 # prior: standard deviation of one slope beyond its sampling, and of all alike, as forces and positions are
 # read apart in time: measured on a robot arm's recordings whose pads are known springs (0.04 and 0.08 off).
 SLOPE_SD = 0.1

@@ -30,7 +30,7 @@ from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
 
 UNITS = {"weight": "N", "width": "m", "height": "m"}
-INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # chosen
+INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
 
 
 @dataclass(frozen=True, repr=False)

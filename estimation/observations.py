@@ -25,14 +25,14 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.levels import TAIL
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
-from hmmseg.segmentation.emissions import TAIL
+from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.features import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
-MAX_RATE = 50.0  # chosen: Hz; noise of finer samples is averaged before it is weighed
-NUM_ALIGNMENTS = 16  # numerics
-MIN_STRETCH = 0.5  # chosen
+NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
+MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
 LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior
 APART = 0.1  # chosen: s by which one finger touches or lets go after the other, at most
 MIN_FREE = 8  # chosen: samples of free motion that tell the scale of the forces there

@@ -18,8 +18,8 @@ from estimation.observations import CHANNELS
 from estimation.posterior import Posterior
 from estimation.sampler import Draws
 
-NUM_REPLICATES = 400  # numerics
-SMALL = 0.005  # chosen
+NUM_REPLICATES = 400  # numerics: tell a p-value of SMALL to 0.0035
+SMALL = 0.005  # chosen: p-value from which a check warns; a result has up to a dozen of them
 MEANING = {
     "force": "the net vertical force while carried differs between grips",
     "distance": "the distance of the fingers while held differs between grips",

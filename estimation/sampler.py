@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 INDEPENDENT = 0.9  # numerics: share of independence proposals
 WALKERS = 64  # numerics: of emcee
-BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000  # numerics
+BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000  # numerics: steps left out, between looks at convergence, at most
 MIN_LENGTH = 50  # cited: steps in units of the autocorrelation time, emcee's own rule
 MIN_ESS, MAX_RHAT = 1000.0, 1.01  # cited: Gelman et al. 2013, and enough for two digits of a quantile
 ENOUGH = 1.5 * MIN_ESS  # to stop at: an estimate of it is itself uncertain

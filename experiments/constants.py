@@ -1,16 +1,14 @@
 """Every numeric constant of the product: its kind and reason, read from its comment, into docs/constants.md.
 
-    python -m experiments.constants [--unstated]
+    python -m experiments.constants
 
 A constant is a number, or a tuple or dict of numbers, given to a name in capitals at the top of a module.
 Its kind is the first word of its comment (CONTRIBUTING.md): physics, numerics, cited, learned, prior, limit,
-look or chosen.
-`--unstated` lists those without one and ends with 1 if there are any.
+look or chosen. A test wants a kind and a reason of each.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import io
 import re
@@ -102,11 +100,16 @@ def constants(path: Path) -> Iterator[Constant]:
         yield Constant(file, node.lineno, ", ".join(texts), shown, kind, reason)
 
 
+def goes_on(text: str) -> bool:
+    """Whether a comment goes on with the one above it, rather than being that of the constant below."""
+    return text[:1].islower() and STATED.match(text) is None
+
+
 def stated(said: dict[int, str], lines: list[str], first: int, last: int) -> tuple[str, str]:
     """Kind and reason of a constant on lines `first` to `last`."""
     words = [said[k] for k in range(first, last + 1) if k in said]
     after = last + 1
-    while words and said.get(after, "-")[0].islower() and lines[after - 1].lstrip().startswith("#"):
+    while words and goes_on(said.get(after, "-")) and lines[after - 1].lstrip().startswith("#"):
         words.append(said[after])
         after += 1
     before = first - 1
@@ -158,20 +161,11 @@ def page(found: list[Constant]) -> str:
     return "\n".join(out) + "\n"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--unstated", action="store_true", help="list constants without a kind")
-    given = parser.parse_args()
+def main() -> None:
     found = every()
-    if given.unstated:
-        mine = [constant for constant in found if constant.kind == "unstated"]
-        for c in mine:
-            print(f"{c.file}:{c.line}: {c.name} = {c.value}  # {c.reason}")
-        return int(bool(mine))
     (ROOT / "docs/constants.md").write_text(page(found), encoding="utf-8")
     print(", ".join(f"{n} {kind}" for kind, n in Counter(c.kind for c in found).most_common()))
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -1,4 +1,4 @@
-"""From where on something counts: levels that more than one file decides by."""
+"""From where on something counts, and how noise is shaped: what more than one file decides by."""
 
 from __future__ import annotations
 
@@ -7,3 +7,4 @@ CONTRADICTS = 4.0  # chosen: sds by which what is seen contradicts what is state
 MOVED = 3e-3  # chosen: m by which a hand or a block has gone somewhere; blocks are taller, slips shorter
 GAP = 3.0  # chosen: usual sample periods that make a gap
 DRIFTS = 0.15  # chosen: s in which a hand at rest stays where it is; it drifts over more
+TAIL = 4.0  # cited: degrees of freedom of Student-t residuals: Lange, Little and Taylor, JASA 84, 1989

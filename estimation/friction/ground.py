@@ -24,7 +24,7 @@ from hmmseg.segmentation.features import acceleration
 MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
 FEWEST = 4  # chosen: samples of sliding
 WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little to tell
-COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior
+COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 PRIOR = 0.05  # prior: probability of slip before the anchors are seen
-SURE = 0.99  # chosen
+SURE = 0.99  # chosen: probability from which slip is said to be seen
 ODD = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
 ODD_DRIFT = 2e-3  # prior: m per root second
 SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s of a slipping pad
 STUCK = 0.5  # prior: probability that a pad near its limit holds all the same
 PERSISTENCE = 0.01  # prior: s over which the speed of a slipping pad varies
 DRIFTS = (0.0, 3e-5, 1e-4, 3e-4)  # prior: m per root second
-DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior
+DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior: of these: most pads hold still
 ANYWHERE = 0.01  # prior: m; prior sd of an anchor's height
 NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 

@@ -25,10 +25,9 @@ from hmmseg.hand.pose import Pose, bridged, smooth
 from hmmseg.io.gripper import Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
-from hmmseg.levels import SURE
+from hmmseg.levels import SURE, TAIL
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
-TAIL = 4.0  # prior: degrees of freedom of the Student-t weights, as in the emissions
 TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
 SAMPLES = 20  # chosen: of free motion, at least
 

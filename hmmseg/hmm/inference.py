@@ -26,7 +26,7 @@ from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
 
 Tables = Any  # one array, or a sequence of arrays
 AnyChain = Chain | DurationChain
-_NONE = np.empty((0, 0))  # numerics
+_NONE = np.empty((0, 0))  # numerics: stands for bands that a chain does not have
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _CELLS_A_THREAD = 1 << 17  # numerics: below, another thread costs more than it saves
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
-from hmmseg.segmentation.emissions import TAIL
+from hmmseg.levels import TAIL
 
 _HALF = (TAIL + 1) / 2
 _CONSTANT = math.lgamma(_HALF) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)
-_ROOT2 = math.sqrt(2.0)  # numerics
+_ROOT2 = math.sqrt(2.0)  # numerics: worked out once
 _LEAST = -25.0  # numerics: of an edge, as in the emissions off line
 
 

@@ -37,7 +37,7 @@ KINDS = {FREE: at.FREE_KIND, ON_GROUND: at.GROUND_KIND, SLIDING: at.SLIDING_KIND
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
 # hand at rest creeps, and pads' foam gives by tenths of a mm.
 VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
-PRIOR = 4.0  # prior
+PRIOR = 4.0  # prior: readings that a scale's start is worth
 # chosen: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; of no more weight than a few nats
 LEAST_SPANS = (0.1, 0.1, 0.03, 0.03)
 LEAST_FORCE = 50.0  # chosen: and of its forces, in sds of their noise

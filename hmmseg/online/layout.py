@@ -19,7 +19,7 @@ FORCE, CARRY, NET_X, SHEAR, VELOCITY, LEVEL_SCALE, WIDTH_SCALE = range(7)
 LEVEL = SCALES + 14  # height at which the block rests [m]
 ORIGIN = LEVEL + 2  # mean and variance of the level at the move's pickup
 RING = ORIGIN + 2  # mean and variance of the last boundaries
-NUM_RING = 8  # numerics
+NUM_RING = 8  # numerics: boundaries that are remembered, the last ones; a move has four
 OBJECTS = RING + 2 * NUM_RING  # weight [N] and width [m] of every block, four numbers each
 
 # Kinds of contact states, as the kernels number them.
@@ -31,7 +31,7 @@ FREE_KIND, GROUND_KIND, SLIDING_KIND, ABOVE_KIND = range(4)
 # something else than forces tells that nothing is held (0), or that something is (2; 1: nothing does).
 (T, FX1, FY1, FX2, FY2, VX, VY, AY, Y, D, SD_Y, SD_D, SD_VX, SD_VY, LAST_Y, LAST_D, LAST_FY, SD_FX, SD_FY,
  GRIPPED) = range(20)  # fmt: skip
-NUM_READ = 20  # numerics
+NUM_READ = 20  # numerics: how many are named above
 
 # Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
 SPAN_VX, SPAN_VY, SPAN_Y, SPAN_D, SPAN_FORCE, SPAN_PRESS = range(6)

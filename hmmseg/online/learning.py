@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.levels import TAIL
 from hmmseg.online.layout import (
     ABOVE_KIND,
     AY,
@@ -30,7 +31,6 @@ from hmmseg.online.layout import (
     WIDTH_SCALE,
 )
 from hmmseg.online.scores import carry2, held_height, held_width, scale2
-from hmmseg.segmentation.emissions import TAIL
 
 MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
 MOST_SCALE = 200.0  # chosen: and a scale

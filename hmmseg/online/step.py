@@ -33,23 +33,20 @@ from hmmseg.online.layout import (
 )
 from hmmseg.online.learning import learn
 from hmmseg.online.scores import free, held, lifted, supported
+from hmmseg.segmentation.departure import BRIEF, DEPARTURE, RINGING, SETTLING, STAGES
 from hmmseg.segmentation.emissions import LOST
 
-LOG_DEPARTURE = math.log(1e-4)  # prior: as in hmmseg.segmentation.departure, as are the next four
-BRIEF = 1e-8  # prior
-SETTLING = 0.2  # prior
-RINGING = 0.1  # prior
+LOG_DEPARTURE = math.log(DEPARTURE)
 PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
 NEGLIGIBLE = -28.0  # numerics: nats below the best at which a hypothesis is dropped
 SAME_STATE = 14  # numerics: hypotheses of one state that are kept apart, ...
 SAME_DEPARTED = 4  # numerics: ... and of one that is off the task
-_NUM_STAGES = 3  # numerics
 
 
 @compiled
 def _settled(age):
-    """Probability that a contact has settled: Erlang, three stages, SETTLING s on average."""
-    z = age * _NUM_STAGES / SETTLING
+    """Probability that a contact has settled: Erlang, STAGES stages, SETTLING s on average."""
+    z = age * STAGES / SETTLING
     return -math.expm1(-z) - math.exp(-z) * (z + z * z / 2)
 
 

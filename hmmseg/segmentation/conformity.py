@@ -25,7 +25,7 @@ from hmmseg.segmentation.first_look import Block
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts, log_evidence, most_probable
 
 ENDING = 1e-3  # prior: and that its recording stops before the task's end
-MAX_RATE = 50.0  # chosen: Hz
+MAX_RATE = 50.0  # chosen: Hz; noise of finer samples is averaged before they are judged
 MAX_ASSIGNMENTS = 24  # numerics: tried at most
 MANY = 20  # learned: trials; of more than these one alone does not sway what most have learned
 BETWEEN_TRIALS = 2.0  # prior: slack of like blocks: poses, pads and cables shift widths and weights as well

@@ -14,9 +14,9 @@ from hmmseg.contact.decompose import FREE, Subtask
 from hmmseg.segmentation.free_contacts import IMPOSSIBLE, FreeContacts, switching
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
-SETTLING, STAGES = 0.2, 3  # prior: s, and most stages in which a contact state settles; to end before ...
+SETTLING, STAGES = 0.2, 3  # prior: s, and most stages (of an Erlang law) in which a contact state settles
 RINGING = 0.1  # prior: share of samples that ring while a contact settles
-BRIEF = 1e-8  # prior: ... is less likely by this: a bounce is no new grip, a halt in the air no place
+BRIEF = 1e-8  # prior: to end before is less likely by this: a bounce is no grip, a halt in the air no place
 
 
 def column(free: FreeContacts, step: Subtask, assignment: dict[str, int | None]) -> int | None:

@@ -27,8 +27,8 @@ from scipy.special import gammaln
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
+from hmmseg.levels import TAIL
 
-TAIL = 4.0  # cited: degrees of freedom of the Student-t residuals
 SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's (foam giving late)

@@ -15,7 +15,8 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.hmm.alignment import Alignment, Bands
 from hmmseg.hmm.em import em
-from hmmseg.segmentation.emissions import TAIL, Features, Parameters, log_likelihoods
+from hmmseg.levels import TAIL
+from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
 
 
 @dataclass(frozen=True)

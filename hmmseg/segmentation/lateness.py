@@ -19,7 +19,8 @@ from itertools import repeat
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.segmentation.emissions import TAIL, Parameters
+from hmmseg.levels import TAIL
+from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.lagging import lagging
 from hmmseg.segmentation.stretches import SIGNIFICANT

@@ -22,8 +22,8 @@ from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import CONTRADICTS
-from hmmseg.segmentation.emissions import TAIL, Parameters
+from hmmseg.levels import CONTRADICTS, TAIL
+from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.lateness import Squeeze, lateness, squeeze
 from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest, stretches
 from hmmseg.segmentation.toe import NONE, Toe, find

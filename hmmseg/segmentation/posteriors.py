@@ -20,7 +20,7 @@ from hmmseg.segmentation.pads import Sensing
 from hmmseg.segmentation.spans import Span
 from hmmseg.segmentation.tilt import corner_drops
 
-INTERVAL = (0.05, 0.95)  # chosen
+INTERVAL = (0.05, 0.95)  # physics: a definition: the central 90 %
 NEARBY = 0.15  # chosen: s; a touch known apart from forces this near a boundary is that boundary
 Touches = tuple[tuple[float, float], ...]
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.levels import SURE as SIGNIFICANT
-from hmmseg.segmentation.emissions import TAIL, Parameters
+from hmmseg.levels import TAIL
+from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.toe import DEPENDENT, NONE, Toe
 

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
+from hmmseg.levels import TAIL
+
 # prior: share of samples at which one sensor tells another story than the model (ringing, a block
 # pushed)
 STRAY = 0.02
@@ -26,7 +28,6 @@ SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
 LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
-TAIL = 4.0  # prior: Student-t residuals, as in the emissions
 
 
 @dataclass(frozen=True)

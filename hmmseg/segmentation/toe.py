@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.segmentation.emissions import TAIL
+from hmmseg.levels import TAIL
 
 SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; loads at which the toe may end, a factor of two apart
 DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own

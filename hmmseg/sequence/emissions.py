@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import gammaln
 
 DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
-ONE_CELL = 1e-9  # numerics
+ONE_CELL = 1e-9  # numerics: a state without even so much weight is left as it is
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from hmmseg.sequence.transitions import Transitions
 
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
 HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
-WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # prior
-STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior
+WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # prior: of templates; held-out labels choose
+STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior: of the emissions beside them, likewise
 FORGIVING = 1e-4  # prior: least probability of a held-out label, so that one odd label does not decide
 
 

@@ -17,7 +17,7 @@ from hmmseg.segmentation.spans import Failure
 
 SPREADS = 6.0  # chosen: a trial this far outside the others does not fit
 LEAST_SPREAD = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
-FEW = 4.0  # chosen
+FEW = 4.0  # chosen: trials; the usual width of scores is widened by one over their number, times this
 MEASURABLE = 20.0  # chosen: cells a subtask usually lasts, for two cells to be too few
 SQUEEZED = 0.03  # chosen: of the typical duration
 

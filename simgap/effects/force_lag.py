@@ -8,7 +8,7 @@ import numpy as np
 from simgap.effects.base import FILTER, LATE, Effect, Parameter, Performance, flat, with_force, with_mode
 from simgap.effects.filters import of_finger
 
-STARTS = (0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32)  # numerics
+STARTS = (0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32)  # numerics: s; where searches start
 
 
 def _delays(values, xp):

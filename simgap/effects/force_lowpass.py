@@ -8,7 +8,7 @@ import numpy as np
 from simgap.effects.base import FILTER, SMOOTH, Effect, Parameter, Performance, flat, with_force, with_mode
 from simgap.effects.filters import of_finger
 
-STARTS = (0.02, 0.06, 0.12, 0.2)  # numerics
+STARTS = (0.02, 0.06, 0.12, 0.2)  # numerics: s; where searches start
 
 
 def _times(values, xp):

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from simgap.attribution.background import STATED
 from simgap.attribution.problem import Rows, cosines
 from simgap.gap.problem import Problem
 from simgap.gap.trial_arrays import CHANNELS, PHASES
@@ -21,7 +22,6 @@ from simgap.gap.unresolved import MEDIAN
 
 KINDS = (("x", "y", "distance", "offset"), ("vx", "vy"), ("fx", "fy", "grip", "shear"))
 LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; beyond that it is an effect
-STATED = 0.3  # prior: sd of log variance about the stated one, beforehand
 COLOURS = np.linspace(0.0, 0.4, 9)  # prior: correlation from sample to sample; more is an effect
 BANDS = 6  # numerics: of which medians are taken
 SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise

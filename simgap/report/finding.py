@@ -31,7 +31,7 @@ WHEN = {
 }
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
-TINY = 1e-16  # numerics
+TINY = 1e-16  # numerics: what double precision tells from zero beside one
 
 
 def p_text(p: float) -> str:

@@ -37,7 +37,7 @@ from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-REFITS = 3  # numerics
+REFITS = 3  # numerics: linearisations on the way to the least squares, discrepancies learned anew at each
 STAGES = 14  # look: what a progress bar counts at most
 
 Tell = Callable[[str], None]

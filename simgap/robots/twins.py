@@ -20,7 +20,7 @@ from simgap.simulators.protocol import Channels, Job, run_all
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
 
-TWINS = 6  # numerics
+TWINS = 6  # numerics: drawn; they bound a chance from below by their ranks
 
 
 @dataclass(frozen=True)

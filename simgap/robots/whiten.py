@@ -148,7 +148,7 @@ def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
 CLOCK = "clock"  # a source whose s [s] is the sd of samples' times
 LIES = "lying"  # a source whose s is the sd of where a body comes to rest, anew in each window, by channel
 CONTACTS = "contacts"  # a source whose s is how many usual sizes every effect is off by in each contact
-INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics
+INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics: of an acceleration
 
 
 def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: bool) -> dict[str, Source]:

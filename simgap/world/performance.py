@@ -18,6 +18,7 @@ from simgap.world.dynamics import Loads, Physics, Scalar, State, Tips, drift, in
 
 Values = Any  # a jax Array in compiled code, a NumPy array after it
 CONTROL_PERIOD = 1e-3  # numerics: s; commands and records are this far apart
+BUCKET = 4000  # numerics: control periods; commands are padded to multiples, so that few programs are made
 
 
 class Impedance(NamedTuple):

@@ -15,13 +15,12 @@ from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
-from simgap.world.performance import CONTROL_PERIOD
+from simgap.world.performance import BUCKET, CONTROL_PERIOD
 from simgap.world.properties import Blocks
 from simgap.world.scene import Surroundings, physics, substeps_for
 from simgap.world.smoothing import Motion, smooth
 from simgap.world.virtual_model import Rollout, rollout, standing
 
-BUCKET = 4000  # numerics: control periods; padded to multiples, so that few programs are compiled
 APART = 0.1  # look: m; where a block stands that the recording never locates
 
 # physics: mean and difference coordinates (x, y, distance, offset) from tips (x1, y1, x2, y2), and back.

@@ -25,13 +25,11 @@ from hmmseg.segmentation.tables import spans_table
 from hmmseg.tables import Tabled
 from simgap.world.dynamics import Physics, State, resting_state
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
-from simgap.world.performance import CONTROL_PERIOD, Impedance, Record, perform
+from simgap.world.performance import BUCKET, CONTROL_PERIOD, Impedance, Record, perform
 from simgap.world.properties import Blocks, blocks_table
 from simgap.world.scene import Surroundings, physics, substeps_for
 from simgap.world.sensors import DEFAULT_RATE, record
 
-# numerics: control periods; commands are padded to multiples, so that few programs are compiled
-BUCKET = 4000
 BATCH = 16  # numerics: trials integrated side by side
 MOVING = 2e-3  # chosen: m/s; a slide begins and ends where the block's speed passes this
 

@@ -32,10 +32,9 @@ from hmmseg.hmm.kernels.blocks import (
 from hmmseg.hmm.kernels.compile import compiled, part
 from hmmseg.hmm.kernels.forward import forward_pass, log_of, total
 from hmmseg.hmm.kernels.simd import at, bits_of, double_of
-from hmmseg.hmm.kernels.steps import ZERO_EXPONENT, probable_step, turn
+from hmmseg.hmm.kernels.steps import LOG2E, ZERO_EXPONENT, probable_step, turn
 
 NOTHING = -1010  # numerics: exponent of a probability that counts as zero; one of -1000 is written as zero
-_LOG2E = 1.4426950408889634  # physics: a logarithm
 
 
 @part
@@ -62,7 +61,7 @@ def log2_of_moves(sm, se, vm, ve, num_states):
             if top > -math.inf:
                 weight = top + math.log(math.exp(weight - top) + math.exp(on - top))
         most = max(most, weight)
-    return most * _LOG2E
+    return most * LOG2E
 
 
 @part
@@ -107,7 +106,7 @@ def probabilities(ll, single, num_rows, num_states, stay, advance, varying, init
                 most = ZERO_EXPONENT
                 for k in range(known, hi + 1):
                     most = max(most, magnitude(rest_m[k], rest_e[k]))
-                lo = lowest_state(kept_m, kept_e, b, hi, gained[b] * _LOG2E + count * moves + most)
+                lo = lowest_state(kept_m, kept_e, b, hi, gained[b] * LOG2E + count * moves + most)
             width = hi - lo + 1
             if width == 1:  # what paths gain here need not be known: all of any probability stay
                 for t in range(start - 1, stop - 1):

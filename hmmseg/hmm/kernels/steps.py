@@ -16,7 +16,7 @@ from hmmseg.hmm.kernels.simd import MAGIC, MAGIC_BITS, WIDTH, Lanes, Vec, vector
 ZERO_EXPONENT = -(1 << 60)  # numerics: of a weight that is zero; sums of a few of them still fit 64 bits
 LEAST_LOG = -7e14  # numerics: a log weight below counts as -inf
 IMPOSSIBLE_EXPONENT = -(1 << 49)  # numerics: a weight of a smaller exponent is zero
-_LOG2E = 1.4426950408889634  # physics: a logarithm
+LOG2E = 1.4426950408889634  # physics: a logarithm
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10  # physics: the first has 33 significant bits
 _ONE = 0x3FF0000000000000  # numerics: the bits of 1.0
 _MANTISSA = 0x000FFFFFFFFFFFFF  # numerics: the bits of a mantissa
@@ -68,7 +68,7 @@ def exponentials(lanes: Lanes, logs, mantissa, exponent):
     Cody-Waite reduction by ln 2 and the Taylor polynomial, which within ln 2 / 2 is exact to rounding.
     """
     x = lanes.load(logs).maximum(LEAST_LOG)
-    rounded = x.times_plus(_LOG2E, MAGIC)
+    rounded = x.times_plus(LOG2E, MAGIC)
     whole = rounded - MAGIC
     rest = whole.times_plus(-_LN2_LOW, whole.times_plus(-_LN2_HIGH, x))
     value = rest * (1 / math.factorial(13)) + (1 / math.factorial(12))
