@@ -86,7 +86,7 @@ def start_of(post: Posterior) -> np.ndarray:
     """Scales (6,) from which to climb: each channel's share the best of STARTS, one after the other."""
     best = np.zeros(2 * NUM_CHANNELS)
     for c in range(NUM_CHANNELS):
-        tried = np.repeat(best[None], STARTS.size, axis=0)
-        tried[:, NUM_CHANNELS + c] = STARTS
-        best = tried[int(np.argmax(post.log_prob(tried)))]
+        starts = np.repeat(best[None], STARTS.size, axis=0)
+        starts[:, NUM_CHANNELS + c] = STARTS
+        best = starts[int(np.argmax(post.log_prob(starts)))]
     return best

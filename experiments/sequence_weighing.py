@@ -44,8 +44,8 @@ def log_score(cases: list[Known], weighing: Weighing) -> float:
     """Mean log density of the true boundaries that are not labelled."""
     total = []
     for courses, labels, truth in cases:
-        told = np.isfinite(labels).any(0)
-        scale = np.where(told, weighing.told, weighing.lag)[:, None]
+        known_lag = np.isfinite(labels).any(0)
+        scale = np.where(known_lag, weighing.labelled, weighing.lag)[:, None]
         open_ = ~np.isfinite(labels)
         namings = [naming(course, truth.shape[1] + 1, list(labels), weighing) for course in courses]
         density = np.zeros(truth.shape)
@@ -62,7 +62,7 @@ def weighing_of(x: np.ndarray) -> Weighing:
     """The weighing of parameters without bounds."""
     return Weighing(
         independent=float(np.exp(x[0])), settled=float(x[1]), shares=float(x[2]),
-        lag=float(np.exp(x[3])), told=float(np.exp(x[3])), elsewhere=float(expit(x[4])),
+        lag=float(np.exp(x[3])), labelled=float(np.exp(x[3])), elsewhere=float(expit(x[4])),
     )  # fmt: skip
 
 
@@ -75,8 +75,8 @@ def learn(worlds: list[World]) -> Weighing:
     found = weighing_of(best.x)
     sd = np.sqrt(np.diag(best.hess_inv) / len(cases))
     cases = [known(world, 1) for world in worlds if len(world.trials) > 1]
-    told: Any = minimize_scalar(lambda x: -log_score(cases, replace(found, told=float(np.exp(x)))),
+    known_lag: Any = minimize_scalar(lambda x: -log_score(cases, replace(found, labelled=float(np.exp(x)))),
                            bounds=(-9.0, -3.0), method="bounded", options={"xatol": 0.05})  # fmt: skip
-    found = replace(found, told=float(np.exp(told.x)))
+    found = replace(found, labelled=float(np.exp(known_lag.x)))
     print({"worlds": len(worlds), "log_score": float(-best.fun), "sd": sd.tolist()} | asdict(found))
     return found

@@ -163,13 +163,13 @@ def _patch(
         out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
         return
     nominal, corrected = reproduced(written, body, trials, task, read_rig(rig))
-    told = f"forces differ from the recorded ones by {corrected:.3g} N with it, {nominal:.3g} N without"
+    text = f"forces differ from the recorded ones by {corrected:.3g} N with it, {nominal:.3g} N without"
     if not corrected < nominal:
-        out.warn(f"--patch {folder}: the corrected model is no better ({told}); nothing is written")
+        out.warn(f"--patch {folder}: the corrected model is no better ({text}); nothing is written")
         return
     for name, text in written.items():
         out.stage(folder / name).write_text(text, encoding="utf-8")
-    out.print(f"the corrected model is in {folder}: {', '.join(written)}; {told}")
+    out.print(f"the corrected model is in {folder}: {', '.join(written)}; {text}")
 
 
 def run(

@@ -120,11 +120,11 @@ def _parameters(effect: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
     """Every effect that was looked at: whether it acts, what it explains, its evidence and signature."""
-    told = body.get("attribution") or {}
-    names = dict.fromkeys([*told, *body["effects"]])
+    attribution = body.get("attribution") or {}
+    names = dict.fromkeys([*attribution, *body["effects"]])
     rows = []
     for name in names:
-        entry, own = body["effects"].get(name), told.get(name)
+        entry, own = body["effects"].get(name), attribution.get(name)
         acts = own["probability"] if own else body["probabilities"].get(name)
         share = ""
         if own and own.get("share") is not None and own["probability"] >= 0.01:
@@ -154,10 +154,10 @@ def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tup
 
 def _detection(body: Body) -> str:
     p, fineness = body["detection"]["p_value"], body["detection"].get("resolution")
-    told = f"A healthy recording of this rig and task differs from the model as much with {finding.p_text(p)}"
+    text = f"A healthy recording of this rig and task differs from the model as much with {finding.p_text(p)}"
     if not fineness:
-        return f"{told}."
-    return f"{told}; the healthy twins simulated cannot show less than {plain(fineness, 1)}."
+        return f"{text}."
+    return f"{text}; the healthy twins simulated cannot show less than {plain(fineness, 1)}."
 
 
 def _far(body: Body) -> str:
@@ -165,10 +165,10 @@ def _far(body: Body) -> str:
     if not s or s.get("fraction") is None or s.get("before") is None:
         return ""
     fall = f"from {plain(s['before'])} to {plain(s['after'])}"
-    told = (
+    text = (
         f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
         f"healthy recordings leave {plain(s['noise_floor'])}."
     )
     if s.get("flexible_ceiling") is not None:
-        told += f" A description free of any physics would take {percent(s['flexible_ceiling'])} of the gap."
-    return told
+        text += f" A description free of any physics would take {percent(s['flexible_ceiling'])} of the gap."
+    return text

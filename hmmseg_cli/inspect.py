@@ -110,9 +110,9 @@ def _show(out: Output, found: Any) -> None:
                           ("least", "right"), ("most", "right"), ("course", "left")):  # fmt: skip
         table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
     for channel in found.channels:
-        told = "text" if channel.text else channel.unit or ""
+        unit = "text" if channel.text else channel.unit or ""
         rate = "" if channel.rate is None else f"{channel.rate:.4g}"
-        table.add_row(channel.name, told, rate, str(channel.missing or ""), _number(channel.minimum),
+        table.add_row(channel.name, unit, rate, str(channel.missing or ""), _number(channel.minimum),
                       _number(channel.maximum), sparkline(channel.course))  # fmt: skip
     out.print(table)
     for line in found.said:

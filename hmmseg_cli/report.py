@@ -105,12 +105,12 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
         for prop, entry in entries.items():
             value = (measured or {}).get(obj, {}).get(prop)
             source, shown = body["reasons"].get(f"{obj}.{prop}", ""), SHOWN[prop]
-            told, inner, outer, deviation = "unknown", "", "", ""
+            text, inner, outer, deviation = "unknown", "", "", ""
             if entry is not None:
                 source = ", ".join(entry.get("subtasks", ()))
-                told = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
+                text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
                 if entry.get("mean") is not None:
-                    told = estimate(entry["mean"], entry["sd"], shown)
+                    text = estimate(entry["mean"], entry["sd"], shown)
                     inner = interval(entry["interval_68"][0], entry["interval_68"][1], shown, sds=2.0)
                     outer = interval(entry["interval_95"][0], entry["interval_95"][1], shown, sds=3.9)
                     if value is not None:
@@ -122,5 +122,5 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
                 if measured
                 else ()
             )
-            rows.append((obj, prop, told, inner, outer, *apart, source))
+            rows.append((obj, prop, text, inner, outer, *apart, source))
     return rows

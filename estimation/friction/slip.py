@@ -23,8 +23,8 @@ from scipy.special import logsumexp
 
 PRIOR = 0.05  # prior: probability of slip before the anchors are seen
 SURE = 0.99  # chosen: probability from which slip is said to be seen
-ODD = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
-ODD_DRIFT = 2e-3  # prior: m per root second
+STRAY = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
+STRAY_DRIFT = 2e-3  # prior: m per root second
 SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s of a slipping pad
 STUCK = 0.5  # prior: probability that a pad near its limit holds all the same
 PERSISTENCE = 0.01  # prior: s over which the speed of a slipping pad varies
@@ -84,9 +84,9 @@ def slip_evidence(
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
     count, batch = len(stretches), _padded(every)
-    odd = _log_likelihood(batch, ODD_DRIFT) + np.log(ODD)
-    still = np.stack([_log_likelihood(batch, drift) for drift in DRIFTS]) + np.log(1 - ODD)
-    still = np.logaddexp(still, odd)
+    stray = _log_likelihood(batch, STRAY_DRIFT) + np.log(STRAY)
+    still = np.stack([_log_likelihood(batch, drift) for drift in DRIFTS]) + np.log(1 - STRAY)
+    still = np.logaddexp(still, stray)
     log_drift = np.log(np.asarray(DRIFT_PRIOR))[:, None]
     moved = []
     for coefficient in np.quantile(bound_draws, (0.1, 0.5, 0.9)):

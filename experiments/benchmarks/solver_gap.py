@@ -130,7 +130,7 @@ def gap_optimistix(folder: Path) -> Solve:
             base, mine, there, on, low, high, member, size = args
             x = jnp.clip(y, low, high) * there
             u = base.at[mine].add(x)
-            properties = given.centre + given.spread * u[:z].reshape(given.centre.shape)
+            properties = given.centre + given.sd * u[:z].reshape(given.centre.shape)
             residual, doubts = whitened(corrected(world, u, on, z), arrays, w, properties)
             prior = jnp.sqrt((1 + size) * jnp.log1p(member @ jnp.square(x)) + 1e-12)
             return jnp.concatenate([residual.ravel(), x[:z], prior, jnp.sqrt(2 * doubts + 1e-12)[None]])

@@ -29,8 +29,8 @@ def check_axes(trial: Trial, rig: Rig) -> list[Finding]:
     if not forces and not places:
         return []
     stems = (*(CARTESIAN if places else ()), *(FORCES if forces else ()))
-    told = " and ".join(["press against each other"] * forces + ["stand apart in a grip"] * places)
-    problem = f"and y are exchanged: the fingers {told} along y"
+    text = " and ".join(["press against each other"] * forces + ["stand apart in a grip"] * places)
+    problem = f"and y are exchanged: the fingers {text} along y"
     first = "fx1" if forces and not places else "x1"
     return [Finding(first, problem, exchanged(stems, ("x", "y"), trial, rig))]
 

@@ -49,8 +49,8 @@ def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     expected = f"{LIGHTEST:g} to {HEAVIEST:g} kg" if stated is None else f"{stated:g} kg in rig.toml"
     names = gripper.wrench[:3]
     finding = Finding(names[0], "", all_changed(names, rig, unit=unit))
-    told = f"move a tool of {found:.3g} kg ({expected}): they look like {unit}"
-    return (f"{trial.file}: columns {', '.join(names)} {told}; expected {finding.remedy}",)
+    text = f"move a tool of {found:.3g} kg ({expected}): they look like {unit}"
+    return (f"{trial.file}: columns {', '.join(names)} {text}; expected {finding.remedy}",)
 
 
 def _nearest(size: float) -> tuple[str, float]:

@@ -27,15 +27,15 @@ def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
         name, travel = max(far.items(), key=lambda item: item[1])
-        unit, told = length_unit(travel)
-        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {told}"
+        unit, text = length_unit(travel)
+        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {text}"
         return [Finding(name, problem, all_changed(travels, rig, unit=unit))]
     for name in gripper.opening:
         values = trial.channels[name]
         widest, swing = float(np.nanmax(np.abs(values))), _travel(trial, name)
         if swing > WIDEST:
-            unit, told = ("cm", 'cm (or "in")') if swing < 15 else ("mm", "mm (or %)")
-            problem = f"swings by {swing:.4g} m, a gripper by less than {WIDEST:g} m: it looks like {told}"
+            unit, text = ("cm", 'cm (or "in")') if swing < 15 else ("mm", "mm (or %)")
+            problem = f"swings by {swing:.4g} m, a gripper by less than {WIDEST:g} m: it looks like {text}"
             return [Finding(name, problem, changed(name, rig, unit=unit))]
         if swing < NARROW:
             problem = f"changes by {swing:.2g} m in all (of {widest:.3g} m)"
@@ -119,7 +119,7 @@ def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
     others = [axis for axis in AXES if axis != up and axis in position]
     across = gripper.closing if gripper.closing in others else others[0]
     swapped = position | {up: position[across], across: position[up]}
-    told = ", ".join(f"{axis} = {json.dumps(swapped[axis])}" for axis in AXES if axis in swapped)
+    text = ", ".join(f"{axis} = {json.dumps(swapped[axis])}" for axis in AXES if axis in swapped)
     where = f"{trial.file}: columns {position[up]}, {position[across]}"
     problem = f"say that the hand's load pulls along {across} and never along {up}: axes exchanged"
-    return InputError(where, problem, f"position = {{{told}}} under [gripper]")
+    return InputError(where, problem, f"position = {{{text}}} under [gripper]")

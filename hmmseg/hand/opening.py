@@ -88,8 +88,11 @@ def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tup
     if give is not None:
         width, sd = held + give, 0.0
     else:
-        told = [_touch(t, opening, begun, first, held), *_release(t, opening, active, last, opened, held)]
-        width, sd = _together(told, held, ceiling)
+        estimates = [
+            _touch(t, opening, begun, first, held),
+            *_release(t, opening, active, last, opened, held),
+        ]
+        width, sd = _together(estimates, held, ceiling)
     start = int(inside[np.argmax(opening[inside] <= width)])
     after = np.flatnonzero(opening[last : opened + 1] > width)
     stop = int(last + after[0]) if after.size else opened + 1
@@ -158,7 +161,7 @@ def _release(t: np.ndarray, opening: np.ndarray, active: np.ndarray, last: int, 
     return found
 
 
-def _together(told: list[tuple[float, float]], held: float, top: float) -> tuple[float, float]:
+def _together(estimates: list[tuple[float, float]], held: float, top: float) -> tuple[float, float]:
     """Mean and sd [m] of the opening at the touch, between the one held and the widest, `top`.
 
     What pads and drive give is the prior (Student-t); each estimate is right within its sd, or is of
@@ -166,7 +169,7 @@ def _together(told: list[tuple[float, float]], held: float, top: float) -> tuple
     """
     width = np.linspace(held, max(top, held + GRID), NODES)
     log_density = -(TAIL + 1) / 2 * np.log1p(((width - held - GIVE[0]) / GIVE[1]) ** 2 / TAIL)
-    for value, sd in told:
+    for value, sd in estimates:
         sd = max(sd, float(width[1] - width[0]))
         right = np.exp(-0.5 * ((width - value) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
         log_density += np.log((1 - WRONG) * right + WRONG / float(width[-1] - width[0]))

@@ -78,9 +78,9 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     if held.lifts and max(held.lifts) < 0:
         raise lifts_pull(trial, rig, min(held.lifts))
     if held.grips and not held.lifts:
-        told = contradiction(trial, rig, pose, opening, held)
-        if told is not None:
-            raise told
+        text = contradiction(trial, rig, pose, opening, held)
+        if text is not None:
+            raise text
     loaded = [grip for grip, load in zip(held.grips, held.loads, strict=True) if load is None or load != 0]
     found = as_fingers(trial, rig, pose, held.tool, opening, held.force, loaded or held.grips, pressing)
     order = order_warnings(trial, rig, held.tool, held.free)
@@ -219,11 +219,11 @@ def _notes(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     if gripper.tool_mass is not None and gripper.sensor_axes is not None and gripper.reaction is not None:
         return ()
     mass = "as given" if gripper.tool_mass else "from free motion"
-    told = f"{trial.file}: tool of {tool.mass:.3g} kg on the sensor ({mass})"
+    text = f"{trial.file}: tool of {tool.mass:.3g} kg on the sensor ({mass})"
     if gripper.sensor_axes is None and gripper.frame == "sensor":
         up = tool.axes @ direction(gripper.up)
         names = gripper.wrench[:3]
         largest = int(np.argmax(np.abs(up)))
         sign = "-" if up[largest] < 0 else ""
-        told += f"; a load that hangs on it shows in {sign}{names[largest]}"
-    return (told,)
+        text += f"; a load that hangs on it shows in {sign}{names[largest]}"
+    return (text,)

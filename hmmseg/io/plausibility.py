@@ -117,8 +117,8 @@ def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
         name, travel = max(far.items(), key=lambda item: item[1])
-        unit, told = length_unit(travel)
-        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {told}"
+        unit, text = length_unit(travel)
+        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {text}"
         return [Finding(name, problem, all_changed(far, rig, unit=unit))]
     if travels and max(travels.values()) < STILL:
         problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were in km"
@@ -166,8 +166,8 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
         return []
     name, (slope, _) = next(iter(found.items()))
     changes = {k: v for each, (_, what) in found.items() for k, v in changed(each, rig, **what).items()}
-    told = f"is {slope:.3g} times what {name.removeprefix('d').removeprefix('v')} changes by"
-    return [Finding(name, told, changes)]
+    text = f"is {slope:.3g} times what {name.removeprefix('d').removeprefix('v')} changes by"
+    return [Finding(name, text, changes)]
 
 
 def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:

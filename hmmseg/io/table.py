@@ -38,9 +38,9 @@ def plain_table(file: str, columns: dict[str, np.ndarray], names: Sequence[str] 
     columns = flat(columns)
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
-        odd = min(lengths, key=lambda name: sum(n == lengths[name] for n in lengths.values()))
+        other = min(lengths, key=lambda name: sum(n == lengths[name] for n in lengths.values()))
         usual = max(set(lengths.values()), key=list(lengths.values()).count)
-        raise InputError(f"{file}: column {odd}", f"has {lengths[odd]} rows", f"{usual} as in the others")
+        raise InputError(f"{file}: column {other}", f"has {lengths[other]} rows", f"{usual} as in the others")
     count = next(iter(lengths.values()), 0)
     return Table(file, tuple(names if names is not None else columns), columns, np.arange(1, count + 1))
 

@@ -129,12 +129,12 @@ class Watcher:
         """Take a row of a wrist's sensor; what was odd about it."""
         checked(self.filter.rig, t, row)
         newest = wrist.newest
-        odd = wrist.place(t, row)
-        if odd is None:
+        stray = wrist.place(t, row)
+        if stray is None:
             note = None if math.isnan(newest) else self._gap(t - newest)
         else:
-            self.counts[odd] += 1
-            note = ODD[odd].format(t=t, behind=newest - t, lag=wrist.delay)
+            self.counts[stray] += 1
+            note = ODD[stray].format(t=t, behind=newest - t, lag=wrist.delay)
         self._take_felt(wrist, wrist.ready())
         self.filter.idle(t)
         return note

@@ -148,24 +148,24 @@ def fitted(
     """
     weight = np.broadcast_to(there, load.shape).astype(float)
     count = weight.sum(axis=-1)
-    told, free = count > 3, np.maximum(count - 2, 1)
-    mask, slope, scale2, spread = weight, np.zeros(count.shape), np.full(count.shape, sd**2), count
+    determined, free = count > 3, np.maximum(count - 2, 1)
+    mask, slope, scale2, square = weight, np.zeros(count.shape), np.full(count.shape, sd**2), count
     residual = np.zeros_like(value)
     for _ in range(rounds):
         total = np.maximum(weight.sum(axis=-1), 1e-300)
         mean = [((weight * v).sum(axis=-1) / total)[..., None] for v in (load, value)]
         x, y = load - mean[0], value - mean[1]
         wx = weight * x
-        spread = (wx * x).sum(axis=-1)
-        told = told & (spread > 0)
-        spread = np.where(told, spread, 1.0)
-        slope = -(wx * y).sum(axis=-1) / spread * told
+        square = (wx * x).sum(axis=-1)
+        determined = determined & (square > 0)
+        square = np.where(determined, square, 1.0)
+        slope = -(wx * y).sum(axis=-1) / square * determined
         residual = y + slope[..., None] * x
         scale2 = np.maximum((weight * residual**2).sum(axis=-1) / free, sd**2)
         weight = mask * ((TAIL + 1) / (TAIL + residual**2 / scale2[..., None]))
-    share = scale2 * weight.sum(axis=-1) / np.maximum(slope**2 * spread, 1e-300)
+    share = scale2 * weight.sum(axis=-1) / np.maximum(slope**2 * square, 1e-300)
     flattened = slope * np.minimum(share, 1.0)
-    return np.asarray(slope), np.asarray(told / (scale2 / spread + flattened**2)), residual
+    return np.asarray(slope), np.asarray(determined / (scale2 / square + flattened**2)), residual
 
 
 def _medians(values: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -202,8 +202,10 @@ def evidence(
         usual = float(_medians(np.array([s.sd for s in own]), np.ones(len(own), bool)))
         read = [_read(s, delays, filtered, -inner * s.interval / 2) for s in own]
         found = [fitted(*r[:2], s.sd, 3, r[2])[:2] for r, s in zip(read, own, strict=True)]
-        slope, told = (np.stack([f[i] for f in found], axis=-1) for i in (0, 1))
-        weight = np.minimum(told, len(own) * _medians(told, np.ones_like(told, bool))[:, None])
+        slope, determined = (np.stack([f[i] for f in found], axis=-1) for i in (0, 1))
+        weight = np.minimum(
+            determined, len(own) * _medians(determined, np.ones_like(determined, bool))[:, None]
+        )
         total = weight.sum(axis=-1) + prior[1] ** -2
         c = np.maximum(((weight * slope).sum(axis=-1) + prior[0] * prior[1] ** -2) / total, 0.0)
         rests = [value + c[:, None] * load for load, value, _ in read]

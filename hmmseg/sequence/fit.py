@@ -86,7 +86,7 @@ def _fit_unlabelled(data: list[Features], task: SequenceTask, mapping: FeatureMa
     named = tuple(
         _named(data, boundaries, courses[i], namings[i], float(probability[i]) / total, factor) for i in order
     )
-    scale = np.where(np.isfinite(boundaries).any(0), WEIGHING.told, WEIGHING.lag)
+    scale = np.where(np.isfinite(boundaries).any(0), WEIGHING.labelled, WEIGHING.lag)
     lag = scale * float(np.median([len(v) for v in values]))
     return replace(model, courses=named, lag=lag, sure=choice.right)
 
@@ -117,8 +117,8 @@ def _named(data: list[Features], boundaries: list[np.ndarray], course: Course, f
         (shares(each, b)[:, None] - ends) * len(each.values)
         for each, b, ends in zip(data, boundaries, course.ends, strict=True)
     ])  # fmt: skip
-    told = np.isfinite(lags)
-    shift = np.where(told, lags, 0.0).sum(0) / np.maximum(told.sum(0), 1)
+    labelled = np.isfinite(lags)
+    shift = np.where(labelled, lags, 0.0).sum(0) / np.maximum(labelled.sum(0), 1)
     return NamedCourse(probability, emissions, mean_cells, found.probability, shift)
 
 
@@ -147,7 +147,7 @@ def _fit_labelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
             for each, b, path in zip(data, boundaries, known, strict=True)
         ]
         aligned = learner.align(emissions, law, detectors)
-        start = learner.told(learner.one_hot([a.path for a in aligned]))
+        start = learner.as_labelled(learner.one_hot([a.path for a in aligned]))
         emissions, probability = learner.run(start, emissions.temper, FLOORS[-1:], detectors)
     return _finish(data, task, mapping, learner, emissions, probability, detectors)
 

@@ -85,9 +85,9 @@ class Learner:
             probability = found.responsibilities
             emission = found.emission.updated(probability)
             durations = found.durations.updated(probability)
-        return emission.emissions, self.told(probability)
+        return emission.emissions, self.as_labelled(probability)
 
-    def told(self, probability: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def as_labelled(self, probability: Sequence[np.ndarray]) -> list[np.ndarray]:
         """State probabilities, of labelled trials those of their labels."""
         return [p if k is None else np.eye(self.num_states)[k]
                 for p, k in zip(probability, self.known, strict=True)]  # fmt: skip
@@ -120,7 +120,7 @@ class _Emission:
         return ll if allowed is None else ll + allowed
 
     def updated(self, responsibilities: Sequence[np.ndarray]) -> _Emission:
-        pooled = self.learner.pooled(self.learner.told(responsibilities))
+        pooled = self.learner.pooled(self.learner.as_labelled(responsibilities))
         return replace(self, emissions=update(self.emissions, self.learner.stacked, pooled, self.floor))
 
 
@@ -142,4 +142,4 @@ class _Durations:
         return jumps(ratios_of(self.learner.values[trial], self.detectors), self.detectors, self.law.bands)
 
     def updated(self, responsibilities: Sequence[np.ndarray]) -> _Durations:
-        return replace(self, law=self.learner.law(self.learner.told(responsibilities)))
+        return replace(self, law=self.learner.law(self.learner.as_labelled(responsibilities)))

@@ -38,7 +38,7 @@ class Weighing:
     settled: float
     shares: float
     lag: float
-    told: float
+    labelled: float
     elsewhere: float
 
 
@@ -47,7 +47,7 @@ WEIGHING = Weighing(
     settled=-2.98,  # learned: by `experiments.sequences learn --worlds 70`
     shares=0.146,  # learned: by `experiments.sequences learn --worlds 70`
     lag=0.0071,  # learned: by `experiments.sequences learn --worlds 70`
-    told=0.0049,  # learned: by `experiments.sequences learn --worlds 70`
+    labelled=0.0049,  # learned: by `experiments.sequences learn --worlds 70`
     elsewhere=0.047,  # learned: by `experiments.sequences learn --worlds 70`
 )
 

@@ -21,7 +21,7 @@ from simgap.attribution.shares import Shares, shares
 from simgap.attribution.verdict import ALARM, LEAST, Explanation, acting, conclude, known
 
 DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
-JUDGED = 6  # numerics: sets of which it is asked whether they are the cause
+EXAMINED = 6  # numerics: sets of which it is asked whether they are the cause
 
 
 def attribute(
@@ -56,31 +56,31 @@ def attribute(
     for m, weight in zip(models, w, strict=True):
         likely[parts[m.effects]] = likely.get(parts[m.effects], 0.0) + float(weight)
     ranked = sorted((p for p in likely if p), key=lambda p: -likely[p])
-    judged = {part: _judged(f, part, by_group, rng) for part in ranked[:JUDGED]}
-    sets = [_explanation(f, parts[m.effects], float(x), judged) for m, x in zip(models, w, strict=True)]
+    examined = {part: _examined(f, part, by_group, rng) for part in ranked[:EXAMINED]}
+    sets = [_explanation(f, parts[m.effects], float(x), examined) for m, x in zip(models, w, strict=True)]
     small = None
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
         small = _small(f, models, parts, by_group, absorbed)
     if small is not None and gap.usual:  # a cause that is surely found can be mended
         chance = conclude(sets, found.p_value).probabilities
         small = small if chance["none"] + chance["unknown"] > DOUBT else None
-    first = next(iter(judged), ())
+    first = next(iter(examined), ())
     verdict = conclude(sets, found.p_value, small is None, _names(f, first) if forced else ())
-    causes = next((j.causes for j in judged.values() if _names(f, j.causes) == verdict.causes), ())
+    causes = next((j.causes for j in examined.values() if _names(f, j.causes) == verdict.causes), ())
     causes = first if forced else causes
-    told = fitted(f, causes)
-    left, before = residual_left(f, told), residual_left(f, fitted(f, ()))
+    model = fitted(f, causes)
+    left, before = residual_left(f, model), residual_left(f, fitted(f, ()))
     sd = noise[gap.rows.channel]
     rest = significant(gap.rows, f.spectrum.band, left, sd)
     p_rest = detected(statistic(f, models, causes)).p_value
-    explained = shares(f, told, by_group, rng)
+    explained = shares(f, model, by_group, rng)
     far = how_far(gap, noise**2) if nested and causes else None
     chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
                     found.p_value)  # fmt: skip
     somewhere = verdict.verdict != "none" or small is not None
     return Attribution(
         **vars(verdict),
-        effects=_effects(f, models, chance, judged),
+        effects=_effects(f, models, chance, examined),
         detection=found,
         remainder=Remainder(explained.remainder, p_rest, rest),
         where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
@@ -99,9 +99,9 @@ def _names(f: Forms, effects: Iterable[int]) -> tuple[str, ...]:
 
 
 def _explanation(
-    f: Forms, part: tuple[int, ...], weight: float, judged: dict[tuple[int, ...], _Judged]
+    f: Forms, part: tuple[int, ...], weight: float, examined: dict[tuple[int, ...], _Examined]
 ) -> Explanation:
-    one = judged.get(part)
+    one = examined.get(part)
     if one is None:
         return Explanation(_names(f, part), weight)
     return Explanation(_names(f, part), weight, _names(f, one.causes), one.known)
@@ -117,8 +117,8 @@ def _small(
     if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
         return None
     if absorbed is not None:  # by causes that have a name: what has none says nothing of properties
-        told = fitted(f, parts[models[0].effects])
-        moved = np.abs(told.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+        model = fitted(f, parts[models[0].effects])
+        moved = np.abs(model.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
         if (moved > absorbed).any():
             return None
     return small
@@ -153,7 +153,7 @@ def _forced(f: Forms, names: tuple[str, ...]) -> Model:
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _Examined:
     """A set of named effects: its fit, shares, invariance, `causes` that matter, probability to be right."""
 
     effects: tuple[int, ...]
@@ -164,7 +164,9 @@ class _Judged:
     known: float
 
 
-def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.random.Generator) -> _Judged:
+def _examined(
+    f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.random.Generator
+) -> _Examined:
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     same = {j: invariance(f, model, j, f.gap.rows.trial) for j in effects}
@@ -179,7 +181,7 @@ def _judged(f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.ra
     left = explained.inside if shifting else 0.0
     factors = [i.log_bayes_factor for i in shifting]
     sure = known(left, 1 - explained.remainder, factors) if causes else 0.0
-    return _Judged(effects, model, explained, same, causes, sure)
+    return _Examined(effects, model, explained, same, causes, sure)
 
 
 def _there(f: Forms, model: Model, effect: int) -> bool:
@@ -193,7 +195,7 @@ def _there(f: Forms, model: Model, effect: int) -> bool:
 
 
 def _effects(
-    f: Forms, models: list[Model], chances: dict[str, float], judged: dict[tuple[int, ...], _Judged],
+    f: Forms, models: list[Model], chances: dict[str, float], examined: dict[tuple[int, ...], _Examined],
 ) -> dict[str, EffectPosterior]:  # fmt: skip
     """The posterior of every candidate: from the best set that holds it, or by itself."""
     out: dict[str, EffectPosterior] = {}
@@ -202,7 +204,7 @@ def _effects(
         forms_of.setdefault(c.name, []).append(j)
     for name, mine in forms_of.items():
         inside = [m for m in models if {*mine} & {*m.effects}]
-        found = next((one for part, one in judged.items() if {*mine} & {*part}), None)
+        found = next((one for part, one in examined.items() if {*mine} & {*part}), None)
         if found is not None:
             model = found.model
         elif inside:

@@ -13,7 +13,7 @@ Rows = list[dict[str, Any]]
 
 
 def entries(
-    told: Verdict,
+    verdict: Verdict,
     detection: Detection,
     remainder: tuple[float, float | None, Rows],
     attribution: Mapping[str, tuple[float, float, tuple[float, float]]],
@@ -21,13 +21,13 @@ def entries(
 ) -> dict[str, Any]:
     """Verdict, detection, remainder (share, p-value, where), every effect's probability, share of the
     gap and its 90 % interval, and where. A gap that is none, or does not matter, lies nowhere."""
-    gap = told.verdict != "none"
+    gap = verdict.verdict != "none"
     share, p_value, places = remainder
     return {
-        "verdict": told.verdict,
-        "causes": list(told.causes),
-        "indistinguishable": list(told.indistinguishable),
-        "probabilities": told.probabilities,
+        "verdict": verdict.verdict,
+        "causes": list(verdict.causes),
+        "indistinguishable": list(verdict.indistinguishable),
+        "probabilities": verdict.probabilities,
         "detection": {
             "p_value": detection.p_value,
             "statistic": detection.statistic,

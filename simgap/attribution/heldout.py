@@ -32,15 +32,15 @@ def how_far(gap: Gap, noise: np.ndarray) -> HowFar | None:
     before, after, floor = (np.zeros(trials.size) for _ in range(3))
     for k, trial in enumerate(trials):
         inside = gap.rows.trial == trial
-        train, judge = forms(gap.taken(~inside)), forms(gap.taken(inside))
+        train, test = forms(gap.taken(~inside)), forms(gap.taken(inside))
         best = next((m for m in sought(train, 1) if any(gap.candidates[j].named for j in m.effects)), None)
         kept = () if best is None else tuple(j for j in best.effects if gap.candidates[j].named)
         model, empty = fitted(train, kept), fitted(train, ())
-        weight = 1 / noise[_channels(judge, gap, inside)]
-        after[k] = _square(judge, kept, weight, model.x)
-        before[k] = _square(judge, (), weight, _plain(train, gap, ~inside, noise))
-        before[k] = min(before[k], _square(judge, (), weight, empty.x))
-        floor[k] = judge.count.sum()
+        weight = 1 / noise[_channels(test, gap, inside)]
+        after[k] = _square(test, kept, weight, model.x)
+        before[k] = _square(test, (), weight, _plain(train, gap, ~inside, noise))
+        before[k] = min(before[k], _square(test, (), weight, empty.x))
+        floor[k] = test.count.sum()
     gone, there = before - after, before - floor
     if float(there.sum()) <= 0:
         return None

@@ -51,8 +51,8 @@ def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap
     count = np.bincount(inverse).astype(float)
     noise = by_group[f.spectrum.group]
     excess = np.maximum(np.bincount(inverse, before**2) - np.bincount(inverse, noise), 0.0) / count
-    spread = np.sqrt(2 / count) * np.bincount(inverse, noise) / count
-    amount = np.sqrt(np.maximum(excess - 2 * spread, 0.0))
+    chance = np.sqrt(2 / count) * np.bincount(inverse, noise) / count
+    amount = np.sqrt(np.maximum(excess - 2 * chance, 0.0))
     sd = np.sqrt(np.bincount(inverse, np.ones(inverse.size) if rows.sd is None else rows.sd**2) / count)
     amount, least = amount * sd, np.bincount(inverse, tolerance) / count
     size = amount / least

@@ -33,8 +33,8 @@ class Shares:
         part = lost / max(float(lost.sum()), 1e-12)
         scatter = np.sqrt(2 * floor + 4 * max(after - floor, 0.0))
         drawn = after + scatter * rng.standard_normal(DRAWS)
-        told = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
-        return cls(before, after, floor, told[:, None] * part, inside)
+        explained = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
+        return cls(before, after, floor, explained[:, None] * part, inside)
 
     @property
     def remainder(self) -> float:

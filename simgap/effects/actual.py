@@ -18,7 +18,7 @@ def _wrong(given, push: np.ndarray) -> list:
         for k, kind in enumerate(("weight", "width", "height")):
             column = push[:, 3 * o + k]
             if given.measured[o, k] and (column**2).sum() > 1.0:
-                usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.spread[o, k])
+                usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.sd[o, k])
                 out.append(Candidate(EFFECT.name, (f"{name}.{kind}",), nothing, nothing, usual,
                                      np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
                                      np.full(1, np.inf)))  # fmt: skip

@@ -141,7 +141,7 @@ class Effect:
 
     `correct(world, values, on)` takes the recording back; `on` is 1 where the effect is in the
     candidate and 0 elsewhere, for parameters that have no neutral value. `scatter(problem, residual)`
-    gives the variance of a random disturbance instead (a `simgap.gap.spread.Spread`).
+    gives the variance of a random disturbance instead (a `simgap.gap.scatter.Scatter`).
     `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
     scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
     `chosen` is false for effects that only `--effect` asks for. `report(values, rig)` gives the parameters
@@ -152,7 +152,7 @@ class Effect:
     by default from its priors; empty for one that cannot be felt. `turns`: the parameter
     [rad] by up to which blocks turn in the grip on the ground where it acts, as they please.
 
-    `called`: the effect in plain words, `told(means, rig)` where its parameters decide them, and what to
+    `called`: the effect in plain words, `phrase(means, rig)` where its parameters decide them, and what to
     `check` on the rig. `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]:
     least and most that blocks are held with, so that it shows. `restored(channels, values)`: recorded
     channels as they would be without it. `patched(document, found)`: puts what was found into numbers that
@@ -180,7 +180,7 @@ class Effect:
     played: Mapping[str, float] | None = None
     called: str = ""
     check: str = ""
-    told: Callable[[Mapping[str, float], Mapping[str, Any]], str] | None = None
+    phrase: Callable[[Mapping[str, float], Mapping[str, Any]], str] | None = None
     sampled: Callable[[np.ndarray, dict[str, float], np.random.Generator], np.ndarray] | None = None
     grip: tuple[float, float] | None = None
     restored: Callable[[dict[str, np.ndarray], dict[str, float]], dict[str, np.ndarray]] | None = None

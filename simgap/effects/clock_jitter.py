@@ -14,7 +14,7 @@ JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 
 def _scatter(given, residual: np.ndarray):
     from simgap.gap.assemble import rows_of
-    from simgap.gap.spread import on_grid
+    from simgap.gap.scatter import on_grid
 
     rows, rate = rows_of(given), _rates(given)[given.whitening.weight > 0]
     size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)

@@ -35,8 +35,8 @@ def faded(drive: jax.Array, ratio: jax.Array) -> jax.Array:
 def of_finger(words: str) -> Callable[[Mapping[str, float], Mapping[str, Any]], str]:
     """These words, and the finger where it is of one alone."""
 
-    def told(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
+    def phrase(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
         acting = [k for k, v in means.items() if v > 0]
         return f"{words} of finger {acting[0][-1]}" if [k[:6] for k in acting] == ["finger"] else words
 
-    return told
+    return phrase

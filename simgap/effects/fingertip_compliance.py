@@ -36,7 +36,7 @@ def _admitted(rig):
     return "fingertip_compliance/1", {f"give_{k}{i + 1}": give[k] * sds[i] for k in give for i in (0, 1)}
 
 
-def _told(means, rig):
+def _phrase(means, rig):
     nominal, found = rig.get("normal_stiffness"), means.get("normal_stiffness")
     if nominal is None or found is None:
         return "other fingertips than the model's"
@@ -71,7 +71,7 @@ EFFECT = Effect(
         "Press a fingertip against a scale with feeler gauges behind it and plot force over travel; look "
         "for worn or replaced pads."
     ),
-    told=_told,
+    phrase=_phrase,
     parameters=(
         Parameter("give_normal", "m/N", 4e-4, low=-2.4e-4),
         Parameter("give_shear", "m/N", 4e-4, low=-3.8e-4),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from simgap.effects.base import FORCES, READOUT, Effect, Parameter, flat, per_channel, with_force
 
 
-def _told(means, rig):
+def _phrase(means, rig):
     worst = max(means, key=lambda k: abs(means[k]))
     total = sum(abs(v) for v in means.values())
     lone = total > 0 and abs(means[worst]) > 0.8 * total
@@ -20,7 +20,7 @@ EFFECT = Effect(
     mistaken_for=("weight", "fingertip_mass"),
     called="zero errors of the force sensors",
     check="Tare the force sensors in free air, record two seconds at rest, and look at what is left.",
-    told=_told,
+    phrase=_phrase,
     parameters=tuple(Parameter(c, "N", 0.1) for c in FORCES),
     stage=READOUT,
     correct=lambda w, v, on: w._replace(force=w.force - per_channel(v, FORCES)),

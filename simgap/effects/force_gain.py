@@ -27,7 +27,7 @@ def _correct(world: World, values, on) -> World:
     )
 
 
-def _told(means, rig):
+def _phrase(means, rig):
     which = {k: v for k, v in means.items() if k != "gain"}
     if which:
         worst = max(which, key=lambda k: abs(which[k]))
@@ -44,7 +44,7 @@ EFFECT = Effect(
     mistaken_for=("weight", "fingertip_compliance"),
     called="force sensors that read too high or too low",
     check="Hang a known weight from each fingertip and compare; check the calibration factors in the driver.",
-    told=_told,
+    phrase=_phrase,
     parameters=tuple(Parameter(n, "1", 0.1, low=-0.5, high=0.5) for n in EVERY),
     forms=(("gain",), FINGERS, FORCES),
     admitted=lambda rig: ("force_gain/2", dict(zip(FORCES, rig.systematic.force_gain, strict=True))),

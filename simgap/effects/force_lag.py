@@ -35,7 +35,7 @@ EFFECT = Effect(
         "Tap a fingertip sharply and compare the time stamps of force and motion; look for a buffer in "
         "the force channel."
     ),
-    told=of_finger("force readings that come late"),
+    phrase=of_finger("force readings that come late"),
     parameters=(
         Parameter("delay", "s", 0.1, starts=STARTS, low=0.0, high=0.4),
         Parameter("finger1", "s", 0.1, starts=STARTS, low=0.0, high=0.4),

@@ -39,7 +39,7 @@ EFFECT = Effect(
         "Look up the filter setting of the force amplifier or driver; tap a fingertip and see how fast "
         "the reading rises."
     ),
-    told=of_finger("a slow filter in the force channel"),
+    phrase=of_finger("a slow filter in the force channel"),
     parameters=(
         Parameter("time_constant", "s", 0.08, starts=STARTS, low=0.0, high=0.5),
         Parameter("finger1", "s", 0.08, starts=STARTS, low=0.0, high=0.5),

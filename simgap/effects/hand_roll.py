@@ -23,7 +23,7 @@ def _scatter(given, residual: np.ndarray):
     from scipy.fft import dct
 
     from simgap.gap.assemble import rows_of
-    from simgap.gap.spread import on_grid
+    from simgap.gap.scatter import on_grid
 
     rows, arrays, there = rows_of(given), given.frame.arrays, given.whitening.weight > 0
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])

@@ -19,7 +19,7 @@ def _scatter(given, residual: np.ndarray):
     most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
     were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each.
     """
-    from simgap.gap.spread import Spread
+    from simgap.gap.scatter import Scatter
 
     frame = given.frame
     force = frame.world.force[: frame.num_trials]
@@ -41,7 +41,7 @@ def _scatter(given, residual: np.ndarray):
     for channel, share in SHARES.items():
         c = CHANNELS.index(channel)
         variance[..., c] = share * step**2 / 12 * weight[..., c] ** 2
-    return Spread(
+    return Scatter(
         "quantisation", step, 1e-3, variance[weight > 0], float(values.size * np.log(step / WRITTEN))
     )
 

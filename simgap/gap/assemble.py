@@ -16,7 +16,7 @@ from simgap.gap.fit import Fitted
 from simgap.gap.frame import subtask_name
 from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
-from simgap.gap.spread import Spread
+from simgap.gap.scatter import Scatter
 from simgap.gap.tolerance import tolerated
 from simgap.gap.trial_arrays import CHANNELS, PHASES
 
@@ -35,14 +35,14 @@ def gap_of(
     given: Problem,
     healthy: Fitted,
     fits: Sequence[Fitted],
-    spreads: Sequence[Spread] = (),
+    scatters: Sequence[Scatter] = (),
     redrawn: Sequence[Problem] = (),
 ) -> Gap:
-    """The gap with a candidate for every fit (of one effect each), every spread, and the properties that were
+    """The gap with a candidate for every fit (of one effect each) and scatter, and for the properties that were
     measured apart. What sensors' noise makes of them is seen on `redrawn` recordings."""
     rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
     usual = given.frame.rig.tolerance == Tolerance()
-    scattering, tolerance = [_spreading(s, rows) for s in spreads], tolerated(given)
+    scattering, tolerance = [_scattering(s, rows) for s in scatters], tolerated(given)
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
         k = problem.num_properties
@@ -70,7 +70,7 @@ def together(
     gap: Gap,
     healthy: Fitted,
     joint: Fitted,
-    left: Sequence[Spread] = (),
+    left: Sequence[Scatter] = (),
     redrawn: Sequence[Problem] = (),
 ) -> Gap:
     """The gap with further candidates: the effects of a joint fit, linearised where they are together.
@@ -78,7 +78,7 @@ def together(
     Each shifts the residual by what leaving it out changes; what they do only together is parted evenly.
     What scatters is as large as it is in what they leave (`left`).
     """
-    anew = {s.effect: _spreading(s, gap.rows) for s in left}
+    anew = {s.effect: _scattering(s, gap.rows) for s in left}
     gap = replace(gap, candidates=tuple(anew.get(c.name, c) for c in gap.candidates))
     if len(joint.effects) < 2:
         return gap
@@ -165,7 +165,7 @@ def _candidate(
     )  # fmt: skip
 
 
-def _spreading(s: Spread, rows: Rows) -> Candidate:
+def _scattering(s: Scatter, rows: Rows) -> Candidate:
     """What scatters as a candidate; its variance over that of the noise as it is in these rows."""
     nothing, count = np.zeros(0), s.variance.size
     variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))

@@ -22,28 +22,32 @@ TOLD = 0.5  # look: sd of the prior below which a property is told by the record
 
 
 def body(
-    found: Search, told: Attribution, causes: Fitted | None, following: dict | None, seed: int
+    found: Search, verdict: Attribution, causes: Fitted | None, following: dict | None, seed: int
 ) -> dict[str, Any]:
     """The JSON document of a diagnosis; `causes`: the joint fit of the named effects that shift signals."""
-    given, posterior = found.problem, told.effects
+    given, posterior = found.problem, verdict.effects
     named = {n: e for n, e in posterior.items() if n in catalogue()}
     ranked = sorted(named, key=lambda n: -named[n].probability)
-    shown = [n for k, n in enumerate(ranked) if k < LISTED or n in told.causes or n in told.indistinguishable]
-    effects = {n: _described(found, told, n, seed) for n in shown}
-    if len(told.causes) > 1:
-        effects["+".join(told.causes)] = {
-            "parameters": {f"{n}.{k}": p for n in told.causes for k, p in effects[n]["parameters"].items()},
-            "log_evidence": _evidence(told, told.causes),
+    shown = [
+        n for k, n in enumerate(ranked) if k < LISTED or n in verdict.causes or n in verdict.indistinguishable
+    ]
+    effects = {n: _described(found, verdict, n, seed) for n in shown}
+    if len(verdict.causes) > 1:
+        effects["+".join(verdict.causes)] = {
+            "parameters": {
+                f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()
+            },
+            "log_evidence": _evidence(verdict, verdict.causes),
             "heldout_score": None,
             "property_shift": _shifts(found, causes),
         }
-    elif told.causes and causes is not None:
-        effects[told.causes[0]]["property_shift"] = _shifts(found, causes)
-    rest, far = told.remainder, told.how_far
+    elif verdict.causes and causes is not None:
+        effects[verdict.causes[0]]["property_shift"] = _shifts(found, causes)
+    rest, far = verdict.remainder, verdict.how_far
     attribution = {n: (e.probability, e.share, e.share_90) for n, e in named.items()}
-    out = entries(told, told.detection, (rest.share, rest.p_value, where(given, rest.where, None)),
-                  attribution, where(given, told.where, causes))  # fmt: skip
-    out |= {"effects": effects, "noise": told.noise, "shrinkage": None, "next_experiment": following}
+    out = entries(verdict, verdict.detection, (rest.share, rest.p_value, where(given, rest.where, None)),
+                  attribution, where(given, verdict.where, causes))  # fmt: skip
+    out |= {"effects": effects, "noise": verdict.noise, "shrinkage": None, "next_experiment": following}
     if far is not None:
         ends = [x if np.isfinite(x) else None for x in far.interval_90]
         out["shrinkage"] = {
@@ -51,13 +55,13 @@ def body(
             "noise_floor": far.noise_floor, "fraction": far.fraction, "interval_90": ends,
             "flexible_ceiling": None,
         }  # fmt: skip
-    if told.small_gap is not None:
-        small = told.small_gap
+    if verdict.small_gap is not None:
+        small = verdict.small_gap
         metres = small.channel in ("x", "y", "distance", "offset")
         unit = "m" if metres else "m/s" if small.channel in ("vx", "vy") else "N"
         out["small_gap"] = {
             "size": small.amount * _unit_of_noise(found, small.channel), "unit": unit,
-            "where": where(given, told.where, None),
+            "where": where(given, verdict.where, None),
         }  # fmt: skip
     return out
 
@@ -68,11 +72,11 @@ def _unit_of_noise(found: Search, channel: str) -> float:
     return float(np.median(arrays.sd[..., c][arrays.there[..., c] > 0]))
 
 
-def _described(found: Search, told: Attribution, name: str, seed: int) -> dict[str, Any]:
+def _described(found: Search, verdict: Attribution, name: str, seed: int) -> dict[str, Any]:
     """Parameters and evidence of one effect."""
     return {
-        "parameters": parameters(found, told.effects[name], name, seed),
-        "log_evidence": _evidence(told, (name,)),
+        "parameters": parameters(found, verdict.effects[name], name, seed),
+        "log_evidence": _evidence(verdict, (name,)),
         "heldout_score": None,
         "property_shift": {},
     }
@@ -91,7 +95,7 @@ def drawn(
     them."""
     effect, rng = catalogue()[name], np.random.default_rng(seed)
     of = {p.name: p for p in effect.parameters}
-    scatter = next((s for s in found.spreads if s.effect == name), None)
+    scatter = next((s for s in found.scatters if s.effect == name), None)
     if scatter is not None:
         p = effect.parameters[0]
         return {p.name: (scatter.value * np.exp(scatter.log_sd * rng.standard_normal(DRAWS)), p.unit)}
@@ -100,7 +104,7 @@ def drawn(
         u = p.mean + p.sd * rng.standard_normal(DRAWS)
         if key not in of:  # by how much a property that was measured apart is off
             obj, kind = key.rsplit(".", 1)
-            one = found.problem.spread[found.problem.frame.task.objects.index(obj), PROPERTIES.index(kind)]
+            one = found.problem.sd[found.problem.frame.task.objects.index(obj), PROPERTIES.index(kind)]
             return {key: (u * float(one), UNITS[kind])}
         draws[key] = np.asarray(of[key].value(np.clip(u, *of[key].limits)))
     if effect.report is not None:
@@ -114,9 +118,9 @@ def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
             "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
 
 
-def _evidence(told: Attribution, names: tuple[str, ...]) -> float:
+def _evidence(verdict: Attribution, names: tuple[str, ...]) -> float:
     """Log posterior odds of an effect, or of several, to act [nats]."""
-    chance = min((told.effects[n].probability for n in names), default=0.0)
+    chance = min((verdict.effects[n].probability for n in names), default=0.0)
     chance = float(np.clip(chance, 1e-12, 1 - 1e-12))
     return float(np.log(chance / (1 - chance)))
 
@@ -127,7 +131,7 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
     if causes is None:
         return {}
     k = given.num_properties
-    before, after = (given.centre + given.spread * f.u[:k].reshape(-1, 3) for f in (found.healthy, causes))
+    before, after = (given.centre + given.sd * f.u[:k].reshape(-1, 3) for f in (found.healthy, causes))
     known = (causes.push[:, :k] ** 2).sum(0).reshape(-1, 3) > 1 / TOLD**2
     return {
         f"{name}.{kind}": {"before": float(before[o, j]), "after": float(after[o, j]), "unit": UNITS[kind]}

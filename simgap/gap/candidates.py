@@ -26,7 +26,7 @@ def candidate_names(rig: Rig, excluded: Sequence[str] = ()) -> list[str]:
 
 
 def shifting(names: Sequence[str]) -> list[str]:
-    """Keys of all forms of those effects that shift signals (the others only spread them)."""
+    """Keys of all forms of those effects that shift signals (the others only scatter them)."""
     return [key for n in names if fitted()[n].correct is not None for key in forms_of(n)]
 
 

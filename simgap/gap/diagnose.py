@@ -30,8 +30,8 @@ from simgap.gap.experiments import next_experiment
 from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.located import Tally, tallies
 from simgap.gap.problem import Problem
+from simgap.gap.scatter import scatters
 from simgap.gap.search import Search, search
-from simgap.gap.spread import spreads
 from simgap.gap.tolerance import properties_tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.gap.wrist_gap import check_forced, of_wrist
@@ -140,30 +140,32 @@ def diagnose(
             return own_healthy(found, healthy, task, rig, actual)
         return twin_statistics(found, task, rig, actual, seed, tell) if twins and value > NIL else ()
 
-    gap, told = attributed(found, tuple(forced), seed, null)
-    causes = _causes(found, gap, told)
+    gap, verdict = attributed(found, tuple(forced), seed, null)
+    causes = _causes(found, gap, verdict)
     following = None
-    if told.verdict == "set":
+    if verdict.verdict == "set":
         tell("the next experiment")
-        mine = {n: parameters(found, told.effects[n], n, seed) for n in told.causes}
+        mine = {n: parameters(found, verdict.effects[n], n, seed) for n in verdict.causes}
         values = {n: {k: p["mean"] for k, p in each.items()} for n, each in mine.items()}
-        following = next_experiment(found, values, told.indistinguishable, seed, actual)
-    document = body(found, told, causes, following, seed)
-    warnings = (*found.warnings, *_inseparable(told, following))
+        following = next_experiment(found, values, verdict.indistinguishable, seed, actual)
+    document = body(found, verdict, causes, following, seed)
+    warnings = (*found.warnings, *_inseparable(verdict, following))
     if found.problem.frame.num_trials == 1:
         warnings = (*warnings, "one trial: nothing tells an accident of it from an effect")
     before = residual_at(found.problem, (), found.healthy.u)
     after = residual_at(found.problem, causes.effects, causes.u)
     cells = tallies(found.problem, before)
-    return Diagnosis(document, found, causes, told, before, after, cells, warnings, seed)
+    return Diagnosis(document, found, causes, verdict, before, after, cells, warnings, seed)
 
 
-def _inseparable(told: Attribution, following: dict[str, Any] | None) -> list[str]:
+def _inseparable(verdict: Attribution, following: dict[str, Any] | None) -> list[str]:
     """What no experiment is expected to tell from the causes, if there is any."""
-    left = sorted(set(told.indistinguishable) - set([] if following is None else following["separates"]))
+    left = sorted(set(verdict.indistinguishable) - set([] if following is None else following["separates"]))
     if not left:
         return []
-    return [f"no experiment of the list is expected to tell {', '.join(left)} from {' + '.join(told.causes)}"]
+    return [
+        f"no experiment of the list is expected to tell {', '.join(left)} from {' + '.join(verdict.causes)}"
+    ]
 
 
 def attributed(
@@ -178,8 +180,8 @@ def attributed(
     leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
-        left = spreads(
-            found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.spreads]
+        left = scatters(
+            found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
         )
         gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
@@ -195,11 +197,11 @@ def _together(found: Search, which: Sequence[int]) -> Fitted:
     return fit(found.problem, Start(tuple(found.fits[j].effects[0] for j in which), u))
 
 
-def _causes(found: Search, gap: Gap, told: Attribution) -> Fitted:
+def _causes(found: Search, gap: Gap, verdict: Attribution) -> Fitted:
     """The fit of the verdict's effects that shift signals, in the forms that they were found in."""
     which = []
-    for name in told.causes:
-        parameters = gap.candidates[told.effects[name].candidate].parameters
+    for name in verdict.causes:
+        parameters = gap.candidates[verdict.effects[name].candidate].parameters
         which += [
             j for j, f in enumerate(found.fits)
             if name_of(f.effects[0]) == name and free_parameters(f.effects[0]) == parameters

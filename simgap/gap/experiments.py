@@ -72,7 +72,7 @@ def next_experiment(
         blocks = blocks_of(found)
     except ValueError:
         return None
-    chosen, told = EXPERIMENTS[0], dict[str, float]()
+    chosen, separated = EXPERIMENTS[0], dict[str, float]()
     for experiment in EXPERIMENTS:
         if experiment.measured and actual:
             continue
@@ -81,16 +81,16 @@ def next_experiment(
         except (InputError, ValueError, KeyError):  # what cannot be simulated on this rig
             continue
         sure = {p: g for p, g in gains.items() if g > ENOUGH}
-        if len(sure) > len(told):
-            chosen, told = experiment, sure
-        if len(told) == len(partners):
+        if len(sure) > len(separated):
+            chosen, separated = experiment, sure
+        if len(separated) == len(partners):
             break
-    if not told:
+    if not separated:
         return None
     return {
         "do": chosen.do,
-        "separates": sorted({*cause, *told}),
-        "expected_gain_nats": float(min(told.values())),
+        "separates": sorted({*cause, *separated}),
+        "expected_gain_nats": float(min(separated.values())),
         "task": task_table(found.problem.frame.task),
         "operator": {k: list(v) for k, v in chosen.operator.items()},
     }

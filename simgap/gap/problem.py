@@ -47,13 +47,13 @@ def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
 
 @dataclass(frozen=True)
 class Problem:
-    """A frame with its whitening and the properties' prior: `centre`, `spread` (O, 3); which of weight, width
+    """A frame with its whitening and the properties' prior: `centre`, `sd` (O, 3); which of weight, width
     and height were `measured` (O, 3) apart; `nuisances` that every fit leaves free."""
 
     frame: Frame
     whitening: Whitening
     centre: np.ndarray
-    spread: np.ndarray
+    sd: np.ndarray
     measured: np.ndarray
     nuisances: Nuisances
 
@@ -64,7 +64,7 @@ class Problem:
     def properties(self, u: np.ndarray) -> np.ndarray:
         """Weight, width and height (..., O, 3) of the blocks at coordinates (..., all columns)."""
         own = u[..., : self.num_properties]
-        return self.centre + self.spread * own.reshape(*own.shape[:-1], *self.centre.shape)
+        return self.centre + self.sd * own.reshape(*own.shape[:-1], *self.centre.shape)
 
     @cached_property
     def constants(self) -> tuple[Any, Any, Any]:
@@ -92,7 +92,7 @@ def problem(frame: Frame, actual: dict | None = None) -> Problem:
     """The problem of a frame; `actual` as `estimation.actual` reads it narrows the prior."""
     a, w, objects = frame.arrays, frame.world, frame.task.objects
     valid = (a.there[..., 6] > 0) & (a.phase[..., 2] > 0)
-    centre, spread = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
+    centre, width = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
     measured = np.zeros((len(objects), 3), bool)
     net = w.force[..., 1] + w.force[..., 3]
     position, _ = tips(jax.tree.map(jnp.asarray, w))
@@ -104,14 +104,14 @@ def problem(frame: Frame, actual: dict | None = None) -> Problem:
         guess = (float(np.median(net[mine])), float(np.median(distance[mine]))) if mine.any() else (0.4, 0.02)
         for k, prop in enumerate(("weight", "width", "height")):
             start = max(guess[k], 1e-3) if k < 2 else 0.015
-            centre[o, k], spread[o, k] = start, FLAT[prop]
+            centre[o, k], width[o, k] = start, FLAT[prop]
             if prop in given:
                 value, sd = given[prop]
-                centre[o, k], spread[o, k] = value, np.hypot(sd, (2e-3 * value, 3e-5, 4e-5)[k])
+                centre[o, k], width[o, k] = value, np.hypot(sd, (2e-3 * value, 3e-5, 4e-5)[k])
                 measured[o, k] = True
     white = whitening(frame)
     none = Nuisances(np.zeros((int((white.weight > 0).sum()), 0)))
-    return Problem(frame, white, centre, spread, measured, none)
+    return Problem(frame, white, centre, width, measured, none)
 
 
 def free_of(key: str) -> list[Parameter]:

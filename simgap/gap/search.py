@@ -22,14 +22,14 @@ from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import Problem, neutral, problem
 from simgap.gap.realign import moved, realigned
-from simgap.gap.spread import Spread, spreads
+from simgap.gap.scatter import Scatter, scatters
 from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
 ROUNDS = 2  # numerics: times at most
-TRIED = 3  # chosen: leading candidates that are taken out in turn where no trial fits its task
+ATTEMPTS = 3  # chosen: leading candidates that are taken out in turn where no trial fits its task
 HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
-WORTHY = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
+WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
 Progress = Callable[[str], None]
 
 
@@ -44,7 +44,7 @@ class Search:
     problem: Problem
     healthy: Fitted
     fits: tuple[Fitted, ...]
-    spreads: tuple[Spread, ...]
+    scatters: tuple[Scatter, ...]
     gap: Gap
     redrawn: tuple[Problem, ...]
     warnings: tuple[str, ...]
@@ -88,11 +88,11 @@ def search(
         tell("aligning again without the best explanation")
         aligned, given, healthy, fits = again
         others = redrawn(given)
-    spread = spreads(given, given.nuisances.left(healthy.residual), names)
-    gap = gap_of(given, healthy, fits, spread, others)
+    scattering = scatters(given, given.nuisances.left(healthy.residual), names)
+    gap = gap_of(given, healthy, fits, scattering, others)
     if of_wrist(trials):
         warnings = [not_compared(trials), *warnings]
-    return Search(tuple(trials), aligned, given, healthy, tuple(fits), tuple(spread), gap, others,
+    return Search(tuple(trials), aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
                   (*misled, *warnings))  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def _anew(
     """
     best = _known(fits)[0]
     gained = healthy.cost - best.cost
-    if gained < WORTHY or gained - noise_gained(others, healthy, best) < WORTHY:
+    if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
         return None
     again = realigned(trials, given, best)
     if not SHIFT < moved(aligned, again) < np.inf:
@@ -143,7 +143,7 @@ def _insisted(
         if healthy.cost > HOPELESS * given.size:
             break
         found = _known([best_fit(given, key, healthy) for key in keys])
-        for f in found[:TRIED]:
+        for f in found[:ATTEMPTS]:
             again = realigned(trials, given, f)
             if 2 * sum(t.segmentation.complete for t in again.trials) > len(trials):
                 why = failed.trials[0].segmentation.failed

@@ -9,7 +9,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.segmentation.features import noise_sd
 from simgap.gap.unresolved import kinks, of_a_kink, pushed, speed_jumps
 
-MISFIT = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
+UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
 FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
@@ -97,7 +97,7 @@ def mean_of(s: Signals, name: str) -> np.ndarray:
     return (s.__dict__[f"{name}1"] + s.__dict__[f"{name}2"]) / 2
 
 
-def misfit(
+def between_samples(
     t: np.ndarray, force: np.ndarray, free: np.ndarray, starting: np.ndarray, boundaries: np.ndarray
 ) -> np.ndarray:
     """What no model of coarse samples can tell (N, 4) of net fx, net fy, grip and shear [N].
@@ -110,5 +110,5 @@ def misfit(
     step = np.pad(np.abs(np.diff(every, axis=0)), ((2, 2), (0, 0)))
     change = np.max([step[k : k + len(force)] for k in range(4)], axis=0)
     after = free & (np.abs(t[:, None] - boundaries) < FADING).any(axis=1)
-    share = np.where(starting, STARTING, MISFIT)[:, None]
+    share = np.where(starting, STARTING, UNSEEN)[:, None]
     return np.maximum(share * change, FADED * np.abs(every) * after[:, None])

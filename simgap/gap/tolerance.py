@@ -15,7 +15,7 @@ SHARE = 0.005  # cited: of a block's width or weight: the better half of the pap
 def properties_tolerated(given: Problem) -> np.ndarray:
     """By how much properties (3 O,) may be off before it matters, in sds of their prior."""
     share = given.frame.rig.tolerance.property or PROPERTY
-    return (share * np.abs(given.centre) / given.spread).ravel()
+    return (share * np.abs(given.centre) / given.sd).ravel()
 
 
 def tolerated(given: Problem) -> np.ndarray:

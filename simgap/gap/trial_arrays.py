@@ -15,9 +15,9 @@ from hmmseg.levels import SURE
 from hmmseg.segmentation.align import TrialAlignment
 from simgap.effects.base import FORCES
 from simgap.gap.sensor_noise import (
+    between_samples,
     channel_noise,
     mean_of,
-    misfit,
     motion_doubt,
     residual_noise,
     sample_noise,
@@ -99,7 +99,7 @@ def trial_arrays(
     sample = sample_noise(signals, rig, group)
     plain = residual_noise(sample, rig, step)
     sd = np.hypot(plain, motion_doubt(signals, sample, step, group))
-    sd[:, 6:] = np.hypot(sd[:, 6:], misfit(t, force, phase == 0, edge & (phase == 2), boundaries))
+    sd[:, 6:] = np.hypot(sd[:, 6:], between_samples(t, force, phase == 0, edge & (phase == 2), boundaries))
     shaken = _shaken(signals, sample, force, phase == 2, subtask, step, group) / rig.gravity
     sd[:, 6:8] = np.hypot(sd[:, 6:8], shaken[:, None])
     sd[:, 3] = np.hypot(sd[:, 3], shaken / rig.fingertip.shear_stiffness)

@@ -103,7 +103,7 @@ def _recorded(found: Search, task: BlockTask, rig: Rig, which: range, seed: int)
 def blocks_of(found: Search) -> dict[str, Block]:
     """The blocks as the fit without any effect has them; ValueError where one cannot be."""
     given = found.problem
-    values = given.centre + given.spread * found.healthy.u[: given.num_properties].reshape(-1, 3)
+    values = given.centre + given.sd * found.healthy.u[: given.num_properties].reshape(-1, 3)
     if not (values > LEAST).all():
         raise ValueError("a property that no block has")
     return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}

@@ -197,8 +197,8 @@ def _conclude(
     weights = np.exp(score - np.logaddexp.reduce(score)).tolist()
     sets = [Explanation((), weights[0])]
     sets += [Explanation(f.effects, w, f.effects, sure) for f, w in zip(found, weights[1:], strict=True)]
-    told = conclude(sets, located.p_value, forced=best.effects if forced else ())
-    chosen = best if told.causes else None
+    verdict = conclude(sets, located.p_value, forced=best.effects if forced else ())
+    chosen = best if verdict.causes else None
     gap, chance = located.p_value < ALARM, acting(sets, located.p_value)
     detection = Detection(float(located.z.max()), located.p_value, located.resolution)
     remains = left, rest.p_value, listed_cells(lay, rest, real - best.shift, sim) if gap else []
@@ -211,7 +211,7 @@ def _conclude(
     shares = _shares(best, fitted, seed) if gap else {}
     attribution = {n: (p, *shares.get(n, (0.0, (0.0, 0.0)))) for n, p in chance.items()}
     where = listed_cells(lay, located, real, sim) if gap else []
-    body = entries(told, detection, remains, attribution, where) | {
+    body = entries(verdict, detection, remains, attribution, where) | {
         "effects": {
             "+".join(f.effects): effect_entry(given, f, ring, temperature, held[f.effects].score, trials)
             for f in found[:LISTED]

@@ -112,17 +112,17 @@ class PlayServer:
     async def _told(self, message: str | bytes) -> dict[str, Any] | None:
         """What a message of the page does; what cannot be read is told and changes nothing."""
         try:
-            told = json.loads(message)
-            kind = told["kind"]
+            asked = json.loads(message)
+            kind = asked["kind"]
             if kind == "aim":
-                grip = float(told.get("grip", 3.0))
-                self.session.aim(float(told["x"]), float(told["y"]), told["closed"] is True, grip)
+                grip = float(asked.get("grip", 3.0))
+                self.session.aim(float(asked["x"]), float(asked["y"]), asked["closed"] is True, grip)
             elif kind == "touch":
-                self.session.touch(np.array(told["tips"], float))
+                self.session.touch(np.array(asked["tips"], float))
             elif kind == "reset":
                 self.session.reset()
             elif kind == "effect":
-                return await self._change(told["name"])
+                return await self._change(asked["name"])
             elif kind == "save":
                 return self._save()
             else:

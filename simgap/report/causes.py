@@ -19,7 +19,7 @@ def plain_name(
 def _one(name: str, means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
     called, _, effect = _words(name)
     own = {k.removeprefix(f"{name}."): v for k, v in means.items()}
-    return effect.told(own, rig) if own and effect is not None and effect.told is not None else called
+    return effect.phrase(own, rig) if own and effect is not None and effect.phrase is not None else called
 
 
 def checks(effects: Sequence[str]) -> list[str]:

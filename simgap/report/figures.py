@@ -54,9 +54,9 @@ def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None)
 
 def draw_suspects(body: Body, path: Path | None = None) -> Axes:
     """Whether each suspect acts, and the share of the gap that it explains; else the probabilities."""
-    told = body.get("attribution")
-    if told:
-        rows = sorted(told.items(), key=lambda item: -item[1]["probability"])[:8][::-1]
+    effects = body.get("attribution")
+    if effects:
+        rows = sorted(effects.items(), key=lambda item: -item[1]["probability"])[:8][::-1]
         values = [v["probability"] for _, v in rows]
     else:
         rows = sorted(body["probabilities"].items(), key=lambda item: -item[1])[:8][::-1]
@@ -66,7 +66,7 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
         axes = figure.add_subplot()
         axes.barh(at, values, 0.6, color=BLUE, alpha=0.85, label="probability that it acts")
         for k, (_, entry) in enumerate(rows):
-            share = entry.get("share") if told else None
+            share = entry.get("share") if effects else None
             if share is not None and entry["probability"] >= 0.01:
                 ends = entry.get("interval_90") or (share, share)
                 axes.plot(ends, [k, k], color=RED, lw=1.4)

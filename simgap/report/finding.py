@@ -82,10 +82,10 @@ def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
     if verdict == "none":
         return [f"The model reproduces the recording to within the sensors' noise ({p})."]
     if verdict == "unknown":
-        told = (
+        text = (
             f"Recording and model differ beyond noise ({p}); no known cause explains the larger part of it."
         )
-        return [told, *moving(body)]
+        return [text, *moving(body)]
     chance = probability(body)
     out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
     if verdict == "set":
@@ -97,9 +97,9 @@ def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
 
 def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The whole finding in a paragraph, for a terminal."""
-    told = " ".join([*sentences(body, rig), *remains(body)])
+    text = " ".join([*sentences(body, rig), *remains(body)])
     causes = f" ({', '.join(body['causes'])})" if body["causes"] else ""
-    return f"{headline(body, rig)}{causes}. {told}"
+    return f"{headline(body, rig)}{causes}. {text}"
 
 
 def explained(body: Body) -> str:
@@ -178,8 +178,8 @@ def to_do(body: Body) -> list[str]:
     out = checks(suspects)
     asked = body.get("next_experiment")
     if asked:
-        told = ", ".join(plain_name(n) for n in asked["separates"])
-        out.append(f"Record once more: {asked['do']}. That tells apart: {told}.")
+        text = ", ".join(plain_name(n) for n in asked["separates"])
+        out.append(f"Record once more: {asked['do']}. That tells apart: {text}.")
     if body["verdict"] == "unknown" and body["where"]:
         (channel, subtask), *_ = by_place(body)
         what, at = CHANNELS.get(channel, channel), when(subtask)

@@ -29,10 +29,10 @@ def tables(body: Mapping[str, Any]) -> list[Table]:
         out.append(values)
     if body["next_experiment"] is not None:
         following = Table(title="next experiment", title_justify="left", show_header=False)
-        told = body["next_experiment"]
-        gain = f"by {told['expected_gain_nats']:.0f} nats at least"
-        following.add_row(told["do"])
-        following.add_row(f"expected to tell {', '.join(told['separates'])} apart, {gain}")
+        asked = body["next_experiment"]
+        gain = f"by {asked['expected_gain_nats']:.0f} nats at least"
+        following.add_row(asked["do"])
+        following.add_row(f"expected to tell {', '.join(asked['separates'])} apart, {gain}")
         out.append(following)
     if body["where"]:
         cells = Table(title="where the gap is largest", title_justify="left")

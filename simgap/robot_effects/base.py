@@ -106,9 +106,9 @@ class Setting:
 def drives(setting: Setting) -> list[str]:
     """Commands of torque, force, current or duty: those that are 0 where nothing is to be done."""
     known = setting.simulator.channels
-    told = {n for n in setting.commands() if known[n].unit in ("N m", "N", "A", "Nm")}
+    efforts = {n for n in setting.commands() if known[n].unit in ("N m", "N", "A", "Nm")}
     switches = {n for n in setting.commands() if known[n].unit == "1" and _switches(setting, n)}
-    return [n for n in setting.commands() if n in told or (known[n].unit == "1" and n not in switches)]
+    return [n for n in setting.commands() if n in efforts or (known[n].unit == "1" and n not in switches)]
 
 
 def places(setting: Setting) -> list[str]:

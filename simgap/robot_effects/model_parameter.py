@@ -19,11 +19,11 @@ def candidates(setting: Setting) -> list[RobotEffect]:
         short = name.rpartition(".")[2]
         short = short if short not in groups.get(effect, {}) else name
         groups.setdefault(effect, {})[short] = name
-    told = getattr(setting.simulator, "says", {})
+    says = getattr(setting.simulator, "says", {})
     return [
         RobotEffect(
             effect,
-            told.get(effect, "the simulator's own parameter"),
+            says.get(effect, "the simulator's own parameter"),
             {short: known[name] for short, name in names.items()},
             model=names,
             fitted=all(known[n].fitted for n in names.values()),

@@ -35,9 +35,9 @@ def held_out_scores(gap: Gap, sets: Sequence[tuple[int, ...]], fold: np.ndarray)
     out = np.zeros((numbers.size, len(sets)))
     for k, number in enumerate(numbers):
         inside = fold == number
-        train, judge = forms(gap.taken(~inside)), forms(gap.taken(inside))
+        train, test = forms(gap.taken(~inside)), forms(gap.taken(inside))
         for i, effects in enumerate(sets):
-            out[k, i] = _log_likelihood(judge, effects, fitted(train, effects).x)
+            out[k, i] = _log_likelihood(test, effects, fitted(train, effects).x)
     return out
 
 
@@ -60,9 +60,9 @@ def _chances(gain: np.ndarray) -> np.ndarray:
     Gains beyond a nat count by their logarithm: one log in which a cause shows a hundred times as much as in
     the others must not make the others' agreement look like scatter.
     """
-    told = np.arcsinh(gain)
-    sd = np.maximum(told.std(0, ddof=1), 1e-9) / np.sqrt(len(told))
-    return student.sf(told.mean(0) / sd, len(told) - 1)
+    gains = np.arcsinh(gain)
+    sd = np.maximum(gains.std(0, ddof=1), 1e-9) / np.sqrt(len(gains))
+    return student.sf(gains.mean(0) / sd, len(gains) - 1)
 
 
 def chance_of_gain(gap: Gap, one: tuple[int, ...], other: tuple[int, ...], fold: np.ndarray) -> float:

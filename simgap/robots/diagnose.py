@@ -24,7 +24,7 @@ from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
-from simgap.robots.judge import RobotVerdict, judge
+from simgap.robots.verdict import RobotVerdict, verdict_on
 from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
@@ -133,8 +133,8 @@ def _diagnosed(
     settled = kept("settled", lambda: _settled(composed, point, twins.factor))
     ended = _refitted(composed, parts, settled, wanted, borne, twins.factor)
     tell("shares")
-    judged = (whole, composed, parts, ended, plain.point, twins, fold, seed, bool(forced))
-    verdict = kept("verdict", lambda: _judged(*judged))
+    given = (whole, composed, parts, ended, plain.point, twins, fold, seed, bool(forced))
+    verdict = kept("verdict", lambda: _concluded(*given))
     far, sensor = None, ended.covariances.whitener()
     if verdict.causes:
         tell("how far")
@@ -195,7 +195,7 @@ def _refitted(
     return Found(linear, cov.whitener(off), cov, off, f, (fitted(f, causes),), names)
 
 
-def _judged(
+def _concluded(
     whole: Composed, composed: Composed, phases: Phases, ended: Found, plain: Point, twins: Twins,
     fold: np.ndarray, seed: int, forced: bool,
 ) -> RobotVerdict:  # fmt: skip
@@ -203,14 +203,14 @@ def _judged(
     linear, sensor = ended.linear, ended.covariances.whitener()
     rows = np.flatnonzero(np.isfinite(linear.residual))
     s = forms(gap_of(composed, linear, sensor, phases, ended.names))
-    told_by = explained(composed, linear, sensor, plain, ended.best, whole)
+    explains = explained(composed, linear, sensor, plain, ended.best, whole)
     every = s if whole is composed else _every(whole, linear.point, ended.best, phases)
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
     off = bool(ended.discrepancy) and len(composed.recordings) >= 3
     numerics = tuple(j for j, n in enumerate(ended.names) if composed.numeric(n))
     rng = np.random.default_rng(seed)
     causes = ended.models[0].effects
-    return judge(ended.forms, s, causes, null, rng, told_by, every, fold[rows], forced, off, numerics)
+    return verdict_on(ended.forms, s, causes, null, rng, explains, every, fold[rows], forced, off, numerics)
 
 
 def _every(whole: Composed, point: Point, causes: Sequence[str], phases: Phases) -> Forms:
@@ -244,13 +244,13 @@ def _least_squares(composed: Composed, plain: Linear, sensor: Whitener) -> Linea
 def _alike(composed: Composed, linear: Linear, names: Sequence[str]) -> Identifiability:
     """What the logs can tell, from sensitivities at the plain point."""
     whiten = covariances(composed, linear).whitener()
-    told, columns = [], []
+    kinds, columns = [], []
     for name in names:
         effect, moved = composed.effects[name], linear.moved[name]
         sd = np.array([p.sd for p in effect.parameters.values()])
         columns.append(whiten(np.where(np.isfinite(moved.jacobian), moved.jacobian, 0.0)) * sd)
-        told += [name if len(effect.parameters) == 1 else f"{name}.{short}" for short in effect.parameters]
-    return identifiability(told, np.concatenate(columns, 1))
+        kinds += [name if len(effect.parameters) == 1 else f"{name}.{short}" for short in effect.parameters]
+    return identifiability(kinds, np.concatenate(columns, 1))
 
 
 def _twin_statistic(s, white: np.ndarray, rows: np.ndarray) -> float:

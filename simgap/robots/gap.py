@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from simgap.attribution.problem import BANDS, Candidate, Gap
-from simgap.attribution.problem import Rows as Told
+from simgap.attribution.problem import Rows as GapRows
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
@@ -55,7 +55,7 @@ def gap_of(
             )
         )
     rows = linear.rows
-    told = Told(
+    mine = GapRows(
         rows.log,
         rows.channel,
         phases.of(rows),
@@ -66,7 +66,7 @@ def gap_of(
         BANDS,
     )
     nuisance = np.concatenate([*along, np.zeros((rows.log.size, 0))], 1)
-    whole = Gap(told, residual, nuisance, tuple(made), own=tuple(int(k) for k in np.flatnonzero(own)))
+    whole = Gap(mine, residual, nuisance, tuple(made), own=tuple(int(k) for k in np.flatnonzero(own)))
     return whole if finite.all() else whole.taken(np.flatnonzero(finite))
 
 

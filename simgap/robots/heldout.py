@@ -50,7 +50,7 @@ def shrinkage(
     rows, index = found.linear.rows, np.flatnonzero(np.isfinite(found.linear.residual))
     gap = found.forms.gap
     before, after = plain.residual.copy(), np.full(rows.log.size, np.nan)
-    told = []
+    kept_sets = []
     whole_logs = all(np.unique(fold[rows.log == log]).size == 1 for log in np.unique(rows.log))
     for number in np.unique(fold):
         inside = fold == number
@@ -60,7 +60,7 @@ def shrinkage(
             kept = tuple(j for j, n in enumerate(found.names) if n in causes)
         else:
             kept = borne_out(gap.taken(seen), sought(train)[0].effects, fold[index][seen])
-        told.append(tuple(found.names[j] for j in kept))
+        kept_sets.append(tuple(found.names[j] for j in kept))
         point = point_of(composed, train, kept, found.linear.point)
         if whole_logs:
             point = _refitted(composed, found, point, np.unique(rows.log[~inside]).tolist())
@@ -73,7 +73,7 @@ def shrinkage(
             before[mine] = rows.observed[mine] - base_at(part, bare).rows
         predicted = base_at(part, point).rows
         after[mine] = np.where(inside[mine], rows.observed[mine] - predicted, after[mine])
-    return _measured(found.linear, before, after, sensor, fold, tuple(told))
+    return _measured(found.linear, before, after, sensor, fold, tuple(kept_sets))
 
 
 def _plain(composed: Composed, point: Point, logs: Sequence[int]) -> Point:
@@ -91,7 +91,7 @@ def _measured(
     after: np.ndarray,
     sensor: Whitener,
     fold: np.ndarray,
-    told: tuple[tuple[str, ...], ...],
+    kept_sets: tuple[tuple[str, ...], ...],
 ) -> Shrinkage | None:
     usable = np.isfinite(after) & np.isfinite(before) & np.isfinite(linear.residual)
     numbers = np.unique(fold)
@@ -117,7 +117,7 @@ def _measured(
         1.0,
         *fraction_gone(gone, there),
         rms,
-        told,
+        kept_sets,
         before,
         after,
     )

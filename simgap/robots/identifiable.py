@@ -57,9 +57,9 @@ def identifiability(names: Sequence[str], columns: np.ndarray) -> Identifiabilit
         if own > CLOSE:
             continue
         key = frozenset([j, *chosen])
-        told = tuple(names[int(seen[i])] for i in (j, *chosen))
+        others = tuple(names[int(seen[i])] for i in (j, *chosen))
         if not any(known <= key for known in found) and (key not in found or found[key].own > own):
-            found[key] = Alike(told, own)
+            found[key] = Alike(others, own)
     alike = sorted(found.values(), key=lambda a: (len(a.names), a.own))
     return Identifiability(
         tuple(name for name, none in zip(names, unseen, strict=True) if none), tuple(alike)

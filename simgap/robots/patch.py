@@ -37,11 +37,13 @@ def write_patch(
     found: RobotDiagnosis, document: Mapping[str, Any], xml: Path | None, path: Callable[[str], Path]
 ) -> None:
     """Write ranges.json, and for a MuJoCo model the XML with the causes in it."""
-    told = ranges(found, document)
+    document_of_ranges = ranges(found, document)
     if xml is not None:
         from simgap.simulators.mjcf.patch import patched
 
         text, untouched = patched(xml, found)
-        told["not_in_xml"] = untouched
+        document_of_ranges["not_in_xml"] = untouched
         path(xml.name).write_text(text, encoding="utf-8")
-    path("ranges.json").write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    path("ranges.json").write_text(
+        json.dumps(document_of_ranges, indent=1, allow_nan=False) + "\n", encoding="utf-8"
+    )

@@ -59,13 +59,13 @@ def phases_of(simulator: Simulator, recordings: Sequence[Recording]) -> Phases:
     """By motion, and where the simulator tells contacts, by what touches: a model is off by more there."""
     moving = phases_by_motion(simulator, recordings)
     states = getattr(simulator, "contact_states", None)
-    told = [] if states is None else [states(log) for log in recordings]
-    common = Counter(label for _, labels in told for label in labels).most_common()
+    labelled = [] if states is None else [states(log) for log in recordings]
+    common = Counter(label for _, labels in labelled for label in labels).most_common()
     if len(common) < 2:
         return moving
     kept = [label for label, _ in common[:MANY]]
     names, starts, numbers = {}, [], []
-    for number, (log, (times, labels)) in enumerate(zip(recordings, told, strict=True)):
+    for number, (log, (times, labels)) in enumerate(zip(recordings, labelled, strict=True)):
         going = np.searchsorted(moving.starts[number], times, side="right") - 1
         motion = [moving.names[k] for k in moving.number[number][np.maximum(going, 0)]]
         both = [f"{m}, {k if k in kept else OTHER}" for m, k in zip(motion, labels, strict=True)]

@@ -158,9 +158,9 @@ def start_of(
     if own is not None:
         return {n: (float(v), float(s)) for n, (v, s) in own(log, float(log.t[row])).items()}
     out: dict[str, tuple[float, float]] = {}
-    told = getattr(simulator, "states", None)
+    states = getattr(simulator, "states", None)
     for name, channel in simulator.channels.items():
-        if channel.kind == "position" and (told is None or name in told):
+        if channel.kind == "position" and (states is None or name in states):
             (value, sd), (rate, rate_sd) = smoothed(log.t, log[name], row, noise[name], forward)
             out[name], out[name + RATE] = (value, sd), (rate, rate_sd)
     return out

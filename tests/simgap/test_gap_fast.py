@@ -14,7 +14,7 @@ from simgap.gap.evaluation import residual_at
 from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.problem import neutral, problem
-from simgap.gap.spread import spreads
+from simgap.gap.scatter import scatters
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.trial_arrays import CHANNELS, _struck
 from simgap.gap.unresolved import kinks, of_a_kink, pushed, speed_jumps
@@ -44,7 +44,7 @@ def fast():
 @double_precision
 def test_fast_work_shows_no_irregular_clock(fast):
     given, healthy = fast
-    (clock,) = spreads(given, healthy.residual, ["clock_jitter"])
+    (clock,) = scatters(given, healthy.residual, ["clock_jitter"])
     assert clock.value < 1.5e-3 or not clock.same
 
 

@@ -20,7 +20,7 @@ from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import neutral, problem, slots
-from simgap.gap.spread import spreads
+from simgap.gap.scatter import scatters
 
 
 def read(folder, count=2):
@@ -108,10 +108,10 @@ def test_what_the_rig_admits_is_a_nuisance(shared):
 @double_precision
 def test_quantisation_is_seen_and_not_imagined(healthy):
     given, found = healthy
-    assert not spreads(given, found.residual, ["quantisation"])
+    assert not scatters(given, found.residual, ["quantisation"])
     finish = effect_named("quantisation").finish
     assert finish is not None
     rounded = given.frame.world._replace(force=finish(given.frame.world.force, {"step": 0.04}))
     coarse = replace(given, frame=replace(given.frame, world=rounded))
-    (seen,) = spreads(coarse, found.residual, ["quantisation"])
+    (seen,) = scatters(coarse, found.residual, ["quantisation"])
     assert seen.value == pytest.approx(0.04, rel=1e-3) and seen.known > 100

@@ -17,7 +17,7 @@ from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from simgap.gap.frame import build
 from simgap.gap.grips import HELD, LOOSE, firmness
-from simgap.gap.sensor_noise import MISFIT, STARTING, channel_noise, misfit, sample_noise
+from simgap.gap.sensor_noise import UNSEEN, STARTING, channel_noise, between_samples, sample_noise
 from simgap.gap.trial_arrays import CHANNELS
 
 DEMO = example_folder()
@@ -51,9 +51,9 @@ def test_how_fast_a_block_comes_off_its_support_is_in_doubt():
     force = np.zeros((12, 4))
     force[6:, 1] = 0.8  # N; the weight comes onto one finger within a sample
     free, starting = np.zeros(12, bool), t == t[6]
-    doubt = misfit(t, force, free, starting, np.array([t[6]]))
+    doubt = between_samples(t, force, free, starting, np.array([t[6]]))
     assert doubt[6, 1] == pytest.approx(STARTING * 0.8)
-    assert doubt[5, 1] == pytest.approx(MISFIT * 0.8) and doubt[0, 1] == 0
+    assert doubt[5, 1] == pytest.approx(UNSEEN * 0.8) and doubt[0, 1] == 0
 
 
 def _lift(aligned: AlignedTrials, at: float, known_to: float) -> AlignedTrials:

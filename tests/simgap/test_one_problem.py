@@ -41,7 +41,7 @@ def test_properties_without_an_effect_are_those_identified(source):
     found = identify_aligned(aligned)
     given = problem(build([one.trial for one in aligned.trials], aligned, aligned.rig))
     healthy = fit(given, Start((), neutral(given)))
-    values = given.centre + given.spread * healthy.u[: given.num_properties].reshape(-1, 3)
+    values = given.centre + given.sd * healthy.u[: given.num_properties].reshape(-1, 3)
     assert len(found.names) == 6
     for obj, prop in found.names:
         draws = found.of(obj, prop)

@@ -7,7 +7,7 @@ import pytest
 
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows
-from simgap.robots.judge import _beside_numerics
+from simgap.robots.verdict import _beside_numerics
 from simgap.robots.scatter import scattering
 
 LOGS, N = 6, 60

@@ -194,11 +194,11 @@ def _simulator(mujoco: Any, model: Any, described: Map, address: Mapping[str, tu
 
 
 def _commands_untold(mujoco: Any, model: Any, driven: Mapping[str, int]) -> list[str]:
-    told = set(driven.values())
+    driven_names = set(driven.values())
     return [
         mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator {i}"
         for i in range(model.nu)
-        if i not in told
+        if i not in driven_names
     ]
 
 
@@ -242,11 +242,11 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
         slack = LATITUDE * (reach[1] - reach[0])
         if reach[0] - slack <= low and high <= reach[1] + slack:
             continue
-        told = "rad" if turning else "m"
+        unit = "rad" if turning else "m"
         guess = 'unit = "deg" in the map?' if turning else 'unit = "mm" in the map?'
         raise InputError(
             f"{file}: column {column.column}",
-            f"{low:.4g} to {high:.4g} {told}, beyond joint {column.name}'s {reach[0]:.4g} to {reach[1]:.4g}",
+            f"{low:.4g} to {high:.4g} {unit}, beyond joint {column.name}'s {reach[0]:.4g} to {reach[1]:.4g}",
             guess,
         )
 

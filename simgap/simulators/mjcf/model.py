@@ -188,8 +188,8 @@ class MjcfSimulator:
     @property
     def _partial(self) -> bool:
         """Whether some of the state is told by no column."""
-        told = len(self.joints) + 6 * len(self.free)
-        return told < self.model.nv or self.model.na > 0
+        states = len(self.joints) + 6 * len(self.free)
+        return states < self.model.nv or self.model.na > 0
 
     def prepare(self, recordings: Sequence[Recording]) -> None:
         """Run whole logs once, where columns do not tell the whole state, to start windows from."""
@@ -233,8 +233,8 @@ class MjcfSimulator:
     def touched(self, recording: Recording) -> list[frozenset[tuple[int, int]]]:
         """Pairs of geoms that touch along the recorded motion, at the samples looked at."""
         data = self._data[0]
-        told = (*self.joints, *(n for m in self.free.values() for n in m.values()))
-        columns = {c: filled(recording[c]) for c in told}
+        states = (*self.joints, *(n for m in self.free.values() for n in m.values()))
+        columns = {c: filled(recording[c]) for c in states}
         mujoco.mj_setState(self.model, data, self._own_state(recording, True), int(self._spec))
         out = []
         for i in self._shown(recording):

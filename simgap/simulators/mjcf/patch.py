@@ -116,8 +116,8 @@ def option_set(text: str, values: Mapping[str, str]) -> str | None:
     opening = re.search(r"<mujoco\b[^>]*>", text)
     if opening is None:
         return None
-    told = " ".join(f'{k}="{v}"' for k, v in values.items())
-    return f"{text[: opening.end()]}\n  <option {told}/>{text[opening.end() :]}"
+    attributes = " ".join(f'{k}="{v}"' for k, v in values.items())
+    return f"{text[: opening.end()]}\n  <option {attributes}/>{text[opening.end() :]}"
 
 
 def _set(text: str, found: re.Match, values: Mapping[str, str]) -> str:

@@ -47,13 +47,13 @@ def rivals(f: Forms, causes: Sequence[int]) -> list[Model]:
     return sorted((fitted(f, effects) for effects in sorted(sets)), key=lambda m: -m.score)
 
 
-def judge(
+def verdict_on(
     f: Forms,
     sensor: Forms,
     causes: tuple[int, ...],
     twins: Sequence[float],
     rng: np.random.Generator,
-    told_by: Explained,
+    explains: Explained,
     every: Forms,
     fold: np.ndarray,
     forced: bool = False,
@@ -61,7 +61,7 @@ def judge(
     numerics: tuple[int, ...] = (),
 ) -> RobotVerdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
-    `causes` were borne out by held-out rows, and explain what `told_by` says, in that order; `every` is the
+    `causes` were borne out by held-out rows, and explain what `explains` says, in that order; `every` is the
     gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
     statistics; `fold` (n,) of each row; `off`: whether the model is off by itself, so that only held-out rows
     tell small differences; `numerics` are candidates of the solver's own.
@@ -72,7 +72,7 @@ def judge(
     names = [c.name for c in f.gap.candidates]
     models = rivals(f, causes)
     # Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it.
-    least = np.where(told_by.part >= LEAST, told_by.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
+    least = np.where(explains.part >= LEAST, explains.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
     kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
     left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
     value = _beside_numerics(sensor, causes, () if {*kept} & {*numerics} else numerics)
@@ -86,20 +86,20 @@ def judge(
     if verdict.causes and off and not forced:
         verdict = verdict.beside(names[j] for j in _not_told_apart(f, models, causes, kept, fold))
     rows, band, sd = every.gap.rows, every.spectrum.band, np.ones(every.gap.rows.channel.size)
-    told = tuple(j for j, c in enumerate(every.gap.candidates) if c.name in verdict.causes)
+    named = tuple(j for j, c in enumerate(every.gap.candidates) if c.name in verdict.causes)
     gap = verdict.verdict != "none"
-    parts = told_by.shares(rng)
+    parts = explains.shares(rng)
     return RobotVerdict(
         **vars(verdict),
         detection=detection,
         remainder=Remainder(
-            parts.remainder if told else float(gap),
-            detected(statistic(every, [fitted(every, told)], told)).p_value,
-            significant(rows, band, residual_left(every, fitted(every, told)), sd) if gap else (),
+            parts.remainder if named else float(gap),
+            detected(statistic(every, [fitted(every, named)], named)).p_value,
+            significant(rows, band, residual_left(every, fitted(every, named)), sd) if gap else (),
         ),
         where=significant(rows, band, residual_left(every, fitted(every, ())), sd) if gap else (),
         shares=replace(parts, each=parts.each[:, [causes.index(j) for j in kept]]),
-        left=dict(zip(told_by.regimes, told_by.left.tolist(), strict=True)) if told else {},
+        left=dict(zip(explains.regimes, explains.left.tolist(), strict=True)) if named else {},
         shared=tuple(names[j] for j in kept),
         model=scattering(f, fitted(f, causes), fold),
         chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
@@ -132,7 +132,7 @@ def _explanation(
 
 
 def _not_told_apart(
-    f: Forms, models: Sequence[Model], causes: tuple[int, ...], told: tuple[int, ...], fold: np.ndarray
+    f: Forms, models: Sequence[Model], causes: tuple[int, ...], named: tuple[int, ...], fold: np.ndarray
 ) -> set[int]:
     """Effects that take a told cause's place and that held-out rows do not tell from it, though all rows
     together seem to: where the model is off by itself, its likelihood is no judge of small differences."""
@@ -141,7 +141,7 @@ def _not_told_apart(
     rivals_of = [
         m for m in models if len(set(causes) - set(m.effects)) == 1 and len(m.effects) == len(causes)
     ]
-    for m in [m for m in rivals_of if set(causes) - set(m.effects) <= set(told)][:RIVALS]:
+    for m in [m for m in rivals_of if set(causes) - set(m.effects) <= set(named)][:RIVALS]:
         apart = log_prior(f, m) - log_prior(f, best)
         if apart > -np.log(RULED_OUT) and chance_of_gain(f.gap, causes, m.effects, fold) > BORNE_OUT:
             found |= set(m.effects) - set(causes)

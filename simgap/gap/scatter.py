@@ -13,7 +13,7 @@ from simgap.gap.problem import Problem
 
 
 @dataclass(frozen=True)
-class Spread:
+class Scatter:
     """`variance` (n,) over the noise's that an effect of size `value` adds to each cosine coefficient of a
     cell (in the order of `assemble.rows_of`), log sd of that value, and evidence [nats] `known` of another
     kind. `same`: whether its size is the same everywhere. The variance of
@@ -30,7 +30,7 @@ class Spread:
 
 def on_grid(
     effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None
-) -> Spread:
+) -> Scatter:
     """The most likely size of a scatter with variance size^2 `unit` (n,), from squares (n,) of residuals.
 
     `part` (n,): numbers of parts in which one cause has one size. One that would have another in each, by a
@@ -50,10 +50,10 @@ def on_grid(
         several = (np.logaddexp.reduce(each, axis=0) - np.log(grid.size)).sum()
         one = np.logaddexp.reduce(score) - np.log(grid.size)
         same = same and bool(one > several - POSITIVE)
-    return Spread(effect, float(grid[best]), sd, grid[best] ** 2 * unit, known, same)
+    return Scatter(effect, float(grid[best]), sd, grid[best] ** 2 * unit, known, same)
 
 
-def spreads(given: Problem, residual: np.ndarray, names: list[str]) -> list[Spread]:
+def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
     """What each of the named effects that scatter adds to residuals (n,); not those that say nothing."""
     scattering: list[Callable] = [
         e.scatter for n, e in fitted().items() if n in names and e.scatter is not None
