@@ -38,7 +38,7 @@ def gap_of(
     scatters: Sequence[Scatter] = (),
     redrawn: Sequence[Problem] = (),
 ) -> Gap:
-    """The gap with a candidate for every fit (of one effect each) and scatter, and for the properties that were
+    """The gap with a candidate for every fit (of one effect each) and scatter, and for properties that were
     measured apart. What sensors' noise makes of them is seen on `redrawn` recordings."""
     rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
     usual = given.frame.rig.tolerance == Tolerance()

@@ -24,7 +24,6 @@ from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.identifiable import Identifiability, identifiability
-from simgap.robots.verdict import RobotVerdict, verdict_on
 from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
@@ -33,6 +32,7 @@ from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import pruned
 from simgap.robots.search import Found, point_of, search
 from simgap.robots.twins import Twins, healthy_twins
+from simgap.robots.verdict import RobotVerdict, verdict_on
 from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording

@@ -17,7 +17,7 @@ from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from simgap.gap.frame import build
 from simgap.gap.grips import HELD, LOOSE, firmness
-from simgap.gap.sensor_noise import UNSEEN, STARTING, channel_noise, between_samples, sample_noise
+from simgap.gap.sensor_noise import STARTING, UNSEEN, between_samples, channel_noise, sample_noise
 from simgap.gap.trial_arrays import CHANNELS
 
 DEMO = example_folder()

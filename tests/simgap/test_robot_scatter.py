@@ -7,8 +7,8 @@ import pytest
 
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows
-from simgap.robots.verdict import _beside_numerics
 from simgap.robots.scatter import scattering
+from simgap.robots.verdict import _beside_numerics
 
 LOGS, N = 6, 60
 
