@@ -17,6 +17,7 @@ from hmmseg.contact.equations import Pads, block_width, block_y, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import CONTRADICTS, TAIL
+from hmmseg.robust import robust_sd
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
 UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
@@ -87,7 +88,7 @@ def slope(
             return None
         weights = trust * x / power
         residual = np.where(every, y - float(weights @ y) * x, 0.0)
-        scale = max(1.4826 * float(np.median(np.abs(residual[every]))), noise)
+        scale = max(robust_sd(residual[every]), noise)
         trust = np.where(every, (TAIL + 1) / (TAIL + (residual / scale) ** 2), 0.0)
         # A sample that bears the fit alone shows no residual: the jackknife's (MacKinnon and White 1985).
         basis, _ = np.linalg.qr((np.concatenate([x[None], others]) * np.sqrt(trust)).T)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.compliance import Slope
+from hmmseg.robust import robust_sd
 
 BEFORE = 4  # numerics: samples before the touch from which the fingers' height at it is extrapolated
 SURE, RELIEVED = (
@@ -66,7 +67,7 @@ def first_push(
     if held.size < BEFORE:
         return touch
     level = float(np.median(held))
-    noise = 1.4826 * float(np.median(np.abs(held - level)))
+    noise = robust_sd(held - level)
     before = np.flatnonzero(np.isfinite(net) & (t <= touch[0]))
     free = before[net[before] > level - max(SURE * noise, RELIEVED * abs(level))]
     if not free.size or free[-1] == before[-1]:

@@ -26,6 +26,7 @@ from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.levels import TAIL
+from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.features import acceleration, thin
@@ -223,7 +224,7 @@ def _free_scale(signals: Signals, name: str, free: np.ndarray) -> float:
     values = getattr(signals, name)[free]
     if values.size < MIN_FREE:
         return signals.sd_force if np.isfinite(signals.sd_force) else 1.0
-    return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-9)
+    return max(robust_sd(values - np.median(values)), 1e-9)
 
 
 def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: str, rig: Rig) -> float:
@@ -239,7 +240,7 @@ def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: st
                 residuals.append(chosen - np.median(chosen))
     if not residuals:
         return 1.0
-    return max(1.4826 * float(np.median(np.abs(np.concatenate(residuals)))), 1e-9)
+    return max(robust_sd(np.concatenate(residuals)), 1e-9)
 
 
 def _noise(pooled: dict[str, list], scales: dict[str, float]) -> Noise:

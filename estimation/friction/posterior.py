@@ -22,6 +22,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.levels import SURE
+from hmmseg.robust import robust_sd
 
 # chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
 # ratio of two small forces says little: samples below this share of the grip's median are left out.
@@ -123,7 +124,7 @@ def _forces(a: Aligned, rig: Rig, finger: int, sd_force: float) -> _Forces:
         values = getattr(a.signals, name)
         if free.sum() >= MIN_FREE:
             bias = float(values[free].mean())
-            shown = 1.4826 * float(np.median(np.abs(values[free] - bias)))
+            shown = robust_sd(values[free] - bias)
             sd = max(stated, shown) * np.sqrt(1 + 1 / free.sum())
         else:
             bias = 0.0
@@ -195,7 +196,7 @@ def _stretches(
 def _height_noise(signals: Signals, height: np.ndarray) -> np.ndarray:
     """Noise sd (num_timesteps,) of one finger's height [m]; learned where the rig states none."""
     bend = np.abs(np.diff(height, 2))
-    learned = 1.4826 * float(np.nanmedian(bend)) / np.sqrt(6.0) if np.isfinite(bend).any() else 1e-4
+    learned = robust_sd(bend[np.isfinite(bend)]) / np.sqrt(6.0) if np.isfinite(bend).any() else 1e-4
     return np.where(np.isfinite(signals.sd_y), signals.sd_y, max(learned, 1e-7))
 
 

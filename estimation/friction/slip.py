@@ -21,6 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
+from hmmseg.robust import robust_sd
+
 PRIOR = 0.05  # prior: probability of slip before the anchors are seen
 SURE = 0.99  # chosen: probability from which slip is said to be seen
 STRAY = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
@@ -105,7 +107,7 @@ def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
     bends = [np.diff(s.anchor, 2) / s.sd[1:-1] for s in stretches if s.t.size > 3]
     if not bends:
         return stretches
-    shown = 1.4826 * float(np.median(np.abs(np.concatenate(bends)))) / np.sqrt(6.0)
+    shown = robust_sd(np.concatenate(bends)) / np.sqrt(6.0)
     return [replace(s, sd=s.sd * max(shown, 1.0)) for s in stretches]
 
 

@@ -8,6 +8,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.plausibility import Finding, exchanged
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
+from hmmseg.robust import white_sd
 
 MORE = 3.0  # limit: a grip is so many times what pads share of a load unequally
 CARTESIAN = ("{}1", "{}2", "v{}1", "v{}2")
@@ -43,4 +44,4 @@ def _strong(difference: np.ndarray) -> float:
 
 def _noise(values: np.ndarray) -> float:
     there = values[np.isfinite(values)]
-    return 1.4826 * float(np.median(np.abs(np.diff(there)))) / np.sqrt(2) if there.size > 1 else 0.0
+    return white_sd(there, 1) if there.size > 1 else 0.0

@@ -19,6 +19,7 @@ from hmmseg.io.gripper import Gripper
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import MOVED, SURE
+from hmmseg.robust import robust_sd
 
 ACTIVE = 8.0  # chosen: noise scales above which the wrist feels something
 TOGETHER = 5  # chosen: samples within one smoothing window
@@ -142,7 +143,7 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
     load = load[np.isfinite(load)]
     if load.size <= LEAST:
         return None
-    scatter = max(1.4826 * float(np.median(np.abs(load - np.median(load)))), tool.noise)
+    scatter = max(robust_sd(load - np.median(load)), tool.noise)
     found = float(np.median(load))
     if abs(found) <= SURE * scatter / np.sqrt(load.size / TOGETHER):
         return 0.0

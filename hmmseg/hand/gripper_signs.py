@@ -8,11 +8,11 @@ import re
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.pose import bridged
 from hmmseg.io.gripper import AXES
 from hmmseg.io.plausibility import REACH, Finding, all_changed, changed, length_unit
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
+from hmmseg.robust import bridged
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
 NARROW = 2e-4  # limit: m
@@ -81,7 +81,7 @@ def counts_closing(trial: Trial, rig: Rig) -> InputError:
     """The line for an opening that grows as the gripper closes."""
     gripper = rig.gripper
     assert gripper is not None
-    most = float(sum(bridged(trial.t, trial.channels[name]).max() for name in gripper.opening))
+    most = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
     name = gripper.opening[0]
     fields = changed(name, rig, sign=-1, offset=round(most, 4))
     finding = Finding(name, "", fields)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.hand.grouping import grouped
+from hmmseg.robust import white_sd
 
 STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
 SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first touch
@@ -50,7 +51,7 @@ def closings(opening: np.ndarray) -> list[tuple[int, int, int]]:
 
     A swing counts where it is a tenth of the whole way and beyond the noise.
     """
-    noise = 1.4826 * float(np.median(np.abs(np.diff(opening, 2)))) / np.sqrt(6)
+    noise = white_sd(opening)
     swing = max(0.1 * float(np.ptp(opening)), 10 * noise, LEAST_CLOSING)
     turning, last = [0], 0
     rising: bool | None = None
@@ -118,7 +119,7 @@ def _kink(way: np.ndarray, noise: float) -> tuple[float, float] | None:
 
 def _noise(opening: np.ndarray) -> float:
     """Noise sd [m] of one sample of the opening."""
-    return max(1.4826 * float(np.median(np.abs(np.diff(opening, 2)))) / np.sqrt(6), 1e-6)
+    return max(white_sd(opening), 1e-6)
 
 
 def _touch(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: float) -> tuple[float, float]:

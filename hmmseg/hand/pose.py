@@ -9,6 +9,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.gripper import AXES, Gripper, direction
 from hmmseg.io.trial import Trial
+from hmmseg.robust import bridged, white_sd
 
 WINDOW, WIDEST = 0.1, 0.4  # chosen: s over which motion is smoothed: arms change no faster
 LEAST = 3  # chosen: samples of the same: what a parabola needs
@@ -43,7 +44,7 @@ def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose
     t, n = trial.t, trial.t.size
     position = np.zeros((n, 3))
     for axis, name in gripper.position.items():
-        position[:, AXES.index(axis)] = bridged(t, trial.channels[name])
+        position[:, AXES.index(axis)] = bridged(trial.channels[name], t)
     turned = _turned(trial, gripper)
     position = position + np.einsum("tij,j->ti", turned, np.asarray(gripper.fingertip))
     up = direction(gripper.up)
@@ -64,7 +65,7 @@ def _window(t: np.ndarray, position: np.ndarray) -> float:
     Of a parabola through n samples, the second derivative's variance is 720 s^2 / (n^5 dt^4) for large n.
     """
     period = float(np.median(np.diff(t)))
-    sd = max(1.4826 * float(np.median(np.abs(np.diff(c, 2)))) / np.sqrt(6) for c in position.T)
+    sd = max(white_sd(c) for c in position.T)
     needed = (720 * sd**2 / period**4 / QUIET**2) ** 0.2 * period
     return float(np.clip(needed, WINDOW, WIDEST))
 
@@ -86,7 +87,7 @@ def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
         signs = np.cumprod(np.r_[1.0, np.where((q[there][1:] * q[there][:-1]).sum(axis=1) < 0, -1, 1)])
         q[there] *= signs[:, None]  # q and -q turn alike: no jumps between them
         q[~there] = np.nan
-        return Rotation.from_quat(np.stack([bridged(t, c) for c in q.T], axis=1)).as_matrix()
+        return Rotation.from_quat(np.stack([bridged(c, t) for c in q.T], axis=1)).as_matrix()
     if gripper.rotation_vector is not None:
         names = gripper.rotation_vector
         vectors = np.stack([trial.channels[name] for name in names], axis=1)
@@ -101,13 +102,6 @@ def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
         nearest = np.round(np.interp(t, t[there], np.arange(there.sum()))).astype(int)
         return Rotation.from_rotvec(vectors[there][nearest]).as_matrix()
     return np.broadcast_to(np.eye(3), (t.size, 3, 3))
-
-
-def bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (num_timesteps,) with missing samples interpolated."""
-
-    there = np.isfinite(values)
-    return values if there.all() else np.interp(t, t[there], values[there])
 
 
 def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WINDOW) -> np.ndarray:

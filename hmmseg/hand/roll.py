@@ -14,8 +14,9 @@ import numpy as np
 
 from hmmseg.contact.equations import rolled_offset, turned
 from hmmseg.errors import InputError
-from hmmseg.hand.pose import bridged, smooth
+from hmmseg.hand.pose import smooth
 from hmmseg.io.trial import ROLL, Trial
+from hmmseg.robust import bridged
 
 MOST = 0.5  # limit: rad; a hand rolled further holds no upright block (and degrees are larger)
 SLOWEST = 0.25  # prior: s; a hand with a block turns no faster than 2 Hz (an arm's own modes lie above)
@@ -34,7 +35,7 @@ def levelled(trial: Trial) -> Trial:
         where = f"{trial.file}: sample {beyond[0] + 1}, column {ROLL}"
         expected = f"radians, 0 where the fingers are level, at most {MOST:g} either way (is it in degrees?)"
         raise InputError(where, f"{roll[beyond[0]]:.3g} rad", expected)
-    return _turned_back(trial, bridged(trial.t, roll))
+    return _turned_back(trial, bridged(roll, trial.t))
 
 
 def _turned_back(trial: Trial, roll: np.ndarray) -> Trial:

@@ -15,6 +15,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.plausibility import Finding, all_changed, changed, exchanged
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
+from hmmseg.robust import white_sd
 
 ALL = 0.95  # limit: share of the samples that must agree
 MOST = 0.75  # limit: the same where a hold goes on after its block has been put down
@@ -142,7 +143,7 @@ def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Findi
 def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
     """Runs of samples with at least half the usual grip; None where nothing is ever held."""
     scale = float(np.quantile(np.abs(squeeze), 0.95))
-    noise = 1.4826 * float(np.median(np.abs(np.diff(squeeze)))) / np.sqrt(2)
+    noise = white_sd(squeeze, 1)
     if scale == 0 or scale < 10 * noise:
         return None
     pressed = np.abs(squeeze) > scale / 2
@@ -164,7 +165,7 @@ def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
 def _pushing_alike(common: np.ndarray, squeeze: np.ndarray, load: np.ndarray) -> int | None:
     """Sign of both fx where they push the same way as strongly and as long as a grip would."""
     scale = float(np.quantile(np.abs(common), 0.95))
-    noise = 1.4826 * float(np.median(np.abs(np.diff(common)))) / np.sqrt(2)
+    noise = white_sd(common, 1)
     strong = np.abs(common) > scale / 2
     if scale < max(10 * noise, 3 * float(np.quantile(np.abs(squeeze), 0.95))):
         return None

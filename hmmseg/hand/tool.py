@@ -21,11 +21,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.pose import Pose, bridged, smooth
+from hmmseg.hand.pose import Pose, smooth
 from hmmseg.io.gripper import Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE, TAIL
+from hmmseg.robust import bridged, robust_sd
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
 TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
@@ -96,7 +97,7 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
     """What samples `free` (num_timesteps,) of a trial say of its tool."""
     gripper = rig.gripper
     assert gripper is not None
-    force = np.stack([bridged(trial.t, c) for c in wrench_of(trial, gripper).T], axis=1)
+    force = np.stack([bridged(c, trial.t) for c in wrench_of(trial, gripper).T], axis=1)
     force = smooth(trial.t, force, window=pose.window)[free]
     return FreeMotion(trial.t[free], force, _terms(pose, gripper, rig.gravity)[:, free], pose.window)
 
@@ -148,7 +149,7 @@ def _fit(rig: Rig, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns
     for _ in range(ROUNDS):
         axes = _axes(gripper, weights, force, terms[0] + terms[1])
         fitted = _regressed(weights, force @ axes, terms, time, turns, gripper.tool_mass)
-        scale = max(1.4826 * float(np.median(np.abs(fitted.residual))), 1e-6)
+        scale = max(robust_sd(fitted.residual), 1e-6)
         weights = (TAIL + 3) / (TAIL + ((fitted.residual / scale) ** 2).sum(axis=1))
     return axes, fitted, scale
 
@@ -236,7 +237,7 @@ def _centre_of_mass(trial: Trial, gripper: Gripper, tool: Tool, free: np.ndarray
         return None
     if not gripper.turns or _spread(felt / np.linalg.norm(felt, axis=1, keepdims=True)) < TURNED:
         return None
-    torque = np.stack([bridged(trial.t, trial.channels[name]) for name in gripper.wrench[3:]], axis=1)
+    torque = np.stack([bridged(trial.channels[name], trial.t) for name in gripper.wrench[3:]], axis=1)
     torque = smooth(trial.t, torque)[free] @ axes * np.linalg.det(axes)  # an axial vector in the tool's axes
     arm = tool.mass * felt
     # torque = c x arm + offset: linear in c

@@ -17,12 +17,13 @@ from hmmseg.hand.carried import ACTIVE, contradiction, grip_force_of, held_by
 from hmmseg.hand.force_units import tool_warnings
 from hmmseg.hand.gripper_signs import lifts_pull
 from hmmseg.hand.opening import Grip
-from hmmseg.hand.pose import Pose, bridged, pose_of, smooth
+from hmmseg.hand.pose import Pose, pose_of, smooth
 from hmmseg.hand.quaternion_order import order_warnings
 from hmmseg.hand.tool import Tool
 from hmmseg.io.gripper import AXES, Gripper, direction
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import ROLL, Trial
+from hmmseg.robust import bridged
 
 # chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
 LAG = 0.012
@@ -72,7 +73,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     gripper = rig.gripper
     assert gripper is not None
     pose = pose_of(trial, gripper)
-    opening = np.sum([bridged(trial.t, trial.channels[name]) for name in gripper.opening], axis=0)
+    opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
     pressing = grip_force_of(trial, gripper)
     held = held_by(trial, rig, pose, opening, pressing)
     if held.lifts and max(held.lifts) < 0:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hmmseg.hand.opening import LEAST_CLOSING, SLOWED, STEP, Grip, grip_of
+from hmmseg.robust import NORMAL
 
 STAND = 0.1  # chosen: s of next to no motion: the gripper stands
 STILL = 0.1  # chosen: share of a closing's top speed that is next to none
@@ -95,7 +96,7 @@ class Closings:
         if self._seen < NOISE and n == NOISE // 10:
             self._seen += n
             bent = np.abs(np.diff(self._recent, 2))
-            self._noise = max(self._noise, 1.4826 * float(np.median(bent)) / np.sqrt(6))
+            self._noise = max(self._noise, NORMAL * float(np.median(bent)) / np.sqrt(6))
             self._recent.clear()
 
     def _speed(self, over: float) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from hmmseg.hand.carried import TOGETHER
 from hmmseg.levels import MOVED, SURE
+from hmmseg.robust import robust_sd
 
 WENT = 20  # chosen: samples of a hand that goes somewhere before what it bears is judged
 
@@ -45,7 +46,7 @@ class Went:
         limit = SURE / math.sqrt(n / TOGETHER)
         up, across = np.array(self._up), np.array(self._across)
         found, aside = float(np.median(up)), float(np.median(across))
-        scatter = [max(1.4826 * float(np.median(np.abs(v - np.median(v)))), noise) for v in (up, across)]
+        scatter = [max(robust_sd(v - np.median(v)), noise) for v in (up, across)]
         if 2 * self._raised > n and abs(found) > limit * scatter[0]:
             return found
         return 1.0 if abs(aside) > limit * scatter[1] or abs(found) > limit * scatter[0] else 0.0

@@ -18,13 +18,14 @@ from hmmseg.errors import InputError
 from hmmseg.hand.carried import TOGETHER, give_of, grip_force_of
 from hmmseg.hand.gripper_signs import lifts_pull
 from hmmseg.hand.opening import Grip
-from hmmseg.hand.pose import WINDOW, Pose, bridged, pose_of
+from hmmseg.hand.pose import WINDOW, Pose, pose_of
 from hmmseg.hand.tool import FreeMotion, Tool, applied_force, free_motion, tool_of
 from hmmseg.hand.wrist import as_fingers
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
 from hmmseg.online.closing import Closings
 from hmmseg.online.load import Went
+from hmmseg.robust import bridged
 
 WHERE = "stream"
 BATCH = 0.02  # chosen: s that are turned into fingers together
@@ -150,7 +151,7 @@ class Wrist:
         pose = pose_of(trial, self.gripper, self._window)
         if self._window is None:
             self._window = pose.window
-        opening = np.sum([bridged(trial.t, trial.channels[name]) for name in self.gripper.opening], axis=0)
+        opening = np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
         free = np.array(
             [self._opening.free(t, o) for t, o in zip(trial.t.tolist(), opening.tolist(), strict=True)]
         )
@@ -205,7 +206,7 @@ class Wrist:
 
     def _as_rows(self, trial: Trial, tool: Tool, until: float) -> list[tuple[float, np.ndarray]]:
         pose = pose_of(trial, self.gripper, self._window)
-        opening = np.sum([bridged(trial.t, trial.channels[name]) for name in self.gripper.opening], axis=0)
+        opening = np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
         force = applied_force(trial, self.rig, pose, tool)
         grips = []
         for held in self._opening.grips:

@@ -11,6 +11,7 @@ from hmmseg.contact.equations import pads_of
 from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
+from hmmseg.robust import white_sd
 from hmmseg.segmentation.emissions import Features
 
 MAX_RATE = 40.0  # chosen: Hz; faster recordings are read at this rate, fast enough for a hand
@@ -18,13 +19,9 @@ WINDOW = 6e-3  # chosen: s over which such a reading is averaged; a contact chan
 
 
 def noise_sd(values: np.ndarray) -> float:
-    """Robust standard deviation of white sample noise, from second differences.
-
-    The second difference of white noise of variance s^2 has variance 6 s^2; its median absolute
-    value is blind to the few samples at which the signal itself bends.
-    """
-    bend = np.diff(values[np.isfinite(values)], 2)
-    return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(6.0)) if bend.size else np.nan
+    """Robust standard deviation of white sample noise; NaN where too few samples are there."""
+    there = values[np.isfinite(values)]
+    return float(white_sd(there)) if there.size > 2 else np.nan
 
 
 def thin(

@@ -11,6 +11,7 @@ import numpy as np
 from hmmseg.hand.signals import Signals
 from hmmseg.levels import SURE as SIGNIFICANT
 from hmmseg.levels import TAIL
+from hmmseg.robust import NORMAL
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.toe import DEPENDENT, NONE, Toe
@@ -215,7 +216,7 @@ def evidence(
         there = np.concatenate([one[2] for one in read], axis=-1)
         count = there.sum(axis=-1)
         enough = count >= KEPT * num_samples
-        scale = max(min(1.4826 * _medians(np.abs(residual), there)[enough], default=usual), usual)
+        scale = max(min(NORMAL * _medians(np.abs(residual), there)[enough], default=usual), usual)
         cost = (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL) * there
         row[:] = np.where(enough, -num_samples * cost.sum(axis=-1) / np.maximum(count, 1), -np.inf)
     return DEPENDENT * out

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.levels import TAIL
+from hmmseg.robust import robust_sd
 
 SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; loads at which the toe may end, a factor of two apart
 DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own
@@ -60,7 +61,7 @@ def find(readings: Sequence[Reading]) -> Toe:
     usual = float(np.median([sd for *_, sd in readings]))
     load, value, there = _padded(readings)
     straight = _depths(load, value, np.zeros((1, *load.shape)), there, usual)[1]
-    scale = max(usual, 1.4826 * float(np.median(np.abs(straight[0][there]))))
+    scale = max(usual, robust_sd(straight[0][there]))
     toes = np.stack([Toe(1.0, soft).give(load) for soft in SOFTS])
     depth, residual = _depths(load, value, toes, there, scale)
     gain = _evidence(residual, there, scale) - _evidence(straight, there, scale) - (depth / DEPTH) ** 2 / 2

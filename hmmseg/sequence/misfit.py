@@ -13,10 +13,11 @@ import numpy as np
 
 from hmmseg.hmm import dense as ergodic
 from hmmseg.hmm.alignment import Alignment
+from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
 
-SPREADS = 6.0  # chosen: a trial this far outside the others does not fit
-LEAST_SPREAD = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
+WIDTHS = 6.0  # chosen: a trial this many widths outside the others does not fit
+LEAST_WIDTH = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
 FEW = 4.0  # chosen: trials; the usual width of scores is widened by one over their number, times this
 MEASURABLE = 20.0  # chosen: cells a subtask usually lasts, for two cells to be too few
 SQUEEZED = 0.03  # chosen: of the typical duration
@@ -31,14 +32,14 @@ def scores(log_likelihoods: np.ndarray, mean_cells: np.ndarray, alignment: Align
 
 
 def reference(per_trial: Sequence[np.ndarray]) -> np.ndarray:
-    """(2, 2): median and spread of each score over the trials learned from.
+    """(2, 2): median and width of each score over the trials learned from.
 
-    The spread of few trials is uncertain itself and widened by 1 + FEW / their number.
+    The width of few trials is uncertain itself and widened by 1 + FEW / their number.
     """
     table = np.array(per_trial)
     center = np.median(table, 0)
-    spread = 1.4826 * np.median(np.abs(table - center), 0)
-    widened = np.maximum(spread, LEAST_SPREAD) * (1 + FEW / len(table))
+    width = NORMAL * np.median(np.abs(table - center), 0)
+    widened = np.maximum(width, LEAST_WIDTH) * (1 + FEW / len(table))
     return np.column_stack([center, widened])
 
 
@@ -55,11 +56,11 @@ def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.nda
         if not optional[k] and typical[k] >= MEASURABLE and cells < max(SQUEEZED * typical[k], 2.0):
             return Failure(k, names[k], None, "is squeezed to almost nothing: it does not happen")
     worse, poorer = (scores(log_likelihoods, mean_cells, alignment) - usual[:, 0]) / usual[:, 1]
-    if worse > SPREADS:
+    if worse > WIDTHS:
         path = ergodic.viterbi(*_free(log_likelihoods, mean_cells)).path
         k, reason = _first_departure(path, names, optional)
         return Failure(k, names[k], None, reason)
-    if poorer > SPREADS:
+    if poorer > WIDTHS:
         excess = log_likelihoods.max(1) - np.median(log_likelihoods.max(1))
         k = min(int(alignment.path[np.argmin(np.convolve(excess, np.ones(9), "same"))]), len(names) - 1)
         return Failure(k, names[k], None, "looks like nothing the model has learned")

@@ -12,6 +12,7 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
+from hmmseg.robust import bridged
 from hmmseg.segmentation.align import TrialAlignment
 from simgap.effects.base import FORCES
 from simgap.gap.sensor_noise import (
@@ -204,11 +205,7 @@ def _moves(
 
 def _filled(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Columns with missing samples interpolated (they are masked where they count)."""
-    out = values.copy()
-    for column in out.T:
-        good = np.isfinite(column)
-        column[~good] = np.interp(t[~good], t[good], column[good])
-    return out
+    return np.stack([bridged(column, t) for column in values.T], axis=1)
 
 
 def _there(

@@ -7,6 +7,7 @@ from math import comb
 
 import numpy as np
 
+from hmmseg.robust import robust_sd
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -39,7 +40,7 @@ def _by_difference(recordings: Sequence[Recording], name: str, order: int) -> fl
     found = found[np.isfinite(found)]
     if not found.size:
         return 1.0
-    return float(1.4826 * np.median(np.abs(found)) / np.sqrt(comb(2 * order, order)))
+    return float(robust_sd(found) / np.sqrt(comb(2 * order, order)))
 
 
 def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from hmmseg.robust import bridged
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
 from simgap.simulators.mjcf.setting import Setting
-from simgap.simulators.mjcf.signals import Held, aligned, body_rate, cubic, filled
+from simgap.simulators.mjcf.signals import Held, aligned, body_rate, cubic
 from simgap.simulators.mjcf.touching import contact_labels
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values, finite
 from simgap.simulators.recording import Recording
@@ -234,7 +235,7 @@ class MjcfSimulator:
         """Pairs of geoms that touch along the recorded motion, at the samples looked at."""
         data = self._data[0]
         states = (*self.joints, *(n for m in self.free.values() for n in m.values()))
-        columns = {c: filled(recording[c]) for c in states}
+        columns = {c: bridged(recording[c]) for c in states}
         mujoco.mj_setState(self.model, data, self._own_state(recording, True), int(self._spec))
         out = []
         for i in self._shown(recording):

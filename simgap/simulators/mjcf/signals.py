@@ -34,12 +34,6 @@ class Held:
         return np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
 
 
-def filled(values: np.ndarray) -> np.ndarray:
-    """A column (num_timesteps,) with missing samples interpolated."""
-    seen = np.isfinite(values)
-    return values if seen.all() else np.interp(np.arange(values.size), np.flatnonzero(seen), values[seen])
-
-
 def cubic(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values (n, ...) between points of an even grid, (T, ...), by cubics through neighbours (Catmull & Rom
     1974)."""

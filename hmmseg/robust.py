@@ -1,0 +1,40 @@
+"""Robust statistics, which a few wild samples do not move."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+
+NORMAL = 1.4826  # physics: a normal number's standard deviation over its median absolute value
+
+
+def robust_sd(residual: np.ndarray) -> float:
+    """Standard deviation of normal residuals about zero, from their median absolute value."""
+    return NORMAL * float(np.median(np.abs(residual)))
+
+
+def white_sd(values: np.ndarray, order: int = 2) -> float:
+    """Standard deviation of white noise, from differences of some order along the first axis.
+
+    A difference of order k has (2 k choose k) times the noise's variance; its median absolute value is blind
+    to the few samples at which the signal itself bends.
+    """
+    return robust_sd(np.diff(values, order, axis=0)) / np.sqrt(comb(2 * order, order))
+
+
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """The value at which half of the weight is reached."""
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+def bridged(values: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:
+    """Values (num_samples,) with missing ones interpolated over times `t`, or over samples.
+
+    ValueError where all are missing.
+    """
+    there = np.isfinite(values)
+    t = np.arange(values.size) if t is None else t
+    return values if there.all() else np.interp(t, t[there], values[there])
