@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -23,8 +22,8 @@ def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
         name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
         for name in task.objects
     }
-    return {"rig.toml": toml(rig.model_dump(exclude_none=True, exclude_defaults=True)),
-            "task.toml": toml(task_table(task)), "actual.toml": toml(actual)}  # fmt: skip
+    return {"rig.toml": tomlkit.dumps(rig.model_dump(exclude_none=True, exclude_defaults=True)),
+            "task.toml": tomlkit.dumps(task_table(task)), "actual.toml": tomlkit.dumps(actual)}  # fmt: skip
 
 
 def trial_files(number: int, trial: Trial, boundaries: np.ndarray, seed: int) -> dict[str, str]:
@@ -49,33 +48,3 @@ def task_table(task: BlockTask) -> dict[str, Any]:
     moves = [{"object": m.object, "to": m.to} | ({"slide": True} if m.slide else {}) for m in task.moves]
     table: dict[str, Any] = {} if task.repeat == 1 else {"repeat": task.repeat}
     return table | {"objects": {name: {"on": on} for name, on in task.initial.items()}, "moves": moves}
-
-
-def toml(table: Mapping[str, Any], prefix: str = "") -> str:
-    """TOML text of nested tables, lists of tables, numbers, strings and lists of those."""
-    plain, tables = [], []
-    for key, value in table.items():
-        name = prefix + _key(key)
-        if isinstance(value, Mapping):
-            only_tables = value and all(isinstance(entry, Mapping) for entry in value.values())
-            tables.append(("" if only_tables else f"[{name}]\n") + toml(value, name + "."))
-        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            tables += [f"[[{name}]]\n{toml(entry, name + '.')}" for entry in value]
-        else:
-            plain.append(f"{_key(key)} = {_value(value)}\n")
-    return "".join(plain + tables)
-
-
-def _key(key: str) -> str:
-    bare = key.isascii() and key.replace("_", "").replace("-", "").isalnum()
-    return key if bare else json.dumps(key, ensure_ascii=False)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else str(value)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
