@@ -9,7 +9,7 @@ Three observations a grip (the span from pickup to place of one move):
 
 Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2
 pooled over grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal
-1997; docs/model.md). Each of the drawn alignments gives every sample to one subtask.
+1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask.
 """
 
 from __future__ import annotations

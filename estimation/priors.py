@@ -1,4 +1,4 @@
-"""Priors of properties and of what the contact equations leave out, with reasons in docs/model.md.
+"""Priors of properties and of what the contact equations leave out, with reasons in docs/properties.md.
 
 Properties are log-normal: blocks that a 4 N pinch can carry and a 75 mm workspace holds, a
 factor of e^sd either way. They are wide: the recording decides.

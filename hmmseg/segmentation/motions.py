@@ -6,7 +6,7 @@ joins both ends with the measured velocities; its crossing time has the density 
 
     p(t) ~ N(0; g(t), s(t)^2) E[max(dg/dt, 0)],
 
-s being the propagated sensor noise and the interpolation's own uncertainty (Rice 1944; docs/model.md).
+s being the propagated sensor noise and the interpolation's own uncertainty (Rice 1944; docs/segmentation.md).
 Touches stop the motion: they come somewhere on the way of a minimum-jerk motion (Flash and Hogan 1985) whose
 start and duration both fingers share.
 """
