@@ -72,7 +72,6 @@ def segment(
     task: Source,
     rig: Source = None,
     model: SequenceModel | None = None,
-    seed: int = 0,
 ) -> list[Segmentation]:
     """Subtasks of every trial with the uncertainty of each boundary.
 
@@ -100,12 +99,11 @@ def fit(
     trials: Source | Sequence[Source],
     task: Source,
     labels: Mapping[str, Sequence[float | None] | Mapping[str, float]] | None = None,
-    seed: int = 0,
 ) -> SequenceModel:
     """Emissions and durations of a plain ordered task, from labels of some trials or none.
 
-    `labels`: by the trial's name boundaries [s], None where unknown, or {subtask: its start}. `seed` is not
-    used, as nothing is drawn. InputError for input at fault.
+    `labels`: by the trial's name boundaries [s], None where unknown, or {subtask: its start}.
+    InputError for input at fault.
 
     >>> import numpy as np
     >>> from hmmseg import fit, segment

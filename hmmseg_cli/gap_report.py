@@ -51,7 +51,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
     return rendered(
         "diagnose.html.j2",
         headline=finding.headline(body, setting.rig),
-        lines=finding.sentences(body, setting.rig),
+        lines=finding.sentences(body),
         to_do=finding.to_do(body) if body["verdict"] != "none" else [],
         remains=finding.remains(body),
         parameters=_parameters(effect) if effect and body["causes"] else [],

@@ -50,13 +50,12 @@ class Remainder:
 @dataclass(frozen=True)
 class SmallGap:
     """A gap below the smallest that matters: `size` over that, of the `channel` and `part` with the most;
-    `amount` and what is `tolerated` there in sds of the noise, for the caller to turn into units."""
+    `amount` there in sds of the noise, for the caller to turn into units."""
 
     size: float
     channel: str
     part: str
-    amount: float = float("nan")
-    tolerated: float = float("nan")
+    amount: float
 
 
 @dataclass(frozen=True)

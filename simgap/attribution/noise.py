@@ -58,5 +58,4 @@ def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap
     size = amount / least
     most = int(size.argmax())
     channel, part = divmod(int(key[most]), len(rows.parts))
-    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]),
-                    float(least[most]))  # fmt: skip
+    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]))

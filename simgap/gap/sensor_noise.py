@@ -17,7 +17,7 @@ ROCKING = 0.1  # prior: a block that is pushed rocks: its sides rise by so much 
 NUDGE = 1e-4  # prior: m; fingers that push unequally move a resting block by about as much
 
 
-def sample_noise(s: Signals, rig: Rig, group: int) -> dict[str, np.ndarray]:
+def sample_noise(s: Signals, group: int) -> dict[str, np.ndarray]:
     """Noise (N,) of one finger's x, y, vx, vy and force, of means over `group` samples.
 
     A jointed finger's changes with its pose. Learned from the recording where the rig does not state it.

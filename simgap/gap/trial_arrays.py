@@ -97,7 +97,7 @@ def trial_arrays(
         rates = np.stack([signals.vx1, signals.vy1, signals.vx2, signals.vy2], 1)
     there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
-    sample = sample_noise(signals, rig, group)
+    sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
     sd = np.hypot(plain, motion_doubt(signals, sample, step, group))
     sd[:, 6:] = np.hypot(sd[:, 6:], between_samples(t, force, phase == 0, edge & (phase == 2), boundaries))

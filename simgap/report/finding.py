@@ -71,7 +71,7 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     return text[0].upper() + text[1:] + more
 
 
-def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
+def sentences(body: Body) -> list[str]:
     """What was found, how sure, and how far it goes, for an engineer who must act."""
     verdict, p, small = body["verdict"], p_text(body["detection"]["p_value"]), body.get("small_gap")
     if verdict == "none" and small:
@@ -97,7 +97,7 @@ def sentences(body: Body, rig: Mapping[str, Any] | None = None) -> list[str]:
 
 def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The whole finding in a paragraph, for a terminal."""
-    text = " ".join([*sentences(body, rig), *remains(body)])
+    text = " ".join([*sentences(body), *remains(body)])
     causes = f" ({', '.join(body['causes'])})" if body["causes"] else ""
     return f"{headline(body, rig)}{causes}. {text}"
 

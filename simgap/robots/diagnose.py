@@ -59,7 +59,6 @@ class RobotDiagnosis:
     shrinkage: Shrinkage | None
     identifiable: Identifiability
     next_log: NextLog | None
-    borne: tuple[str, ...]
     discrepancy: Mapping[str, float]
     warnings: tuple[str, ...]
 
@@ -152,7 +151,6 @@ def _diagnosed(
         far,
         alike,
         next_log(ended.forms, verdict, [r.name for r in composed.recordings]),
-        borne,
         ended.discrepancy.scale,
         tuple(warnings),
     )

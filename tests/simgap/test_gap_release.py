@@ -88,8 +88,8 @@ def test_noise_of_a_jointed_finger_changes_with_its_pose():
     rig = read_rig(DEMO / "rig.toml")
     trial = read_trial(DEMO / "trial_01.csv", rig)
     s = task_space(trial, rig)
-    one = sample_noise(s, rig, 1)
+    one = sample_noise(s, 1)
     np.testing.assert_allclose(one["y"], s.sd_y)
     assert np.ptp(one["y"]) > 0.05 * one["y"].mean() and np.ptp(one["force"]) == 0
-    np.testing.assert_allclose(sample_noise(s, rig, 4)["y"], s.sd_y / 2)
+    np.testing.assert_allclose(sample_noise(s, 4)["y"], s.sd_y / 2)
     np.testing.assert_allclose(channel_noise(one)[:, CHANNELS.index("distance")], np.sqrt(2) * s.sd_x)
