@@ -7,11 +7,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from hmmseg.contact import identifiability
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import CONTRADICTS
 
-UNITS = {"weight": "N", "width": "m", "height": "m", "friction": "1"}
+UNITS = identifiability.UNITS | {"friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
 
 

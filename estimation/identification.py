@@ -21,6 +21,7 @@ from estimation.sliding import with_slides
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
+from hmmseg.contact.identifiability import UNITS
 from hmmseg.errors import nearest
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -29,7 +30,6 @@ from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
 
-UNITS = {"weight": "N", "width": "m", "height": "m"}
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
 
 

@@ -23,13 +23,13 @@ import numpy as np
 from scipy.special import ndtri
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask, decompose, height_equations, subtasks
+from hmmseg.contact.identifiability import UNITS
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import StateLabels, label_states
 
 TRIM = 0.05  # chosen: share of the carry left out at either end of the weight estimate
-UNITS = {"weight": "N", "width": "m", "height": "m"}
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from estimation.combinations import Terms, simplest_combinations
 from estimation.observations import (
     CHANNELS,
 )
+from hmmseg.contact.identifiability import PROPERTIES
 from hmmseg.io.task import BlockTask
 
-PROPERTIES = ("weight", "width", "height")
 FORCE, DISTANCE, RISE = range(len(CHANNELS))
 
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.contact.decompose import Subtask
+from hmmseg.contact.identifiability import PROPERTIES
 from hmmseg.segmentation.spans import Segmentation
-
-PROPERTIES = ("weight", "width", "height")
 
 
 def boundary_residuals(segmentation: Segmentation, truth: Sequence[float]) -> np.ndarray:

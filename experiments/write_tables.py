@@ -30,9 +30,9 @@ from experiments import (
 from experiments.table_misfits import misfits
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
+from hmmseg.contact.identifiability import PROPERTIES
 
 ROOT = Path(__file__).parents[1]
-PROPERTIES = ("weight", "width", "height")
 PAPER = {"weight": "3 %", "width": "7 %", "height": "10 %"}
 TARGET = {"weight": "<= 0.5 %", "width": "<= 0.1 %", "height": "<= 0.2 %"}
 

@@ -136,6 +136,7 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     import numpy as np
 
     from hmmseg.contact.decompose import subtasks
+    from hmmseg.io.rig import FORCE_CHANNELS
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.align import segment
     from simgap.world.animation import Scene, Trace
@@ -156,8 +157,7 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
         result = replayed(recording, task, rig, blocks, boundaries)
     else:
         result = replay(recording, task, rig, blocks, boundaries=boundaries)
-    names = ("fx1", "fy1", "fx2", "fy2")
-    force = dict(zip(names, result.force.reshape(-1, 4).T, strict=True))
+    force = dict(zip(FORCE_CHANNELS, result.force.reshape(-1, 4).T, strict=True))
     predicted = Trial("trial_01.csv", recording.t, recording.channels | force)
     summary = {}
     if rig.noise.force is not None:

@@ -9,14 +9,13 @@ import numpy as np
 
 from estimation.paper_formulas import estimate_plugin
 from hmmseg.contact.decompose import Subtask
+from hmmseg.contact.identifiability import PROPERTIES
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Failure, Segmentation, Span, known
 from hmmseg.segmentation.thresholds import NUMBERS, StateLabels
 from simgap.world.properties import Block
-
-PROPERTIES = ("weight", "width", "height")
 
 
 @dataclass(frozen=True)

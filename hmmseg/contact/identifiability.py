@@ -20,7 +20,8 @@ X_POSITIONS, Y_POSITIONS = "horizontal positions", "vertical positions"
 X_FORCES, Y_FORCES = "horizontal forces", "vertical forces"
 
 Unknown = tuple[str, ...]  # ("weight", object), or a nuisance such as ("load", subtask, sample)
-PROPERTIES = (WEIGHT, WIDTH, HEIGHT)
+UNITS = {WEIGHT: "N", WIDTH: "m", HEIGHT: "m"}  # of what an object has by itself
+PROPERTIES = tuple(UNITS)
 
 
 @dataclass(frozen=True)

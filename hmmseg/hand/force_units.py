@@ -9,7 +9,7 @@ import numpy as np
 
 from hmmseg.hand.tool import Tool
 from hmmseg.io.plausibility import Finding, all_changed, check_forces
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.io.units import UNITS
 
@@ -23,7 +23,7 @@ FORCES = ("mN", "gf", "kgf", "kN")
 
 def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
     """Forces of fingertips whose noise is that of the rig times the size of another unit."""
-    names = [name for name in ("fx1", "fy1", "fx2", "fy2") if name in trial.channels]
+    names = [name for name in FORCE_CHANNELS if name in trial.channels]
     if rig.noise.force is None or not names or check_forces(trial, rig):
         return []
     shown = _noise([trial.channels[name] for name in names])

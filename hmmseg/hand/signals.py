@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.hand.kinematics import forward, jacobian
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import ROLL, Trial
 
 
@@ -102,7 +102,7 @@ class Signals:
 def task_space(trial: Trial, rig: Rig) -> Signals:
     """Signals of a trial: forward kinematics, and the Jacobian for velocities, of the rig."""
     channels, noise, n = trial.channels, rig.noise, trial.t.size
-    out: dict[str, np.ndarray] = {f: channels[f] for f in ("fx1", "fy1", "fx2", "fy2")}
+    out: dict[str, np.ndarray] = {f: channels[f] for f in FORCE_CHANNELS}
     derived = False
     variances = {"x": np.zeros(n), "y": np.zeros(n), "vx": np.zeros(n), "vy": np.zeros(n)}
     for i in (1, 2):

@@ -13,7 +13,7 @@ import numpy as np
 
 from hmmseg.hand.signals import task_space
 from hmmseg.io.plausibility import Finding, all_changed, changed, exchanged
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.robust import white_sd
 
@@ -87,7 +87,7 @@ def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial
     if apart > 0 and towards < 0:
         if carried < 0:
             problem = "is negative in a grip and fy1 + fy2 in a lift: forces on the finger, not by it"
-            changes = all_changed(("fx1", "fy1", "fx2", "fy2"), rig, sign=-1)
+            changes = all_changed(FORCE_CHANNELS, rig, sign=-1)
         else:
             problem = "is negative and fx2 positive in a grip: their signs are flipped"
             changes = all_changed(("fx1", "fx2"), rig, sign=-1)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.io.columns import Column
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
@@ -172,7 +172,7 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
 
 def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
     """Forces in mN or kN: no fingertip presses so hard, or holds anything so softly."""
-    names = [name for name in ("fx1", "fy1", "fx2", "fy2") if name in trial.channels]
+    names = [name for name in FORCE_CHANNELS if name in trial.channels]
     there = [np.abs(v[np.isfinite(v)]) for v in (trial.channels[name] for name in names)]
     strongest = max((float(np.quantile(v, 0.99)) for v in there if v.size), default=1.0)
     if WEAKEST < strongest < STRONGEST or strongest == 0:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask
-from hmmseg.online.properties import UNITS
+from hmmseg.contact.identifiability import UNITS
 
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter

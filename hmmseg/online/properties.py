@@ -11,8 +11,6 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.rounds import one_round
 
-UNITS = {"weight": "N", "width": "m", "height": "m"}
-
 
 class Properties:
     """What the means of weights, widths and rises say of every block.

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hmmseg.io.rig import FORCE_CHANNELS
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
-from simgap.effects.base import FORCES
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.trial_arrays import CHANNELS
 
@@ -34,7 +34,7 @@ def _signal(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
 
     w = found.problem.frame.world
     position, velocity = (np.asarray(z)[trial] for z in tips(jax.tree.map(jnp.asarray, w)))
-    force = dict(zip(FORCES, w.force[trial].T, strict=True))
+    force = dict(zip(FORCE_CHANNELS, w.force[trial].T, strict=True))
     x1, y1, x2, y2 = position.T
     table = {
         "x": (x1 + x2) * 50,

@@ -240,9 +240,6 @@ def per_channel(values: Values, names: tuple[str, ...]) -> Array:
     return jnp.stack([jnp.asarray(values[n], float) for n in names])[None, None, :]
 
 
-FORCES = ("fx1", "fy1", "fx2", "fy2")
-
-
 def flat(performance: Performance) -> np.ndarray:
     """Forces of a performance as columns fx1, fy1, fx2, fy2 (n, 4)."""
     return performance.force.reshape(-1, 4)

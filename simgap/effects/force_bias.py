@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from simgap.effects.base import FORCES, READOUT, Effect, Parameter, flat, per_channel, with_force
+from hmmseg.io.rig import FORCE_CHANNELS
+from simgap.effects.base import READOUT, Effect, Parameter, flat, per_channel, with_force
 
 
 def _phrase(means, rig):
@@ -21,9 +22,9 @@ EFFECT = Effect(
     called="zero errors of the force sensors",
     check="Tare the force sensors in free air, record two seconds at rest, and look at what is left.",
     phrase=_phrase,
-    parameters=tuple(Parameter(c, "N", 0.1) for c in FORCES),
+    parameters=tuple(Parameter(c, "N", 0.1) for c in FORCE_CHANNELS),
     stage=READOUT,
-    correct=lambda w, v, on: w._replace(force=w.force - per_channel(v, FORCES)),
-    admitted=lambda rig: ("force_bias", dict(zip(FORCES, rig.systematic.force_bias, strict=True))),
-    apply=lambda p, v, rng: with_force(p, flat(p) + [v[c] for c in FORCES]),
+    correct=lambda w, v, on: w._replace(force=w.force - per_channel(v, FORCE_CHANNELS)),
+    admitted=lambda rig: ("force_bias", dict(zip(FORCE_CHANNELS, rig.systematic.force_bias, strict=True))),
+    apply=lambda p, v, rng: with_force(p, flat(p) + [v[c] for c in FORCE_CHANNELS]),
 )

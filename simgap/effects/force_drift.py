@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from hmmseg.io.rig import FORCE_CHANNELS
 from simgap.effects.base import (
-    FORCES,
     READOUT,
     Effect,
     Parameter,
@@ -28,13 +28,13 @@ def _since(t, last, bend):
 def _correct(world: World, values, on) -> World:
     last = jnp.asarray(world.events).max(axis=1, keepdims=True) - world.t[:, :1]
     since = _since(world.t - world.t[:, :1], jnp.maximum(last, 1e-3), values["bend"])
-    return world._replace(force=world.force - since[..., None] * per_channel(values, FORCES))
+    return world._replace(force=world.force - since[..., None] * per_channel(values, FORCE_CHANNELS))
 
 
 def _apply(performance: Performance, values, rng) -> Performance:
     t, last = performance.t - performance.t[0], float(performance.events.max() - performance.t[0])
     since = _since(t, max(last, 1e-3), values.get("bend", 0.0))
-    return with_force(performance, flat(performance) + since[:, None] * [values[c] for c in FORCES])
+    return with_force(performance, flat(performance) + since[:, None] * [values[c] for c in FORCE_CHANNELS])
 
 
 EFFECT = Effect(
@@ -48,7 +48,7 @@ EFFECT = Effect(
         "Record a minute in free air after switching on; let amplifiers and gauges warm up before a session."
     ),
     parameters=(
-        *(Parameter(c, "N/s", 0.015) for c in FORCES),
+        *(Parameter(c, "N/s", 0.015) for c in FORCE_CHANNELS),
         Parameter("bend", "1", 0.15, low=-0.6, high=0.6, hidden=True, shape=True),
     ),
     stage=READOUT,

@@ -5,15 +5,16 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import FORCES, SCALE, Effect, Parameter, World, flat, with_force
+from hmmseg.io.rig import FORCE_CHANNELS
+from simgap.effects.base import SCALE, Effect, Parameter, World, flat, with_force
 
 FINGERS = ("finger1", "finger2")
-EVERY = ("gain", *FINGERS, *FORCES)
-OWN = {c: ("gain", f"finger{c[-1]}", c) for c in FORCES}  # what gains make up that of a channel
+EVERY = ("gain", *FINGERS, *FORCE_CHANNELS)
+OWN = {c: ("gain", f"finger{c[-1]}", c) for c in FORCE_CHANNELS}  # what gains make up that of a channel
 
 
 def _gains(values, xp):
-    return xp.stack([sum((values.get(n, 0.0) for n in OWN[c]), xp.zeros(())) for c in FORCES])
+    return xp.stack([sum((values.get(n, 0.0) for n in OWN[c]), xp.zeros(())) for c in FORCE_CHANNELS])
 
 
 def _correct(world: World, values, on) -> World:
@@ -46,8 +47,8 @@ EFFECT = Effect(
     check="Hang a known weight from each fingertip and compare; check the calibration factors in the driver.",
     phrase=_phrase,
     parameters=tuple(Parameter(n, "1", 0.1, low=-0.5, high=0.5) for n in EVERY),
-    forms=(("gain",), FINGERS, FORCES),
-    admitted=lambda rig: ("force_gain/2", dict(zip(FORCES, rig.systematic.force_gain, strict=True))),
+    forms=(("gain",), FINGERS, FORCE_CHANNELS),
+    admitted=lambda rig: ("force_gain/2", dict(zip(FORCE_CHANNELS, rig.systematic.force_gain, strict=True))),
     stage=SCALE,
     correct=_correct,
     apply=lambda p, v, rng: with_force(p, flat(p) * (1 + _gains(v, np))),

@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import FORCES, MIX, Effect, Parameter, Performance, World, flat, with_force
+from hmmseg.io.rig import FORCE_CHANNELS
+from simgap.effects.base import MIX, Effect, Parameter, Performance, World, flat, with_force
 
-NAMES = tuple(f"{to}_from_{of}" for to in FORCES for of in FORCES)
+NAMES = tuple(f"{to}_from_{of}" for to in FORCE_CHANNELS for of in FORCE_CHANNELS)
 # physics: net, grip, shear
 NET = np.array([[1.0, 0, 1, 0], [0, 1, 0, 1], [0.5, 0, -0.5, 0], [0, 0.5, 0, -0.5]])
 

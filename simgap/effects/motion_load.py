@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+from hmmseg.io.rig import FORCE_CHANNELS
 from simgap.effects.base import (
-    FORCES,
     HAND,
     Effect,
     Parameter,
@@ -27,7 +27,7 @@ NAMES = tuple(f"{axis}_of_{motion}" for axis in ("fx", "fy") for motion in MOTIO
 
 def _load(position, velocity, acceleration, values, xp):
     """Forces (..., 4) [N] of motions (..., 4)."""
-    steady = xp.stack([xp.asarray(values[n], float) for n in FORCES])
+    steady = xp.stack([xp.asarray(values[n], float) for n in FORCE_CHANNELS])
     matrix = xp.stack([xp.asarray(values[n], float) for n in NAMES]).reshape(2, 6)
     out = []
     for finger in (0, 1):
@@ -58,7 +58,7 @@ DECOY = Effect(
     says="a force on both fingers, linear in position, velocity and acceleration",
     shows="free motion too",
     mistaken_for=("cable_force", "viscous_drag", "fingertip_mass", "force_bias"),
-    parameters=tuple(Parameter(n, "N", 0.05) for n in (*FORCES, *NAMES)),
+    parameters=tuple(Parameter(n, "N", 0.05) for n in (*FORCE_CHANNELS, *NAMES)),
     stage=HAND,
     correct=_correct,
     apply=_apply,

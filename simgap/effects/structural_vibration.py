@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+from hmmseg.io.rig import FORCE_CHANNELS
 from simgap.effects.base import (
-    FORCES,
     READOUT,
     RINGING,
     Effect,
@@ -19,7 +19,9 @@ from simgap.effects.base import (
 )
 
 GROUPS = (("grip", (0, 3)), ("support", (1, 2)))  # events of a move that ring alike
-AMPLITUDES = tuple(f"{part}_{group}_{c}" for group, _ in GROUPS for part in ("sin", "cos") for c in FORCES)
+AMPLITUDES = tuple(
+    f"{part}_{group}_{c}" for group, _ in GROUPS for part in ("sin", "cos") for c in FORCE_CHANNELS
+)
 
 
 def _ringing(world: World, values) -> jnp.ndarray:
@@ -34,7 +36,8 @@ def _ringing(world: World, values) -> jnp.ndarray:
         for part, wave in (("sin", jnp.sin), ("cos", jnp.cos)):
             shape = (decay * wave(omega * since)).sum(0)
             total += (
-                shape[..., None] * jnp.stack([values[f"{part}_{group}_{c}"] for c in FORCES])[None, None, :]
+                shape[..., None]
+                * jnp.stack([values[f"{part}_{group}_{c}"] for c in FORCE_CHANNELS])[None, None, :]
             )
     return total
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hmmseg.contact.identifiability import PROPERTIES, UNITS
 from simgap.attribution.document import entries
 from simgap.attribution.findings import Attribution, EffectPosterior
 from simgap.effects import catalogue
@@ -14,8 +15,6 @@ from simgap.gap.located import where
 from simgap.gap.search import Search
 from simgap.gap.trial_arrays import CHANNELS
 
-PROPERTIES = ("weight", "width", "height")
-UNITS = {"weight": "N", "width": "m", "height": "m"}
 DRAWS = 2000  # numerics: of the posterior, for intervals
 LISTED = 8  # look: effects that are described
 TOLD = 0.5  # look: sd of the prior below which a property is told by the recordings

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.effects import effect_named
@@ -92,7 +92,7 @@ def recorded(
     for effect in chosen:
         if effect.finish is not None:
             finish, values = effect.finish, dict(effects[effect.name])
-            changed = {c: finish(trial.channels[c], values) for c in ("fx1", "fy1", "fx2", "fy2")}
+            changed = {c: finish(trial.channels[c], values) for c in FORCE_CHANNELS}
             trial = replace(trial, channels=trial.channels | changed)
     return trial
 

@@ -9,12 +9,11 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
 from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.signals import Signals, task_space
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.robust import bridged
 from hmmseg.segmentation.align import TrialAlignment
-from simgap.effects.base import FORCES
 from simgap.gap.sensor_noise import (
     between_samples,
     channel_noise,
@@ -42,7 +41,7 @@ def without_dropouts(trial: Trial) -> Trial:
 
     A block cannot be let go and gripped again from one sample to the next: the reading was lost.
     """
-    force = np.stack([trial.channels[c] for c in FORCES], 1)
+    force = np.stack([trial.channels[c] for c in FORCE_CHANNELS], 1)
     grip = np.minimum(force[:, 0], -force[:, 2])
     before, here, after = grip[:-2], np.abs(force[1:-1]).max(1), grip[2:]
     least = np.minimum(before, after)
@@ -50,7 +49,7 @@ def without_dropouts(trial: Trial) -> Trial:
     if not lost.any():
         return trial
     gone = np.flatnonzero(lost) + 1
-    channels = {k: np.where(np.isin(np.arange(v.size), gone), np.nan, v) if k in FORCES else v
+    channels = {k: np.where(np.isin(np.arange(v.size), gone), np.nan, v) if k in FORCE_CHANNELS else v
                 for k, v in trial.channels.items()}  # fmt: skip
     return replace(trial, channels=channels)
 
@@ -88,7 +87,7 @@ def trial_arrays(
     subtask = np.searchsorted(boundaries, t, side="right")
     phase = np.array([_phase(s) for s in steps])[subtask]
     edge = np.abs(t[:, None] - boundaries).min(axis=1) < step
-    force = np.stack([signals.__dict__[c] for c in FORCES], 1)
+    force = np.stack([signals.__dict__[c] for c in FORCE_CHANNELS], 1)
     names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
     joints = np.stack([trial.channels[n] for n in names], 1)
     if rig.jointed:

@@ -13,11 +13,11 @@ import numpy as np
 from rich.table import Table
 
 from estimation.actual import read_actual
+from hmmseg.contact.identifiability import UNITS
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask
 
 DEFAULT_FRICTION = 1.2  # prior: of foam on a block, where nothing says otherwise
-UNITS = {"weight": "N", "width": "m", "height": "m"}
 
 
 @dataclass(frozen=True)
