@@ -36,7 +36,7 @@ NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to
 MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
 LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior
 APART = 0.1  # chosen: s by which one finger touches or lets go after the other, at most
-MIN_FREE = 8  # chosen: samples of free motion that tell the scale of the forces there
+MIN_FREE = 8  # numerics: samples of free motion that tell the scale of the forces there
 
 
 @dataclass(frozen=True)

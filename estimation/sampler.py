@@ -33,8 +33,8 @@ GROUPS = 4  # numerics: chains that walkers are joined into for R-hat
 KEPT = 4096  # numerics: draws of the unknowns at least, where the chain has so many
 BATCH = 256  # numerics: drawn at once
 IMPORTANCE = 4000  # numerics: independent draws that the chain is checked against
-MIN_EFFICIENCY = 0.05  # chosen: of them, for a check, and to stand in where the chain does not converge
-MAX_APART = 0.25  # chosen: of a posterior sd, between the chain's means of the scales and those draws'
+MIN_EFFICIENCY = 0.05  # numerics: of them, for a check, and to stand in where the chain does not converge
+MAX_APART = 0.25  # numerics: of a posterior sd, between the chain's means of the scales and those draws'
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.features import acceleration
 
 MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
-FEWEST = 4  # chosen: samples of sliding
+FEWEST = 4  # numerics: samples of sliding
 WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little to tell
 COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
 

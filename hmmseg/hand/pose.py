@@ -12,7 +12,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.robust import bridged, white_sd
 
 WINDOW, WIDEST = 0.1, 0.4  # chosen: s over which motion is smoothed: arms change no faster
-LEAST = 3  # chosen: samples of the same: what a parabola needs
+LEAST = 3  # numerics: samples of the same: what a parabola needs
 QUIET = 0.1  # chosen: m/s^2; the window widens until the acceleration's noise is less: a hundredth of gravity
 
 

@@ -30,7 +30,7 @@ from hmmseg.robust import bridged, robust_sd
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
 TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
-SAMPLES = 20  # chosen: of free motion, at least
+SAMPLES = 20  # numerics: of free motion, at least
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from hmmseg.io.trial import MIN_SAMPLES, Trial, channels_of, trial_of
 
 PIECE = 20_000  # numerics: rows of one piece; a piece of 50,000 rows and what is made of it takes 20 MB more
 JUDGED = 50_000  # numerics: rows at the beginning by which a recording's habits are judged
-LONG = 1_000_000  # chosen: rows from which on a recording is read in pieces: 13 columns of it are 100 MB
+LONG = 1_000_000  # numerics: rows from which on a recording is read in pieces: 13 columns of it are 100 MB
 
 
 def is_long(path: str | Path) -> bool:

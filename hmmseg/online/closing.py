@@ -20,9 +20,9 @@ STAND = 0.1  # chosen: s of next to no motion: the gripper stands
 STILL = 0.1  # chosen: share of a closing's top speed that is next to none
 SAMPLES = 4  # numerics: of a stand at least, and steps: what the touch is read from
 PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
-NOISE = 200  # chosen: samples that tell the opening's noise
+NOISE = 200  # numerics: samples that tell the opening's noise
 CLEAR = 10.0  # chosen: noise scales of a motion, as off line
-KEPT = 10.0  # chosen: s of a closing that are kept
+KEPT = 10.0  # numerics: s of a closing that are kept
 OPENING = 0.1  # chosen: share of the way back at which a gripper has surely let go, as off line
 
 

@@ -31,16 +31,16 @@ from hmmseg.online.step import LOG_DEPARTURE, advance
 from hmmseg.online.summary import boundary, summarise
 from hmmseg.segmentation.features import MAX_RATE, noise_sd
 
-WARM_UP = 8  # chosen: rows that tell a force noise which the rig does not state
+WARM_UP = 8  # numerics: rows that tell a force noise which the rig does not state
 NUM_CHANNELS = len(CARTESIAN_CHANNELS)
 KINDS = {FREE: at.FREE_KIND, ON_GROUND: at.GROUND_KIND, SLIDING: at.SLIDING_KIND, ABOVE_GROUND: at.ABOVE_KIND}
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
 # hand at rest creeps, and pads' foam gives by tenths of a mm.
 VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
 PRIOR = 4.0  # prior: readings that a scale's start is worth
-# chosen: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; of no more weight than a few nats
+# prior: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; of no more weight than a few nats
 LEAST_SPANS = (0.1, 0.1, 0.03, 0.03)
-LEAST_FORCE = 50.0  # chosen: and of its forces, in sds of their noise
+LEAST_FORCE = 50.0  # prior: and of its forces, in sds of their noise
 ROUGH = 3.0  # prior: net and shear force of a held block at first, in sds of the force noise
 UNBIASED = 10.0  # prior: a sensor's bias before anything is known, in sds of its noise
 

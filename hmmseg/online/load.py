@@ -10,7 +10,7 @@ from hmmseg.hand.carried import TOGETHER
 from hmmseg.levels import MOVED, SURE
 from hmmseg.robust import robust_sd
 
-WENT = 20  # chosen: samples of a hand that goes somewhere before what it bears is judged
+WENT = 20  # numerics: samples of a hand that goes somewhere before what it bears is judged
 
 
 class Went:

@@ -21,7 +21,7 @@ from hmmseg.online.wrist import Wrist, checked
 
 LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points over the lag to which a late row returns
-USUAL = 0.02  # chosen: how fast the usual interval follows
+USUAL = 0.02  # numerics: how fast the usual interval follows
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
     "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",

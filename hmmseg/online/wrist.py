@@ -28,13 +28,13 @@ from hmmseg.online.load import Went
 from hmmseg.robust import bridged
 
 WHERE = "stream"
-BATCH = 0.02  # chosen: s that are turned into fingers together
-BACKLOG = 10.0  # chosen: s before the first grip that are kept for the filter
-FREE = 1200  # chosen: samples of free motion that the tool is found from, ...
-APART = 8  # chosen: ... so many of them in a window
+BATCH = 0.02  # numerics: s that are turned into fingers together
+BACKLOG = 10.0  # numerics: s before the first grip that are kept for the filter
+FREE = 1200  # numerics: samples of free motion that the tool is found from, ...
+APART = 8  # numerics: ... so many of them in a window
 KEPT = 30.0  # chosen: s for which a grip may turn out to be none
 AROUND = 4  # numerics: windows kept before what is smoothed: it is then as in the whole recording
-TOUCHES = 8  # chosen: touches kept: a boundary looks back over fewer
+TOUCHES = 8  # numerics: touches kept: a boundary looks back over fewer
 
 
 class Wrist:

@@ -27,7 +27,7 @@ from hmmseg.segmentation.boundaries import (
 from hmmseg.segmentation.motions import POINTS, Crossing, Kind
 from hmmseg.segmentation.switching import Penetration, switch_probability
 
-LIKELY = 1e-3  # chosen: least probability of an interval within which the crossing is looked at
+LIKELY = 1e-3  # numerics: least probability of an interval within which the crossing is looked at
 SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
 VIEWS = (0.6, 0.2, 0.2)

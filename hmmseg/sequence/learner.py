@@ -23,7 +23,7 @@ from hmmseg.sequence.transitions import Transitions, transitions
 
 FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
 STEPS_PER_FLOOR = 4  # numerics: of EM
-PRESENCE_PRIOR = (1.0, 1.0)  # chosen: Beta prior of an optional state's presence
+PRESENCE_PRIOR = (1.0, 1.0)  # prior: Beta prior of an optional state's presence
 
 
 class Learner:

@@ -13,7 +13,7 @@ from simgap.attribution.posterior import Forms, Model, fitted, mode, quadratic_f
 SCREEN, REFINED = 3, 5
 WINDOW = 12.0  # numerics: nats behind the best set within which a set is kept
 BEAM = 5  # numerics: sets of each size that are extended
-MOST = 6  # chosen: effects of a set at most
+MOST = 6  # numerics: effects of a set at most
 
 
 def sought(f: Forms, beam: int = BEAM, named: bool = False) -> list[Model]:

@@ -16,7 +16,7 @@ from simgap.gap.problem import Problem, columns_of, limits, slots
 
 SCREEN = 2  # numerics: steps before the best start of a form is chosen
 LEADERS = 3  # numerics: starts screened
-PROMISING = 2.0  # chosen: nats that a linear step must gain for a form to be fitted
+PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
 
 
 def candidate_names(rig: Rig, excluded: Sequence[str] = ()) -> list[str]:

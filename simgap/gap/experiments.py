@@ -28,7 +28,7 @@ from simgap.world.properties import Blocks
 from simgap.world.writing import task_table
 
 TRIALS = 2  # numerics: that are simulated: where contacts fall between samples is chance
-ENOUGH = 5.0  # chosen: nats: the interface's detection floor
+ENOUGH = 5.0  # physics: a definition: nats, the detection floor
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
 ROUNDS = 2  # numerics: times at most
-ATTEMPTS = 3  # chosen: leading candidates that are taken out in turn where no trial fits its task
+ATTEMPTS = 3  # numerics: leading candidates that are taken out in turn where no trial fits its task
 HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
 WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
 Progress = Callable[[str], None]

@@ -19,7 +19,7 @@ from scipy.special import fdtrc, ndtr, ndtri
 from simgap.generic.features import FAST, SLOW, Layout
 
 PERMUTATIONS = 999  # numerics: of labels, at most
-ENOUGH = 100  # chosen: different exchanges; with fewer the F distribution and Bonferroni's bound serve
+ENOUGH = 100  # numerics: different exchanges; with fewer the F distribution and Bonferroni's bound serve
 MODERATION = 4.0  # prior: degrees of freedom that a cell's mean variance is worth
 PACE = 0.02  # chosen: of a duration: clocks repeat themselves exactly, and nobody minds less
 NOTHING = 1e-6  # numerics: of a channel's scale: no sd is smaller

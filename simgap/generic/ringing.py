@@ -19,7 +19,7 @@ DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
 HEAVIEST = 0.25  # chosen: damping beyond which a course is no ring
 FREQUENCIES = 80  # numerics: where searches start
 SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
-LEAST = 12  # chosen: samples
+LEAST = 12  # numerics: samples
 PERIODS = 1.5  # chosen: of the slowest oscillation looked for that a window holds
 HIGHEST = 0.4  # chosen: of the sampling rate
 

@@ -15,7 +15,7 @@ from simgap.simulators.recording import Recording
 
 # numerics: windows of a regime with which a search begins; it ends on all of them
 FIRST = 48
-SETTLE = 0.2  # chosen: s that a model has to come to rest where a window is of rest
+SETTLE = 0.2  # numerics: s that a model has to come to rest where a window is of rest
 
 Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; what is not named is neutral
 

@@ -23,7 +23,7 @@ from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with
-SETTLED = 2.0  # chosen: nats that a further round must gain
+SETTLED = 2.0  # numerics: nats that a further round must gain
 
 Tell = Callable[[str], None]
 

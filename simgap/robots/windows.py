@@ -18,10 +18,10 @@ from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
 
 LENGTH = 0.4  # numerics: s
-FEWEST = 6  # chosen: samples of a window
+FEWEST = 6  # numerics: samples of a window
 # chosen: s of samples on either side that a start is smoothed from, and at least NEIGHBOURS of them
 REACH = 0.03
-NEIGHBOURS = 5  # chosen: samples
+NEIGHBOURS = 5  # numerics: samples
 # chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
 DOUBT = 3.0
 FREE = "free"  # what a simulator's `contact_states` call the state in which nothing touches

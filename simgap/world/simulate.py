@@ -31,7 +31,7 @@ from simgap.world.scene import Surroundings, physics, substeps_for
 from simgap.world.sensors import DEFAULT_RATE, record
 
 BATCH = 16  # numerics: trials integrated side by side
-MOVING = 2e-3  # chosen: m/s; a slide begins and ends where the block's speed passes this
+MOVING = 2e-3  # physics: a definition: m/s; a slide begins and ends where the block's speed passes this
 
 
 @dataclass(frozen=True, repr=False)
