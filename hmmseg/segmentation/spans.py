@@ -170,8 +170,9 @@ def known(
     failed: Failure | None = None, recorded: Any = None,
 ) -> Segmentation:  # fmt: skip
     """The subtasks `shown` between `edges` [s] (one more) that are known: without uncertainty or evidence."""
+    times = [float(edge) for edge in edges]
     spans = tuple(
-        Span(s.name, s.object, s.state, float(a), float(b), 0.0, 0.0, (float(a),) * 2, (float(b),) * 2)
-        for s, a, b in zip(shown, edges[:-1], edges[1:], strict=True)
+        Span(s.name, s.object, s.state, a, b, 0.0, 0.0, (a, a), (b, b))
+        for s, a, b in zip(shown, times[:-1], times[1:], strict=True)
     )
     return Segmentation(file, rate, None, spans, failed, recorded=recorded)
