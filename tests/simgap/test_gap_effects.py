@@ -9,9 +9,9 @@ import pytest
 
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import inverse
-from hmmseg.io.rig import Finger, Fingertip, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Finger, Fingertip, Rig
 from simgap.effects import catalogue, decoys, effect_named, fitted
-from simgap.effects.base import FORCES, Performance, World, flat, tips
+from simgap.effects.base import Performance, World, flat, tips
 from simgap.gap.evaluation import STEP
 from simgap.gap.residuals import contact
 
@@ -112,7 +112,6 @@ def world_of(p: Performance) -> World:
         free=1 - held[None],
         ground=(held - carry)[None],
         carry=carry[None],
-        move=np.ones((1, held.size, 1)),
         events=p.events[None],
     )
 
@@ -178,7 +177,9 @@ PLANTED = {
     "force_nonlinearity": {"curve": 0.05, "gain": -0.03},
     "gain_drift": {"rate": 0.03, "gain": -0.02},
     "force_memory": {"share_0.1": 0.0, "share_0.4": 0.02, "share_1.6": 0.03, "share_6.4": 0.0},
-    "force_mixing": {f"{to}_from_{of}": 0.02 * (k - 1) for to in FORCES for k, of in enumerate(FORCES)},
+    "force_mixing": {
+        f"{to}_from_{of}": 0.02 * (k - 1) for to in FORCE_CHANNELS for k, of in enumerate(FORCE_CHANNELS)
+    },
     "motion_load": {p.name: 0.04 * (-1) ** k for k, p in enumerate(fitted()["motion_load"].parameters)},
 }
 

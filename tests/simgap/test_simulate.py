@@ -9,7 +9,7 @@ from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Finger, Noise, Rig, read_rig
-from hmmseg.io.task import GROUND, BlockTask, Move, parse_task, read_task
+from hmmseg.io.task import GROUND, BlockTask, Move, read_task
 from hmmseg.io.trial import read_trial
 from simgap.world.operator import OperatorSettings, minimum_jerk
 from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
@@ -123,17 +123,6 @@ def test_files_are_read_back_as_they_were(tmp_path, stacked):
     np.testing.assert_allclose(truth["boundaries"], stacked.boundaries, atol=1e-6)
     blocks = read_properties(tmp_path / "actual.toml", STACK)
     assert blocks["block1"].weight == pytest.approx(0.343)
-
-
-def test_files_keep_names_that_need_quotes(tmp_path):
-    task = parse_task(
-        {"objects": {"Klötze 1": {"on": "ground"}}, "moves": [{"object": "Klötze 1", "to": "ground"}]}, ""
-    )
-    texts = scene_files(task, RIG, {"Klötze 1": PAPER_BLOCKS["block1"]})
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    assert read_task(tmp_path / "task.toml") == task
-    assert read_properties(tmp_path / "actual.toml", task)["Klötze 1"].weight == pytest.approx(0.343)
 
 
 def test_properties_come_from_the_json_of_identify(tmp_path):
