@@ -24,7 +24,7 @@ from experiments.saving import save
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
+from hmmseg.segmentation.conformity import MAX_RATE, Conformity, examine
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.features import features, thin
 from simgap.world.properties import random_properties
@@ -64,10 +64,10 @@ def on_edits(cases: Sequence[Case]) -> dict[str, dict]:
                     continue
                 edited, expected = edit(trial, truth)
                 f = to_features(task_space(edited, case.rig), case.rig)
-                (verdict,) = judge([f], [case.task])
+                (verdict,) = examine([f], [case.task])
                 alone.append((verdict.failing is not None, verdict.failing == expected))
                 if others := [h for j, h in enumerate(healthy) if j != i]:
-                    among = judge([f, *others], [case.task] * (1 + len(others)))[0]
+                    among = examine([f, *others], [case.task] * (1 + len(others)))[0]
                     pooled.append((among.failing is not None, among.failing == expected))
                 if verdict.wrong_rise is None:
                     odds.append(verdict.log_odds)
@@ -92,12 +92,12 @@ def on_recordings(cases: Sequence[Case]) -> dict:
     seconds = []
     for case in cases:
         every = [to_features(s, case.rig) for s in case.signals]
-        judge(every[:1], [case.task])  # compiles
+        examine(every[:1], [case.task])  # compiles
         for f in every:
             start = time.perf_counter()
-            alone += judge([f], [case.task])
+            alone += examine([f], [case.task])
             seconds.append(time.perf_counter() - start)
-        pooled += judge(every, [case.task] * len(every))
+        pooled += examine(every, [case.task] * len(every))
     return {
         "trials": len(alone), "false_alarms": sum(v.failing is not None for v in alone),
         "false_alarms_pooled": sum(v.failing is not None for v in pooled),
@@ -111,7 +111,7 @@ def on_simulations(rig: Rig) -> dict[str, dict]:
     for name, task in TASKS.items():
         seeds = list(range(FIRST_SEED, FIRST_SEED + NUM_SIMULATED))
         simulated = simulate_trials(task, rig, [random_properties(task, s) for s in seeds], seeds)
-        verdicts = [judge([to_features(task_space(s.trial, rig), rig)], [task])[0] for s in simulated]
+        verdicts = [examine([to_features(task_space(s.trial, rig), rig)], [task])[0] for s in simulated]
         out[name] = {"trials": len(verdicts), "false_alarms": sum(v.failing is not None for v in verdicts)}
     return out
 

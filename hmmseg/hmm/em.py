@@ -56,7 +56,7 @@ D = TypeVar("D", bound=Durations)
 
 
 @dataclass(frozen=True)
-class Fit(Generic[E, D]):
+class Learned(Generic[E, D]):
     """A fitted model: the alignments are those under this emission and these durations."""
 
     emission: E
@@ -91,7 +91,7 @@ def em(
     max_iterations: int = 40,
     min_iterations: int = 6,
     tolerance: float = 1e-3,
-) -> Fit[E, D]:
+) -> Learned[E, D]:
     """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
 
     The last step is an expectation. Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too
@@ -99,9 +99,9 @@ def em(
     """
     before = -np.inf
     for iteration in range(1, max_iterations + 1):
-        fit = Fit(emission, durations, expectation(emission, durations, num_trials), iteration, False)
+        fit = Learned(emission, durations, expectation(emission, durations, num_trials), iteration, False)
         if iteration > min_iterations and abs(fit.log_evidence - before) < tolerance:
-            return Fit(emission, durations, fit.alignments, iteration, True)
+            return Learned(emission, durations, fit.alignments, iteration, True)
         if iteration < max_iterations:
             before, responsibilities = fit.log_evidence, fit.responsibilities
             emission, durations = emission.updated(responsibilities), durations.updated(responsibilities)

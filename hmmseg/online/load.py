@@ -18,7 +18,7 @@ class Went:
 
     def __init__(self) -> None:
         self._start: tuple[float, np.ndarray] | None = None
-        self._last, self._judged = -math.inf, False
+        self._last, self._decided = -math.inf, False
         self._up: list[float] = []
         self._across: list[float] = []
         self._raised = 0
@@ -28,7 +28,7 @@ class Went:
         """One sample: where it is and what it does to the world; nearer than `apart` [s] they count once."""
         if self._start is None:
             self._start = height, position
-        if self._judged or t < self._last + apart:
+        if self._decided or t < self._last + apart:
             return
         raised = height > self._start[0] + MOVED
         if raised or np.linalg.norm(position - self._start[1]) > MOVED:
@@ -40,9 +40,9 @@ class Went:
     def load(self, noise: float) -> float | None:
         """The load [N], 0 for nothing, below 0 for one that pulls up; None before or after it is judged."""
         n = len(self._up)
-        if self._judged or n < WENT:
+        if self._decided or n < WENT:
             return None
-        self._judged = True
+        self._decided = True
         limit = SURE / math.sqrt(n / TOGETHER)
         up, across = np.array(self._up), np.array(self._across)
         found, aside = float(np.median(up)), float(np.median(across))

@@ -220,7 +220,7 @@ class Wrist:
             near[max(each.start - 1, 0) : each.stop + 1] = 1.0
         for each in grips:
             near[each.start + 1 : each.stop - 1] = 2.0
-        self._judge(trial, pose, force, tool, until)
+        self._decide(trial, pose, force, tool, until)
         if self._opening.held is not None:
             self.force_sd = max(self.force_sd, tool.drift_sd * abs(until - tool.since))
         self.touches += [touch for touch in found.touches if self._out < touch[0] <= until]
@@ -234,7 +234,7 @@ class Wrist:
         chosen = np.flatnonzero((trial.t > self._out) & (trial.t <= until))
         return [(float(trial.t[i]), table[i]) for i in chosen]
 
-    def _judge(self, trial: Trial, pose: Pose, force: np.ndarray, tool: Tool, until: float) -> None:
+    def _decide(self, trial: Trial, pose: Pose, force: np.ndarray, tool: Tool, until: float) -> None:
         """Whether the hand bears anything once it goes somewhere; InputError where that pulls up."""
         held = self._opening.held
         if held is None or held.start > until:

@@ -81,14 +81,14 @@ def align(
     trials: Sequence[Trial],
     task: BlockTask,
     rig: Rig,
-    insist: bool = False,
+    all_fit: bool = False,
     signals: Sequence[Signals] | None = None,
 ) -> AlignedTrials:
     """Fit the switching model to the trials, pooled, and align each of them.
 
     A trial that does not fit its task is kept out of the pool and aligned with the order that it
     shows instead: its subtasks before `failed` are the task's, boundaries after it are not. Its
-    log evidence is that of the order it shows. `insist`: all are taken to fit, whatever they show.
+    log evidence is that of the order it shows. `all_fit`: all are taken to fit, whatever they show.
 
     Of a repeated task every round is such a trial: one that fails leaves the others as they are. `task`
     of the result has its number of rounds (of several recordings with an unknown number, the most).
@@ -96,11 +96,11 @@ def align(
     """
     if signals is None:
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
-    judged = [features(thin(s, MAX_RATE), rig) for s in signals]
-    pool, pieces = aligned_rounds([InMemory(s) for s in signals], judged, task, rig, insist)
+    coarse = [features(thin(s, MAX_RATE), rig) for s in signals]
+    pool, pieces = aligned_rounds([InMemory(s) for s in signals], coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)
-    number = 1 if insist or done.repeat == "unknown" else done.repeat
+    number = 1 if all_fit or done.repeat == "unknown" else done.repeat
     trial_alignments = []
     for trial, s, own in zip(trials, signals, pieces, strict=True):
         segmentation, boundaries, present = joined(
@@ -133,8 +133,8 @@ def segment_long(recording: LongRecording, task: BlockTask, rig: Rig) -> Segment
     the times and what is read of each round at 100 Hz at most.
     """
     source = OnDisk(recording, rig)
-    judged = [features(source.thinned(MAX_RATE), rig)]
-    pool, pieces = aligned_rounds([source], judged, task, rig)
+    coarse = [features(source.thinned(MAX_RATE), rig)]
+    pool, pieces = aligned_rounds([source], coarse, task, rig)
     done = performed(task, pieces)
     number = 1 if done.repeat == "unknown" else done.repeat
     steps = subtasks(done)

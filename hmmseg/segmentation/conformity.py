@@ -70,7 +70,7 @@ class Conformity:
         return None if index is None else self.free.blocks[index]
 
 
-def judge(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Conformity]:
+def examine(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Conformity]:
     """Conformity of every trial; `tasks` have the same moves, each from where its trial starts.
 
     `features` need no more than MAX_RATE: contact states last longer than its samples.
@@ -142,12 +142,12 @@ def conformity(
     Which of the trial's blocks is which object is the assignment of highest evidence among all
     tried (the first with which the trial fits, if any), unless `known` blocks say it.
     """
-    candidates = assignments(free, steps)
+    ways = assignments(free, steps)
     if known:
         fixed = _recognised(free, known)
-        candidates = [assignment | fixed for assignment in candidates]
+        ways = [assignment | fixed for assignment in ways]
     found = []
-    for assignment in candidates:
+    for assignment in ways:
         found.append(_compare(free, steps, assignment))
         if found[-1].failing is None:
             return found[-1]

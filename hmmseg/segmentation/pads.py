@@ -92,9 +92,9 @@ class Sensing:
         if self.late:
             how = "are filtered with a time constant of" if self.filter else "come late by"
             out.append(f"forces {how} {1e3 * self.delay:.0f} ms against positions; boundaries allow for it")
-        told, found = pads_of(rig).normal1, self.normal
-        if abs(found.value - told) > max(CONTRADICTS * found.sd, STIFFNESS_SD * told):
-            stated = f"rig.toml says {1e6 * told:.0f}" if told > 0 else "rig.toml says they are rigid"
+        nominal, found = pads_of(rig).normal1, self.normal
+        if abs(found.value - nominal) > max(CONTRADICTS * found.sd, STIFFNESS_SD * nominal):
+            stated = f"rig.toml says {1e6 * nominal:.0f}" if nominal > 0 else "rig.toml says they are rigid"
             out.append(f"the pads give {1e6 * found.value:.0f} um/N along the grip, where {stated}; "
                        "boundaries allow for it")  # fmt: skip
         return tuple(out)
@@ -232,8 +232,8 @@ def _delay(
     found = lateness(there[:: max(1, len(there) // ENOUGH)], priors[0], LATE)
     if found is not None and found.delay > LATE and found.gain > DECISIVE:
         # A delay is common to all forces; what the grip alone favours is a fault of its pads.
-        tried = np.array([0.0, found.delay])
-        none, late = evidence(kinds[1:], priors[1:], tried, found.filter)[0]
+        delays = np.array([0.0, found.delay])
+        none, late = evidence(kinds[1:], priors[1:], delays, found.filter)[0]
         if late >= none:
             return found.delay, found.sd, True, found.filter
     log_posterior = evidence(kinds, priors, FINE, False, inner=True).sum(axis=0) - (FINE / LEAD_SD) ** 2 / 2
@@ -273,13 +273,13 @@ def _slope(load: np.ndarray, place: np.ndarray, sd: float) -> tuple[float, float
     Loads that ring while nothing moves flatten the line of places over loads, to none at the worst, and make
     that of loads over places too steep: the truth lies between (Frisch 1934). How far they differ is doubt.
     """
-    slope, told, _ = fitted(load, place, sd)
-    if told == 0:
+    slope, weight, _ = fitted(load, place, sd)
+    if weight == 0:
         return float(slope), 0.0
     steep = float(fitted(place, load, sd * float(np.ptp(load) / max(np.ptp(place), sd)))[0])
     moved = max(1.0 - sd**2 / max(float(np.var(place)), 1e-300), 0.0)  # the share that is no noise of places
     apart = max(moved / steep - float(slope), 0.0) if steep > 0 else np.inf
-    return float(slope), float(1.0 / (1.0 / told + apart**2))
+    return float(slope), float(1.0 / (1.0 / weight + apart**2))
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

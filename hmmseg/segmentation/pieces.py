@@ -14,7 +14,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.boundaries import BoundaryPosterior
-from hmmseg.segmentation.conformity import MAX_RATE, Conformity, judge
+from hmmseg.segmentation.conformity import MAX_RATE, Conformity, examine
 from hmmseg.segmentation.emissions import Features, Parameters
 from hmmseg.segmentation.features import features, thin
 from hmmseg.segmentation.fit import Fit, fit
@@ -46,24 +46,24 @@ class Piece:
 
 def aligned_rounds(
     recordings: Sequence[Recorded],
-    judged: Sequence[Features],
+    coarse: Sequence[Features],
     task: BlockTask,
     rig: Rig,
-    insist: bool = False,
+    all_fit: bool = False,
 ) -> tuple[Pool, list[list[Piece]]]:
     """What all recordings show together, and the rounds of each, aligned.
 
-    `judged` are features of each recording at conformity's MAX_RATE. `insist`: all are taken to fit.
+    `coarse` are features of each recording at conformity's MAX_RATE. `all_fit`: all are taken to fit.
     """
-    if task.repeat == 1 or insist:
+    if task.repeat == 1 or all_fit:
         every = [[slice(0, r.t.size)] for r in recordings]
-        verdicts = [[v] for v in judge(judged, [task] * len(recordings))]
+        verdicts = [[v] for v in examine(coarse, [task] * len(recordings))]
     else:
-        every, verdicts = _rounds(recordings, judged, task, rig)
-    steps = subtasks(task if insist else one_round(task))
+        every, verdicts = _rounds(recordings, coarse, task, rig)
+    steps = subtasks(task if all_fit else one_round(task))
     flat = Parts([(r, p) for r, own in zip(recordings, every, strict=True) for p in own])
     of = [v for own in verdicts for v in own]
-    fitting = [i for i, verdict in enumerate(of) if insist or verdict.failing is None]
+    fitting = [i for i, verdict in enumerate(of) if all_fit or verdict.failing is None]
     parameters = of[0].free.parameters
     taps = [v.free.taps for v in of]
     pool = pooled(flat, fitting, steps, rig, taps) if fitting else unfitted(flat, parameters, rig, taps)
@@ -82,16 +82,16 @@ def performed(task: BlockTask, pieces: Sequence[Sequence[Piece]]) -> BlockTask:
 
 
 def _rounds(
-    recordings: Sequence[Recorded], judged: Sequence[Features], task: BlockTask, rig: Rig
+    recordings: Sequence[Recorded], coarse: Sequence[Features], task: BlockTask, rig: Rig
 ) -> tuple[list[list[slice]], list[list[Conformity]]]:
     """Samples and verdict of every round of every recording."""
-    cuts = [cut(f, task) for f in judged]
+    cuts = [cut(f, task) for f in coarse]
     while True:
         every = [slices(r.t, at) for r, at in zip(recordings, cuts, strict=True)]
         parts = [[features(thin(r.part(p), MAX_RATE), rig) for p in own]
                  for r, own in zip(recordings, every, strict=True)]  # fmt: skip
         tasks = [own for p in parts for own in round_tasks(task, len(p))]
-        found = iter(judge([f for own in parts for f in own], tasks))
+        found = iter(examine([f for own in parts for f in own], tasks))
         verdicts = [[next(found) for _ in own] for own in parts]
         changed = False
         for i, own in enumerate(verdicts):

@@ -48,11 +48,11 @@ def cut(f: Features, task: BlockTask) -> list[float]:
     free = fit_free_contacts(f, any(move.slide for move in task.moves))
     steps = subtasks(one_round(task))
     leave = min(0.5, max(4 * len(free.gripped) + 1, len(steps)) / len(f.t))
-    tried = assignments(free, steps)
-    if len(tried) > 1:  # only the best one's table is made for the whole of a recording that may be long
+    ways = assignments(free, steps)
+    if len(ways) > 1:  # only the best one's table is made for the whole of a recording that may be long
         glance = replace(free, table=free.table[:GLANCE])
-        tried = [max(tried, key=lambda each: _glanced(glance, steps, each, leave))]
-    table, model = _closed(free, steps, tried[0], leave)
+        ways = [max(ways, key=lambda each: _glanced(glance, steps, each, leave))]
+    table, model = _closed(free, steps, ways[0], leave)
     num_states = len(steps) + len(free.states)
     path = most_probable(table, *model) % num_states
     states = np.array([s.state for s in steps] + [state for state, _ in free.states])

@@ -18,7 +18,7 @@ from simgap.gap.problem import Problem
 from simgap.gap.trial_arrays import thinned
 
 
-def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, insist: bool = False) -> AlignedTrials:
+def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, all_fit: bool = False) -> AlignedTrials:
     """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
     frame, rig = given.frame, given.frame.rig
     world = world_without(given, found.effects, found.u)
@@ -30,7 +30,7 @@ def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, insist: bo
         columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
         small, _ = thinned(trial)
         rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
-    return align(trials, frame.task, _hand(rig, world), insist, rows)
+    return align(trials, frame.task, _hand(rig, world), all_fit, rows)
 
 
 def _hand(rig: Rig, world) -> Rig:

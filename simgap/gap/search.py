@@ -74,7 +74,7 @@ def search(
         names = shown(names)
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
-        aligned, misled = _insisted(trials, aligned, rig, actual, keys)
+        aligned, misled = _aligned_all(trials, aligned, rig, actual, keys)
     trials, aligned, warnings = _complete(trials, aligned)
     tell("fitting single effects")
     given = with_nuisances(problem(build(trials, aligned, rig), actual))
@@ -128,7 +128,7 @@ def _known(fits: Sequence[Fitted]) -> list[Fitted]:
     return sorted((f for f in fits if name_of(f.effects[0]) not in decoys()), key=lambda f: f.cost)
 
 
-def _insisted(
+def _aligned_all(
     trials: Sequence[Trial], failed: AlignedTrials, rig: Rig, actual: dict | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
     """Another alignment of trials that all `failed`, if most fit their task without one of the candidates.
@@ -136,7 +136,7 @@ def _insisted(
     Forces that a fault displaces may look like another task. Where no candidate helps, `failed` as it is; the
     second is a warning that says which one did.
     """
-    aligned = align(trials, failed.task, rig, insist=True)
+    aligned = align(trials, failed.task, rig, all_fit=True)
     for _ in range(ROUNDS):
         given = problem(build(trials, aligned, rig), actual)
         healthy = fit(given, Start((), neutral(given)))
@@ -148,7 +148,7 @@ def _insisted(
             if 2 * sum(t.segmentation.complete for t in again.trials) > len(trials):
                 why = failed.trials[0].segmentation.failed
                 return again, [f"{why}; without {name_of(f.effects[0])} it fits"]
-        aligned = realigned(trials, given, found[0], insist=True)
+        aligned = realigned(trials, given, found[0], all_fit=True)
     return failed, []
 
 

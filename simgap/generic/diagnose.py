@@ -22,7 +22,7 @@ from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles
 from simgap.generic.effects import CANDIDATES, Scene, scene
 from simgap.generic.features import layout, rows, windowed
-from simgap.generic.fit import Block, Fitted, blocks, fit
+from simgap.generic.fit import Block, EnsembleFit, blocks, fit
 from simgap.generic.locate import Located, locate
 from simgap.generic.report import effect_entry, listed_cells
 from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
@@ -48,8 +48,8 @@ class GenericDiagnosis:
     located: Located
     real: np.ndarray
     sim: np.ndarray
-    chosen: Fitted | None
-    leading: Fitted
+    chosen: EnsembleFit | None
+    leading: EnsembleFit
     ring: Ring | None
     warnings: tuple[str, ...]
 
@@ -117,7 +117,7 @@ def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Prog
     parts = blocks(given, real, sim)
     difference = real.mean(0) - sim.mean(0)
 
-    def fitted(effects: Sequence[str], base: Fitted | None = None) -> Fitted:
+    def fitted(effects: Sequence[str], base: EnsembleFit | None = None) -> EnsembleFit:
         return fit(given, parts, difference, numbers, effects, base)
 
     tell("fitting effects")
@@ -137,9 +137,9 @@ def _temperature(left: float, size: int) -> float:
     return max(TEMPERATURE, left / size)
 
 
-def _together(singles: list[Fitted], names: list[str], fitted, gap: bool) -> list[Fitted]:
+def _together(singles: list[EnsembleFit], names: list[str], fitted, gap: bool) -> list[EnsembleFit]:
     """Effects added one by one to the best so far, as long as each is worth it."""
-    out: list[Fitted] = []
+    out: list[EnsembleFit] = []
     size = singles[0].shift.size
     best = max(singles, key=lambda f: f.evidence(TEMPERATURE))
     while gap and len(best.effects) < MOST:
@@ -178,8 +178,8 @@ def _ring(given: Scene) -> Ring | None:
 
 def _conclude(
     given: Scene, parts: list[Block], located: Located, real: np.ndarray, sim: np.ndarray,
-    found: list[Fitted], ring: Ring | None, temperature: float, forced: bool, seed: int,
-    fitted: Callable[[Sequence[str]], Fitted],
+    found: list[EnsembleFit], ring: Ring | None, temperature: float, forced: bool, seed: int,
+    fitted: Callable[[Sequence[str]], EnsembleFit],
 ) -> GenericDiagnosis:  # fmt: skip
     """Verdict, probabilities, place, shrinkage and parameters from the fitted candidates."""
     lay, best = given.layout, found[0]
@@ -224,7 +224,7 @@ def _conclude(
 
 
 def _shares(
-    best: Fitted, fitted: Callable[[Sequence[str]], Fitted], seed: int
+    best: EnsembleFit, fitted: Callable[[Sequence[str]], EnsembleFit], seed: int
 ) -> dict[str, tuple[float, tuple[float, float]]]:
     """Each effect's share of the gap of all trials, and its 90 % interval."""
     without = [fitted([n for n in best.effects if n != out]).square for out in best.effects]

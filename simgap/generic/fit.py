@@ -61,7 +61,7 @@ class Slot:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class EnsembleFit:
     """A candidate fitted in every block: coordinates `u`, `jacobian` (n, p) of the whitened residual and
     `raw` (n, p) of the prediction, `shift` of all features (F,), chi-squares after and before."""
 
@@ -189,8 +189,8 @@ def at(given: Scene, block: Block, mine: Sequence[Slot], u: np.ndarray) -> np.nd
 
 def fit(
     given: Scene, parts: Sequence[Block], difference: np.ndarray, numbers: tuple[int, int],
-    effects: Sequence[str], base: Fitted | None = None,
-) -> Fitted:  # fmt: skip
+    effects: Sequence[str], base: EnsembleFit | None = None,
+) -> EnsembleFit:  # fmt: skip
     """Effects together fitted to the mean difference (F,) of `numbers` real and simulated trials.
 
     `base`: a fit of some of them, to start from.
@@ -212,7 +212,7 @@ def fit(
         z = np.linalg.solve(root, difference[block.index])
         before += float(z @ z)
     mine, u, jacobian, raw = (tuple(f[j] for f in found) for j in range(4))
-    return Fitted(effects, mine, u, jacobian, raw, shift, square, before)
+    return EnsembleFit(effects, mine, u, jacobian, raw, shift, square, before)
 
 
 def _block(given: Scene, block: Block, root: np.ndarray, difference: np.ndarray, mine: Sequence[Slot], known):

@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 
 from simgap.generic.effects import CANDIDATES, Scene
 from simgap.generic.features import Layout
-from simgap.generic.fit import Fitted
+from simgap.generic.fit import EnsembleFit
 from simgap.generic.locate import Located, both_variances, cell_means
 from simgap.generic.ringing import Ring
 
@@ -44,7 +44,7 @@ def listed_cells(layout: Layout, located: Located, real: np.ndarray, sim: np.nda
 
 
 def effect_entry(
-    given: Scene, found: Fitted, ring: Ring | None, temperature: float, score: float, num_trials: int
+    given: Scene, found: EnsembleFit, ring: Ring | None, temperature: float, score: float, num_trials: int
 ) -> dict[str, Any]:
     """Parameters with 90 % intervals (Student's t of the trials' degrees of freedom) and evidence."""
     reach = -float(stdtrit(max(num_trials - 2, 1), 0.05))

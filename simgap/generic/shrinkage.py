@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simgap.generic.effects import Scene
-from simgap.generic.fit import Block, Fitted, at
+from simgap.generic.fit import Block, EnsembleFit, at
 from simgap.generic.locate import both_variances, cell_means
 
 RESAMPLES = 1000  # numerics: of a bootstrap
@@ -33,7 +33,7 @@ class Heldout:
 
 
 def heldout(
-    given: Scene, parts: Sequence[Block], real: np.ndarray, sim: np.ndarray, found: Fitted
+    given: Scene, parts: Sequence[Block], real: np.ndarray, sim: np.ndarray, found: EnsembleFit
 ) -> Heldout:
     """Squares of every real trial predicted from the others (from the other subtasks where it is alone)."""
     layout, count = given.layout, len(real)
@@ -66,7 +66,7 @@ def heldout(
 
 
 def _shift(
-    given: Scene, parts, found: Fitted, difference: np.ndarray, numbers, kept: np.ndarray
+    given: Scene, parts, found: EnsembleFit, difference: np.ndarray, numbers, kept: np.ndarray
 ) -> np.ndarray:
     """Predicted shift of all features (F,) from a fit to the features `kept` of another difference."""
     out = np.zeros(difference.size)
