@@ -36,8 +36,8 @@ from estimation.moments import (
 from estimation.nuisance import Nuisance, PadDoubt, nuisances
 from estimation.observations import (
     CHANNELS,
-    Aligned,
     Noise,
+    WeighedTrial,
     free_forces,
     gravity_factor,
 )
@@ -97,7 +97,7 @@ class Design:
 
 
 def build(
-    trials: Sequence[Trial], aligned: Sequence[Aligned], noise: Noise, task: BlockTask, rig: Rig
+    trials: Sequence[Trial], aligned: Sequence[WeighedTrial], noise: Noise, task: BlockTask, rig: Rig
 ) -> Design:
     """Design of the given aligned trials."""
     moves = list(range(len(task.performed)))

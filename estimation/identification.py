@@ -11,7 +11,7 @@ import numpy as np
 from estimation.actual import Actual
 from estimation.design import Design, build
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.observations import Aligned, Noise, aligned_weights
+from estimation.observations import Noise, WeighedTrial, aligned_weights
 from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
@@ -46,7 +46,7 @@ class Identification(Tabled):
     task: BlockTask
     rig: Rig
     aligned: AlignedTrials
-    weighed: tuple[Aligned, ...]
+    weighed: tuple[WeighedTrial, ...]
     noise: Noise
     names: tuple[tuple[str, str], ...]
     draws: np.ndarray

@@ -10,8 +10,8 @@ from estimation.combinations import Terms
 from estimation.compliance import possible_share, shear_give, squeeze_give, unexpected_share, unit_pads
 from estimation.nuisance import PadDoubt
 from estimation.observations import (
-    Aligned,
     Noise,
+    WeighedTrial,
     channel_values,
     free_forces,
 )
@@ -23,7 +23,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, Rig
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
 
-def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+def observe(signals: Signals, aligned: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
     values = channel_values(signals, rig)
     out = []
@@ -34,7 +34,7 @@ def observe(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) 
     return np.moveaxis(np.array(out), 2, 0)
 
 
-def observe_slopes(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+def observe_slopes(signals: Signals, aligned: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where none."""
     values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
@@ -45,13 +45,15 @@ def observe_slopes(signals: Signals, aligned: Aligned, rig: Rig, moves: Sequence
     return out
 
 
-def slope_variances(aligned: Aligned, moves: Sequence[int]) -> np.ndarray:
+def slope_variances(aligned: WeighedTrial, moves: Sequence[int]) -> np.ndarray:
     """Variances (num_moves, len(SLOPES)) of the slopes, infinite of none."""
     found = [[aligned.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
     return np.array([[np.inf if s is None else s.variance for s in row] for row in found])
 
 
-def pad_doubt(slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[Aligned], rig: Rig) -> PadDoubt:
+def pad_doubt(
+    slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[WeighedTrial], rig: Rig
+) -> PadDoubt:
     """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, and usual forces.
 
     A share that several kinds of slope find is the largest of them.
@@ -75,7 +77,7 @@ def pad_doubt(slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[Aligne
     return PadDoubt(-found[DISTANCE], found[RISE], possible[DISTANCE], possible[RISE], *usual)
 
 
-def _usual(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
+def _usual(aligned: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:
     """Mean forces of one finger (num_moves,) along the grip, and in shear where the block is put down [N]."""
     s, grips = aligned.signals, aligned.weights.grips.values()
     along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
@@ -88,7 +90,7 @@ def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.nda
     return np.where(counts > 0, weights @ np.nan_to_num(values), np.nan)
 
 
-def sampling_variance(aligned: Aligned, noise: Noise, moves: Sequence[int]) -> np.ndarray:
+def sampling_variance(aligned: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
     """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
     out = []
     with np.errstate(divide="ignore"):
@@ -98,7 +100,7 @@ def sampling_variance(aligned: Aligned, noise: Noise, moves: Sequence[int]) -> n
     return np.moveaxis(np.array(out), 2, 0)
 
 
-def units(aligned: Sequence[Aligned], raw: np.ndarray, rig: Rig) -> np.ndarray:
+def units(aligned: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
     """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
 
     Of a rise at least the give under the weight, and what it changed by in landing: what a pad does on
@@ -121,7 +123,7 @@ def units(aligned: Sequence[Aligned], raw: np.ndarray, rig: Rig) -> np.ndarray:
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
 
 
-def free_means(aligned: Sequence[Aligned], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+def free_means(aligned: Sequence[WeighedTrial], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """Mean forces in free motion (num_trials, 4) and their variances."""
     mean = np.stack([free_forces(a.signals, a) for a in aligned])
     count = np.array([max(a.weights.free_count, 1.0) for a in aligned])

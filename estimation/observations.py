@@ -140,7 +140,7 @@ def robust_weights(
 
 
 @dataclass(frozen=True)
-class Aligned:
+class WeighedTrial:
     """One trial thinned for estimation: signals, drawn alignments' masks and mean weights."""
 
     signals: Signals
@@ -150,7 +150,7 @@ class Aligned:
 
 def aligned_weights(
     aligned: AlignedTrials, rng: np.random.Generator, num_alignments: int = NUM_ALIGNMENTS
-) -> tuple[list[Aligned], Noise]:
+) -> tuple[list[WeighedTrial], Noise]:
     """Weights of every grip's means for drawn alignments, and the noise of each channel."""
     steps, rig = aligned.subtasks, aligned.rig
     prepared, felt, touches = [], [], []  # felt: what the fingers press with is measured
@@ -209,11 +209,11 @@ def aligned_weights(
         if not squeezed:
             slopes = {m: {k: v for k, v in of.items() if k != "distance"} for m, of in slopes.items()}
         weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()), slopes)
-        out.append(Aligned(thinned, masks, weights))
+        out.append(WeighedTrial(thinned, masks, weights))
     return out, _noise(pooled, scales)
 
 
-def free_forces(signals: Signals, aligned: Aligned) -> np.ndarray:
+def free_forces(signals: Signals, aligned: WeighedTrial) -> np.ndarray:
     """Mean forces (4,) in free motion [N], where they ought to vanish."""
     force = np.stack([getattr(signals, name) for name in FORCE_CHANNELS])
     return (aligned.weights.free_robust * np.nan_to_num(force)).sum(axis=1)

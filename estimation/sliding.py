@@ -15,14 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from estimation.compliance import SLOPE_SD, UNSTATED, Slope, middle_share
-from estimation.observations import Aligned, Noise, channel_values
+from estimation.observations import Noise, WeighedTrial, channel_values
 from hmmseg.io.rig import Rig
 
 SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide
 WITNESSES = ("rise", "landing")
 
 
-def with_slides(aligned: Sequence[Aligned], noise: Noise, rig: Rig) -> list[Aligned]:
+def with_slides(aligned: Sequence[WeighedTrial], noise: Noise, rig: Rig) -> list[WeighedTrial]:
     """The trials with places counting for less where their blocks slid; others as they are.
 
     A landing in which a block slid is no witness of the pads any more.
@@ -47,7 +47,7 @@ def with_slides(aligned: Sequence[Aligned], noise: Noise, rig: Rig) -> list[Alig
     ]
 
 
-def _doubted(a: Aligned, reading: np.ndarray, common: float, variance: float) -> Aligned:
+def _doubted(a: WeighedTrial, reading: np.ndarray, common: float, variance: float) -> WeighedTrial:
     counts, slopes = dict(a.weights.counts), dict(a.weights.slopes)
     for move, of_move in a.weights.slopes.items():
         found = of_move.get("landing")

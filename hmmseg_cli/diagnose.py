@@ -243,9 +243,9 @@ def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
     if out.figures is None and out.report is None:
         return
     from hmmseg_cli.figures.gap_generic import draw_signal
-    from simgap.generic.effects import CANDIDATES
+    from simgap.generic.effects import EFFECTS
 
-    shows = {name: candidate.shows for name, candidate in CANDIDATES.items()}
+    shows = {name: candidate.shows for name, candidate in EFFECTS.items()}
     _show(out, found.body, files, task, lambda path: draw_signal(found, path), shows=shows)
 
 

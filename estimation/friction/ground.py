@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.observations import Aligned, gravity_factor
+from estimation.observations import WeighedTrial, gravity_factor
 from hmmseg.contact.decompose import ABOVE_GROUND, SLIDING, Subtask
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -36,7 +36,7 @@ class GroundFriction:
 
 
 def ground_friction(
-    aligned: Sequence[Aligned], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
+    aligned: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
     sd_force: float, rng: np.random.Generator, num_draws: int,
 ) -> GroundFriction | None:  # fmt: skip
     """Friction of a block on what it is slid on; None where it is not, or where that tells too little.
@@ -60,7 +60,7 @@ def ground_friction(
     return GroundFriction(support, draws) if draws.std() < WIDEST * draws.mean() else None
 
 
-def _rows(a: Aligned, step: Subtask, rig: Rig) -> np.ndarray:
+def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
     """Rows (num_samples, 3) of d fx [N], d a / g and fy [N] while the block surely slides."""
     s, free = a.signals, a.weights.free
     sliding = a.masks[:, step.index].all(axis=0) & np.isfinite(s.fx + s.fy + s.vx)
@@ -75,7 +75,7 @@ def _rows(a: Aligned, step: Subtask, rig: Rig) -> np.ndarray:
 
 
 def _carried(
-    aligned: Sequence[Aligned], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
+    aligned: Sequence[WeighedTrial], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
 ) -> tuple[float, float] | None:
     """Weight and its sd [N] as carries of the same block tell it; None where it is not carried."""
     moves = [s.move for s in steps if s.object == obj and s.state == ABOVE_GROUND and s.move is not None]

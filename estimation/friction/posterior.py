@@ -16,7 +16,7 @@ import numpy as np
 from estimation.friction.ground import GroundFriction, ground_friction
 from estimation.friction.ratio_bound import largest_ratio
 from estimation.friction.slip import SlipEvidence, Stretch, slip_evidence
-from estimation.observations import MIN_FREE, Aligned
+from estimation.observations import MIN_FREE, WeighedTrial
 from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask, subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -82,7 +82,7 @@ class _Held:
 
 
 def friction_posteriors(
-    aligned: Sequence[Aligned], task: BlockTask, rig: Rig, sd_force: float,
+    aligned: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
     rng: np.random.Generator, num_draws: int = 2000,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
     """Friction of every object of the task, all trials pooled, alignments marginalised.
@@ -112,7 +112,7 @@ def friction_posteriors(
     return out
 
 
-def _forces(a: Aligned, rig: Rig, finger: int, sd_force: float) -> _Forces:
+def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
     """Forces of one finger less their mean in free motion, where they ought to vanish.
 
     What free motion shows beyond the sensors' noise counts as noise (a cable that pulls).
@@ -152,7 +152,7 @@ def _ratio(forces: _Forces, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _held(
-    aligned: Sequence[Aligned], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str
+    aligned: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str
 ) -> _Held:
     moves = sorted({s.move for s in steps if s.object == obj and s.move is not None})
     ratios, sds, masks = [np.zeros(0)], [np.zeros(0)], []
@@ -171,7 +171,11 @@ def _held(
 
 
 def _stretches(
-    aligned: Sequence[Aligned], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str, rig: Rig
+    aligned: Sequence[WeighedTrial],
+    fingers: list[list[_Forces]],
+    steps: tuple[Subtask, ...],
+    obj: str,
+    rig: Rig,
 ) -> list[Stretch]:
     """Each finger on the resting block, samples that every alignment has there."""
     compliance = 1 / rig.fingertip.shear_stiffness

@@ -12,13 +12,13 @@ import numpy as np
 
 from hmmseg.hmm.chain import Chain, not_numbers
 from hmmseg.hmm.inference import smoothed_tables, table, viterbi
-from hmmseg.hmm.results import Alignment as Best
+from hmmseg.hmm.results import Alignment
 
 Bands = tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
-class Alignment:
+class AlignmentPosterior:
     """Posterior of one recording's alignment, as probabilities; fields as in hmmseg.hmm.results.Posterior.
 
     `path` (num_timesteps,) is the most probable one, `log_prob` its log weight.
@@ -33,7 +33,7 @@ class Alignment:
 
 def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.ndarray,
           log_skip: Bands = (), *, log_initial: np.ndarray | None = None,
-          log_final: np.ndarray | None = None) -> Alignment:  # fmt: skip
+          log_final: np.ndarray | None = None) -> AlignmentPosterior:  # fmt: skip
     """Viterbi path and posterior of one recording, of log likelihoods (num_timesteps, num_subtasks).
 
     Log weights to stay (num_timesteps - 1, num_subtasks), to advance (num_timesteps - 1, num_subtasks - 1),
@@ -48,13 +48,13 @@ def align(log_likelihoods: np.ndarray, log_stay: np.ndarray, log_advance: np.nda
     if missing.any():
         raise not_numbers(ll, int(missing.any(axis=1).argmax()))
     best = viterbi(ll, chain)
-    assert isinstance(best, Best)  # of one recording
-    return Alignment(best.path, best.log_prob, *smoothed_tables(ll, chain))
+    assert isinstance(best, Alignment)  # of one recording
+    return AlignmentPosterior(best.path, best.log_prob, *smoothed_tables(ll, chain))
 
 
 def align_many(log_likelihoods: Sequence[np.ndarray], bands: Sequence[Bands], *,
                log_initial: np.ndarray | None = None,
-               log_final: np.ndarray | None = None) -> list[Alignment]:  # fmt: skip
+               log_final: np.ndarray | None = None) -> list[AlignmentPosterior]:  # fmt: skip
     """`align` for several recordings; `bands` holds (log_stay, log_advance, further skips ...) of each."""
     return [
         align(ll, b[0], b[1], tuple(b[2:]), log_initial=log_initial, log_final=log_final)

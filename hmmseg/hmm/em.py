@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from hmmseg.hmm.alignment import Alignment, Bands, align_many
+from hmmseg.hmm.alignment import AlignmentPosterior, Bands, align_many
 
 S = TypeVar("S")
 
@@ -61,7 +61,7 @@ class Learned(Generic[E, D]):
 
     emission: E
     durations: D
-    alignments: tuple[Alignment, ...]
+    alignments: tuple[AlignmentPosterior, ...]
     num_iterations: int
     converged: bool
 
@@ -76,7 +76,7 @@ class Learned(Generic[E, D]):
         return [a.smoothed for a in self.alignments]
 
 
-def expectation(emission: Emission, durations: Durations, num_trials: int) -> tuple[Alignment, ...]:
+def expectation(emission: Emission, durations: Durations, num_trials: int) -> tuple[AlignmentPosterior, ...]:
     """Alignment posteriors of all trials; raises InfeasibleAlignment where a trial has no path."""
     initial, final = durations.ends
     tables = [emission.log_likelihoods(i) for i in range(num_trials)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
-from hmmseg.hmm.alignment import Alignment, Bands
+from hmmseg.hmm.alignment import AlignmentPosterior, Bands
 from hmmseg.hmm.em import em
 from hmmseg.levels import TAIL
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
@@ -24,7 +24,7 @@ class Fit:
     """Fitted emissions with the alignment posterior of every trial."""
 
     parameters: Parameters
-    posteriors: tuple[Alignment, ...]
+    posteriors: tuple[AlignmentPosterior, ...]
 
 
 def otsu(values: np.ndarray) -> float:

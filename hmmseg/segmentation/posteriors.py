@@ -9,7 +9,7 @@ import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask
 from hmmseg.hand.signals import Signals
-from hmmseg.hmm.alignment import Alignment
+from hmmseg.hmm.alignment import AlignmentPosterior
 from hmmseg.levels import DRIFTS
 from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
 from hmmseg.segmentation.changes import Change, Disagreement, Prior, moment
@@ -27,7 +27,7 @@ Touches = tuple[tuple[float, float], ...]
 
 def contact_changes(
     signals: Signals, thinned: Signals, sensing: Sensing, steps: tuple[Subtask, ...], parameters: Parameters,
-    posterior: Alignment,
+    posterior: AlignmentPosterior,
 ) -> list[Change | None]:  # fmt: skip
     """What one trial shows of each of its boundaries; None where its signals say nothing of it.
 
@@ -50,7 +50,7 @@ def contact_changes(
 
 def boundary_posteriors(
     changes: Sequence[Change | None], known: Mapping[tuple[Kind, int], Disagreement], t: np.ndarray,
-    posterior: Alignment, touches: Touches = (),
+    posterior: AlignmentPosterior, touches: Touches = (),
 ) -> tuple[BoundaryPosterior, ...]:  # fmt: skip
     """Posterior of each boundary of one trial, aligned at t (num_timesteps,) [s].
 

@@ -35,7 +35,7 @@ class FeatureMap:
 
 
 @dataclass(frozen=True)
-class Features:
+class SequenceFeatures:
     """One trial on the grid: `edges` (num_cells + 1,) [s]; `values` (num_cells, num_features)."""
 
     edges: np.ndarray
@@ -101,7 +101,9 @@ def feature_map(trials: Sequence[Trial], channels: Sequence[str]) -> FeatureMap:
     return FeatureMap(tuple(channels), step, window, center, np.where(scale > 0, scale, 1.0))
 
 
-def features(trial: Trial, mapping: FeatureMap) -> Features:
+def features(trial: Trial, mapping: FeatureMap) -> SequenceFeatures:
     """Standardised features of one trial; InputError where it lacks a channel."""
     edges, means = cell_means(trial, mapping.channels, mapping.step)
-    return Features(edges, (_raw(means, mapping.step, mapping.window) - mapping.center) / mapping.scale)
+    return SequenceFeatures(
+        edges, (_raw(means, mapping.step, mapping.window) - mapping.center) / mapping.scale
+    )

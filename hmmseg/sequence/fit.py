@@ -14,7 +14,7 @@ from hmmseg.sequence import misfit as sequence_misfit
 from hmmseg.sequence.courses import COARSE_CELLS, Course, coarse, find_courses
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions, from_weights
-from hmmseg.sequence.features import FeatureMap, Features, feature_map, features
+from hmmseg.sequence.features import FeatureMap, SequenceFeatures, feature_map, features
 from hmmseg.sequence.labels import Labels, choose_detectors, forbidden, labelled_path, read_labels, shares
 from hmmseg.sequence.learner import FLOORS, Learner
 from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states
@@ -62,7 +62,7 @@ def _channels(trials: Sequence[Trial], task: SequenceTask) -> tuple[str, ...]:
     return tuple(common)
 
 
-def _fit_unlabelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
+def _fit_unlabelled(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap,
                     boundaries: list[np.ndarray]) -> SequenceModel:  # fmt: skip
     """All courses of the trials with what their changes may be, given what few labels there are."""
     values, num_states = [each.values for each in data], len(task.sequence)
@@ -103,7 +103,7 @@ def _fine(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndar
     return [np.repeat(p, factor, axis=0)[: len(v)] for p, v in zip(course.probability, values, strict=True)]
 
 
-def _named(data: list[Features], boundaries: list[np.ndarray], course: Course, found: Naming,
+def _named(data: list[SequenceFeatures], boundaries: list[np.ndarray], course: Course, found: Naming,
            probability: float, factor: int) -> NamedCourse:  # fmt: skip
     """A course on the fine grid, and what labels say of how far boundaries lie off its changes."""
     number = len(course.cost) - 1
@@ -122,7 +122,7 @@ def _named(data: list[Features], boundaries: list[np.ndarray], course: Course, f
     return NamedCourse(probability, emissions, mean_cells, found.probability, shift)
 
 
-def _fit_labelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
+def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap,
                   boundaries: list[np.ndarray]) -> SequenceModel:  # fmt: skip
     with_labels = [i for i, b in enumerate(boundaries) if np.isfinite(b).all()]
     known = [labelled_path(d, b) if np.isfinite(b).all() else None
@@ -152,7 +152,7 @@ def _fit_labelled(data: list[Features], task: SequenceTask, mapping: FeatureMap,
     return _finish(data, task, mapping, learner, emissions, probability, detectors)
 
 
-def _finish(data: list[Features], task: SequenceTask, mapping: FeatureMap, learner: Learner,
+def _finish(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap, learner: Learner,
             emissions: StudentEmissions, probability: list[np.ndarray],
             detectors: Detectors | None) -> SequenceModel:  # fmt: skip
     """The model with what its own trials score, so that misfits can be told."""

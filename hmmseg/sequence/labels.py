@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import Alignment, align_many
+from hmmseg.hmm.alignment import AlignmentPosterior, align_many
 from hmmseg.hmm.results import crossings
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.detectors import Detectors, learn
 from hmmseg.sequence.emissions import from_weights
-from hmmseg.sequence.features import Features
+from hmmseg.sequence.features import SequenceFeatures
 from hmmseg.sequence.model import jumps
 from hmmseg.sequence.transitions import Transitions
 
@@ -91,18 +91,18 @@ def _by_subtask(given: Mapping[str, Any], where: str, task: SequenceTask) -> lis
     return [given.get(name) for name in names]
 
 
-def labelled_path(trial: Features, boundaries: np.ndarray) -> np.ndarray:
+def labelled_path(trial: SequenceFeatures, boundaries: np.ndarray) -> np.ndarray:
     """Path (num_cells,) of subtask numbers; a cell belongs to the subtask of its middle."""
     middle = (trial.edges[1:] + trial.edges[:-1]) / 2
     return np.searchsorted(boundaries, middle, side="right")
 
 
-def shares(trial: Features, boundaries: np.ndarray) -> np.ndarray:
+def shares(trial: SequenceFeatures, boundaries: np.ndarray) -> np.ndarray:
     """Boundaries [s] as shares of the trial."""
     return (boundaries - trial.edges[0]) / (trial.edges[-1] - trial.edges[0])
 
 
-def forbidden(trial: Features, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
+def forbidden(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
     """Log weights (num_cells, num_states) that keep labelled boundaries [s] to a cell; None without any.
 
     -inf where a label forbids a state, 0 elsewhere.
@@ -182,7 +182,7 @@ def shown(cells: np.ndarray) -> np.ndarray:
     return np.where(np.r_[equal, False] | np.r_[False, equal], -1, cells)
 
 
-def _excess_scatter(alignment: Alignment, cells: np.ndarray) -> np.ndarray:
+def _excess_scatter(alignment: AlignmentPosterior, cells: np.ndarray) -> np.ndarray:
     """Squared difference of each label from its posterior mean, less the variance [cells^2]."""
     crossing = boundary_probabilities(alignment)
     index = np.arange(len(crossing))[:, None]
@@ -190,7 +190,7 @@ def _excess_scatter(alignment: Alignment, cells: np.ndarray) -> np.ndarray:
     return (mean - cells) ** 2 - (crossing * (index - mean) ** 2).sum(0)
 
 
-def _log_probability(alignment: Alignment, cells: np.ndarray) -> float:
+def _log_probability(alignment: AlignmentPosterior, cells: np.ndarray) -> float:
     """Mean log posterior probability that each boundary is within one cell of its label."""
     crossing = boundary_probabilities(alignment)
     total = 0.0
@@ -199,6 +199,6 @@ def _log_probability(alignment: Alignment, cells: np.ndarray) -> float:
     return total / len(cells)
 
 
-def boundary_probabilities(alignment: Alignment) -> np.ndarray:
+def boundary_probabilities(alignment: AlignmentPosterior) -> np.ndarray:
     """Probability (num_cells - 1, num_states - 1) that subtasks up to k end at each cell edge."""
     return crossings(alignment.moves)

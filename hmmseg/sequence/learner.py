@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.hmm.alignment import Alignment, Bands
+from hmmseg.hmm.alignment import AlignmentPosterior, Bands
 from hmmseg.hmm.em import em, expectation
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import (
@@ -59,7 +59,7 @@ class Learner:
 
     def align(
         self, emissions: StudentEmissions, law: Transitions, detectors: Detectors | None = None
-    ) -> tuple[Alignment, ...]:
+    ) -> tuple[AlignmentPosterior, ...]:
         """Alignments of all trials, in which no state is where labels forbid it."""
         states = _Emission(self, detectors, emissions, 0.0)
         return expectation(states, _Durations(self, detectors, law), len(self.values))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.hmm import dense as ergodic
-from hmmseg.hmm.alignment import Alignment
+from hmmseg.hmm.alignment import AlignmentPosterior
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
 
@@ -23,7 +23,7 @@ MEASURABLE = 20.0  # chosen: cells a subtask usually lasts, for two cells to be 
 SQUEEZED = 0.03  # chosen: of the typical duration
 
 
-def scores(log_likelihoods: np.ndarray, mean_cells: np.ndarray, alignment: Alignment) -> np.ndarray:
+def scores(log_likelihoods: np.ndarray, mean_cells: np.ndarray, alignment: AlignmentPosterior) -> np.ndarray:
     """(2,): log evidence of free switching over forced order [nats], minus log evidence per cell."""
     return np.array([
         ergodic.log_evidence(*_free(log_likelihoods, mean_cells)) - alignment.log_evidence,
@@ -45,7 +45,7 @@ def reference(per_trial: Sequence[np.ndarray]) -> np.ndarray:
 
 def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.ndarray, usual: np.ndarray,
                  log_likelihoods: np.ndarray, mean_cells: np.ndarray,
-                 alignment: Alignment) -> Failure | None:  # fmt: skip
+                 alignment: AlignmentPosterior) -> Failure | None:  # fmt: skip
     """The first subtask at which the trial leaves its task; None where it fits.
 
     `usual` (2, 2): what `reference` gave of the trials learned from.

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import Alignment, Bands, align_many
+from hmmseg.hmm.alignment import AlignmentPosterior, Bands, align_many
 from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import StudentEmissions
-from hmmseg.sequence.features import FeatureMap, Features
+from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.sequence.transitions import Transitions, transitions
 from hmmseg.tables import Tabled
 
@@ -55,7 +55,7 @@ class SequenceModel(Tabled):
         """Transitions between neighbouring cells, without boundary detectors."""
         return transitions(self.mean_cells, self.presence, optional_states(self.task, self.settled))
 
-    def weights(self, trial: Features) -> tuple[np.ndarray, Bands]:
+    def weights(self, trial: SequenceFeatures) -> tuple[np.ndarray, Bands]:
         """Log-likelihoods (num_cells, num_states) and transition bands of one trial."""
         return weights(trial.values, self.emissions, self.detectors, self.transitions.bands)
 
@@ -73,7 +73,7 @@ class SequenceModel(Tabled):
             table.add_row(name, lasts, there, surely[k] if k < len(surely) else "")
         return [table]
 
-    def without_templates(self, trial: Features) -> SequenceModel:
+    def without_templates(self, trial: SequenceFeatures) -> SequenceModel:
         """The model that tells whether a trial fits: templates have no counterpart in free switching; where
         no labels taught it, with evidence coarsened (hmmseg.sequence.naming)."""
         if self.detectors is not None:
@@ -82,7 +82,7 @@ class SequenceModel(Tabled):
         coarsened = temper * INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
         return replace(self, emissions=replace(self.emissions, temper=coarsened))
 
-    def align(self, trials: list[Features]) -> list[Alignment]:
+    def align(self, trials: list[SequenceFeatures]) -> list[AlignmentPosterior]:
         """Posterior alignments; InfeasibleAlignment for a trial with fewer cells than subtasks."""
         parts = [self.weights(trial) for trial in trials]
         law = self.transitions
@@ -105,7 +105,7 @@ class NamedCourse:
     naming: np.ndarray
     shift: np.ndarray
 
-    def align(self, trial: Features) -> Alignment:
+    def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
         """Posterior alignment; InfeasibleAlignment for a trial with fewer cells than stretches."""
         count = len(self.mean_cells)
         law = transitions(self.mean_cells, np.ones(count), [False] * count)

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import Alignment
+from hmmseg.hmm.alignment import AlignmentPosterior
 from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Place, Question, Segmentation, Span
 from hmmseg.sequence import misfit as sequence_misfit
-from hmmseg.sequence.features import Features, features
+from hmmseg.sequence.features import SequenceFeatures, features
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.labels import boundary_probabilities
 from hmmseg.sequence.model import SequenceModel, optional_states
@@ -41,7 +41,7 @@ def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
     return [_segment(trial, features(trial, model.mapping), model) for trial in trials]
 
 
-def _segment(trial: Trial, data: Features, model: SequenceModel) -> Segmentation:
+def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segmentation:
     names = model.task.sequence
     try:
         alignment = model.align([data])[0]
@@ -58,7 +58,7 @@ def _segment(trial: Trial, data: Features, model: SequenceModel) -> Segmentation
                         _failure(data, model), recorded=trial, question=question)  # fmt: skip
 
 
-def _posterior(data: Features, model: SequenceModel, alignment: Alignment) -> Boundaries:
+def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior) -> Boundaries:
     """Of all boundaries: from the model itself where labels taught it, else from all its courses."""
     if not model.courses:
         crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1]
@@ -70,7 +70,7 @@ def _posterior(data: Features, model: SequenceModel, alignment: Alignment) -> Bo
     return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
 
 
-def _failure(data: Features, model: SequenceModel) -> Failure | None:
+def _failure(data: SequenceFeatures, model: SequenceModel) -> Failure | None:
     plain = model.without_templates(data)
     return sequence_misfit.find_failure(
         model.task.sequence, optional_states(model.task, False), model.typical, model.usual_scores,
@@ -78,7 +78,7 @@ def _failure(data: Features, model: SequenceModel) -> Failure | None:
     )  # fmt: skip
 
 
-def _spans(trial: Trial, data: Features, model: SequenceModel, alignment: Alignment,
+def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior,
            known: Boundaries) -> tuple[Span, ...]:  # fmt: skip
     """Spans where the model itself has them, as uncertain as all courses together."""
     names = model.task.sequence
@@ -103,7 +103,7 @@ def _spans(trial: Trial, data: Features, model: SequenceModel, alignment: Alignm
     )
 
 
-def _visit_probabilities(alignment: Alignment) -> np.ndarray:
+def _visit_probabilities(alignment: AlignmentPosterior) -> np.ndarray:
     """Probability (num_states,) that a path enters or starts in each state."""
     visited = alignment.smoothed[0].copy()
     for d, band in enumerate(alignment.moves, 1):

@@ -20,7 +20,7 @@ from simgap.attribution.shares import Shares
 from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles
-from simgap.generic.effects import CANDIDATES, Scene, scene
+from simgap.generic.effects import EFFECTS, Scene, scene
 from simgap.generic.features import layout, rows, windowed
 from simgap.generic.fit import Block, EnsembleFit, blocks, fit
 from simgap.generic.locate import Located, locate
@@ -93,9 +93,9 @@ def diagnose_blocks(
 
 def _check(forced: Sequence[str]) -> None:
     for name in forced:
-        if name not in CANDIDATES:
+        if name not in EFFECTS:
             raise InputError(f"effect {name!r}", "needs the virtual model or is unknown",
-                             nearest(name, list(CANDIDATES)))  # fmt: skip
+                             nearest(name, list(EFFECTS)))  # fmt: skip
 
 
 def detect(ensembles: Ensembles, seed: int = 0) -> tuple[Located, bool]:
@@ -121,7 +121,7 @@ def diagnosed(ensembles: Ensembles, forced: Sequence[str], seed: int, tell: Prog
         return fit(given, parts, difference, numbers, effects, base)
 
     tell("fitting effects")
-    names = [n for n in CANDIDATES if CANDIDATES[n].each != "event" or ring is not None]
+    names = [n for n in EFFECTS if EFFECTS[n].each != "event" or ring is not None]
     if forced:
         found = [fitted(tuple(dict.fromkeys(forced)))]
     else:

@@ -50,8 +50,8 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """An effect: `kinds` of its parameters, one of each a channel (`each` = "channel"), one a channel
+class Change:
+    """An effect on given trials: `kinds` of its parameters, one of each a channel (`each` = "channel"), one a channel
     and event ("event": an oscillation's sine and cosine), or one a subtask ("subtask": of durations)."""
 
     name: str
@@ -61,25 +61,25 @@ class Candidate:
     each: str = "channel"
 
 
-CANDIDATES = {
+EFFECTS = {
     c.name: c
     for c in (
-        Candidate("force_bias", "recorded = simulated + b", "the slow course of every subtask alike",
+        Change("force_bias", "recorded = simulated + b", "the slow course of every subtask alike",
                   (Kind("bias", "", 0.5, "scale"),)),
-        Candidate("force_gain", "recorded = (1 + g) simulated", "course and fluctuation, in proportion",
+        Change("force_gain", "recorded = (1 + g) simulated", "course and fluctuation, in proportion",
                   (Kind("gain", "1", 0.3, low=-0.5 / 0.3, high=1 / 0.3),)),
-        Candidate("force_drift", "recorded = simulated + c t", "a ramp over the whole task",
+        Change("force_drift", "recorded = simulated + c t", "a ramp over the whole task",
                   (Kind("slope", "/s", 0.5, "rate"),)),
-        Candidate("force_lag", "recorded = simulated(t - delay)", "every change of the course, late",
+        Change("force_lag", "recorded = simulated(t - delay)", "every change of the course, late",
                   (Kind("delay", "s", 0.1, starts=(0.3, 1.0, 3.0), low=0.0, high=5.0),)),
-        Candidate("force_lowpass", "tau recorded' + recorded = simulated", "rounded changes, fast power gone",
+        Change("force_lowpass", "tau recorded' + recorded = simulated", "rounded changes, fast power gone",
                   (Kind("time_constant", "s", 0.1, starts=(0.1, 0.5, 2.0), low=0.0, high=5.0),)),
-        Candidate("structural_vibration", "a damped mode rung at the start of a subtask",
+        Change("structural_vibration", "a damped mode rung at the start of a subtask",
                   "power about one frequency", (Kind("sin", "", 0.2, "scale", (0.3, 0.0, -0.3, 0.0)),
                    Kind("cos", "", 0.2, "scale", (0.0, 0.3, 0.0, -0.3))), "event"),
-        Candidate("noise_level", "white noise added (less, if negative)", "power at all frequencies alike",
+        Change("noise_level", "white noise added (less, if negative)", "power at all frequencies alike",
                   (Kind("sd", "", 0.05, "scale", (0.05, 0.5, -0.05)),)),
-        Candidate("timing", "durations of subtasks multiplied", "durations alone",
+        Change("timing", "durations of subtasks multiplied", "durations alone",
                   (Kind("log_ratio", "1", 0.5),), "subtask"),
     )
 }  # fmt: skip

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simgap.generic.effects import (
-    CANDIDATES,
+    EFFECTS,
     Kind,
     Scene,
     channel_features,
@@ -157,7 +157,7 @@ def slots(given: Scene, effects: Sequence[str], channel: int) -> tuple[Slot, ...
     """Parameters that the effects have in a channel, or of durations (-1)."""
     out, count = [], len(given.layout.ensembles.subtasks)
     for name in effects:
-        candidate = CANDIDATES[name]
+        candidate = EFFECTS[name]
         if (candidate.each == "subtask") != (channel < 0):
             continue
         places = {"channel": [-1], "event": range(1, count), "subtask": range(count)}[candidate.each]
@@ -180,7 +180,7 @@ def at(given: Scene, block: Block, mine: Sequence[Slot], u: np.ndarray) -> np.nd
         return out
     values, ring = {}, np.zeros((len(given.layout.ensembles.subtasks), 2))
     for slot, value in zip(mine, u, strict=True):
-        if CANDIDATES[slot.effect].each == "event":
+        if EFFECTS[slot.effect].each == "event":
             ring[slot.place, int(slot.kind.name == "cos")] = slot.sd * value
         else:
             values[slot.kind.name] = slot.sd * value

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from simgap.generic.effects import CANDIDATES, Scene
+from simgap.generic.effects import EFFECTS, Scene
 from simgap.generic.features import Layout
 from simgap.generic.fit import EnsembleFit
 from simgap.generic.locate import Located, both_variances, cell_means
@@ -56,7 +56,7 @@ def effect_entry(
         for slot, value, sd in zip(mine, u, np.sqrt(np.diag(covariance)), strict=True):
             mean, spread = slot.sd * float(value), slot.sd * float(sd)
             prefix = f"{slot.effect}." if len(found.effects) > 1 else ""
-            each = CANDIDATES[slot.effect].each
+            each = EFFECTS[slot.effect].each
             if each == "event":
                 ringing = prefix
                 rings.setdefault((given.layout.ensembles.channels[k], slot.place), []).append((mean, spread))

@@ -9,7 +9,7 @@ import pytest
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.friction.ratio_bound import largest_ratio
 from estimation.friction.slip import Stretch, slip_evidence
-from estimation.observations import Aligned, Weights, subtask_masks
+from estimation.observations import WeighedTrial, Weights, subtask_masks
 from hmmseg.contact.decompose import FREE, subtasks
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Fingertip, Rig, Systematic, read_rig
@@ -25,7 +25,7 @@ BOTH = parse_task({"objects": {"cup": {"on": "ground"}}, "moves": [SLIDE, {"obje
 DURATION, RATE = 1.0, 20.0  # s of each subtask, samples per second
 
 
-def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> Aligned:
+def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> WeighedTrial:
     """A trial whose alignments are given: boundaries (num_alignments, num_subtasks - 1) [s].
 
     Weights are plain means, as far as friction uses them.
@@ -41,13 +41,13 @@ def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> Aligne
             counts[s.move] = {"force": inside.sum(axis=1)}
     uniform = free / max(free.sum(), 1)
     weights = Weights(grips, counts, uniform, np.tile(uniform, (4, 1)), float(free.sum()))
-    return Aligned(signals, masks, weights)
+    return WeighedTrial(signals, masks, weights)
 
 
 def planted(
     task: BlockTask, ratio: np.ndarray, rng: np.random.Generator, *, normal: float = 1.5, bias: float = 0.0,
     slip: np.ndarray | None = None,
-) -> Aligned:  # fmt: skip
+) -> WeighedTrial:  # fmt: skip
     """A trial with true ratios (num_timesteps,) while held; `slip` [m] moves the anchors."""
     steps = subtasks(task)
     boundaries = DURATION * np.arange(1, len(steps))[None]

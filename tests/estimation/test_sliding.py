@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.landing import landing
-from estimation.observations import Aligned, Noise, Weights
+from estimation.observations import Noise, WeighedTrial, Weights
 from estimation.sliding import with_slides
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig, Systematic
@@ -33,7 +33,7 @@ def trial(seed=0, count=50.0, **others):
         {0: {"place": place_of(t)[None]}}, {0: {"place": np.array([count])}}, 0 * t, np.zeros((4, t.size)),
         0.0, {0: {"landing": found}},
     )  # fmt: skip
-    return Aligned(signals, np.ones((1, 1, t.size), bool), weights)
+    return WeighedTrial(signals, np.ones((1, 1, t.size), bool), weights)
 
 
 def uncertain(a):

@@ -13,7 +13,7 @@ from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from simgap.generic.aligned import align
 from simgap.generic.diagnose import detect, diagnose
-from simgap.generic.effects import CANDIDATES, predicted, ring_waves, scene, smoothed
+from simgap.generic.effects import EFFECTS, predicted, ring_waves, scene, smoothed
 from simgap.generic.features import FAST, SLOW, _sub_bands, bin_edges, layout, means, rows, transformed
 from simgap.generic.ringing import fit_ring, from_swing
 
@@ -210,7 +210,7 @@ def test_rates_may_differ():
 
 
 def test_every_candidate_says_what_it_does():
-    for name, candidate in CANDIDATES.items():
+    for name, candidate in EFFECTS.items():
         assert candidate.name == name and candidate.says and candidate.shows and candidate.kinds
 
 
