@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.levels import MOVED
 from hmmseg.online.densities import log_between, log_broad, log_rising, log_student, log_sum
 from hmmseg.online.layout import (
     AY,
@@ -237,9 +238,10 @@ def supported(h, kind, block, x, spans, pads, levels):
         resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same)
     if levels and h[LEVEL + 1] > 0.0:
         spread = x[SD_Y] * x[SD_Y] + scale2(h, LEVEL_SCALE) + 1.0 / h[LEVEL + 1]
-        level = log_student(held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1], spread)
+        risen = held_height(h, x, pads) - h[LEVEL] / h[LEVEL + 1]
+        level = log_student(risen, spread)
         resting, upward = resting + level, upward + level
-        broad += log_broad(x[Y], spans[SPAN_Y])
+        broad += log_student(risen, MOVED * MOVED)
     else:
         force += log_broad(x[Y], spans[SPAN_Y])
         resting += log_broad(x[Y], spans[SPAN_Y])

@@ -27,7 +27,7 @@ from scipy.special import gammaln
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force
-from hmmseg.levels import TAIL
+from hmmseg.levels import MOVED, TAIL
 
 SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
@@ -276,6 +276,7 @@ def _log_gripped(
     if level is None:  # where it rests is not known
         out += _broad(f, "y")
     else:
-        upward += log_student(f.block_y(p.bias) - level, np.hypot(f.sd_y, scale["level"]))
-        broad_up = broad_up + _broad(f, "y")
+        risen = f.block_y(p.bias) - level
+        upward += log_student(risen, np.hypot(f.sd_y, scale["level"]))
+        broad_up = broad_up + log_student(risen, MOVED)  # what bounces or slips stays near
     return out + _log_resting(aside, upward, _broad(f, "vx"), broad_up, stray)

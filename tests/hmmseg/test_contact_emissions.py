@@ -10,6 +10,7 @@ from scipy.integrate import quad
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.contact.equations import Pads
 from hmmseg.io.task import BlockTask, Move
+from hmmseg.levels import MOVED
 from hmmseg.segmentation.emissions import (
     RUNG,
     STRAY,
@@ -157,7 +158,8 @@ def test_one_missing_channel_leaves_the_others():
     close, broad = stats.t.pdf(f.vx, TAIL, scale=spread), 1 / f.span["vx"]
     off = f.block_y(PARAMETERS.bias) - PARAMETERS.levels[0][1]
     level = stats.t.pdf(off, TAIL, scale=np.hypot(3e-5, PARAMETERS.scale["level"]))
-    rest, astray = stats.t.pdf(f.vy, TAIL, scale=spread) * level, 1 / (f.span["vy"] * f.span["y"])
+    near = stats.t.pdf(off, TAIL, scale=MOVED)
+    rest, astray = stats.t.pdf(f.vy, TAIL, scale=spread) * level, near / f.span["vy"]
     with_it = ((1 - 2 * STRAY) * close + STRAY * broad) * rest + STRAY * broad * astray
     expected = np.log(with_it / ((1 - STRAY) * rest + STRAY * astray))
     np.testing.assert_allclose(difference, expected, rtol=1e-9)
@@ -197,3 +199,13 @@ def test_an_unknown_state_is_refused():
     other = replace(step(FREE)[0], state="in-orbit", object="block")
     with pytest.raises(ValueError, match="no emission for the contact state 'in-orbit'"):
         log_likelihoods(features(2), (other,), PARAMETERS, 0)
+
+
+def test_what_strays_on_its_support_stays_near_it():
+    """A bounce or a slip by 3 mm may be; a rise by 25 mm is neither, however its forces ring."""
+    ring = PARAMETERS.bias + np.array([2.0, -0.05, -2.0, -0.05])
+    off = np.array([0.003, 0.025])
+    moving = features(2, force=ring, d=0.019, y=0.01 - 0.1 * 2e-4 + off, vy=0.1)
+    near, far = score(moving, ON_GROUND)
+    assert near - far == pytest.approx(np.diff(stats.t.logpdf(off[::-1], TAIL, scale=MOVED))[0], rel=1e-4)
+    assert near - far > 6
