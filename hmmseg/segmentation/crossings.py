@@ -74,9 +74,13 @@ class Contacts:
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
-        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
+        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other.
+
+        Of two touches the later comes when both are the block's width apart, wherever the first has pushed
+        the block meanwhile: both fingers are halfway to each other then.
+        """
         inward, rate, sd_inward = self.inward[i], self.inward_rate[:, i], self.sd["inward"]
-        if rests:
+        if rests and not making:
             moved, moving = self._pushed(1 - i, held)
             inward, rate, sd_inward = inward + moved, rate + moving, np.sqrt(2.0) * sd_inward
         else:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from experiments.bank import nominal, simulated_cases
+from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.recordings import read_case
+from experiments.sweeps.trials import scene
 from hmmseg.io.rig import Fingertip, Noise, Rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
@@ -117,3 +119,14 @@ def test_one_object_picked_and_placed():
     segmentation = segment([s.trial], task, rig)[0]
     starts = np.array([span.start for span in segmentation.spans[1:]])
     assert np.abs(starts - s.boundaries).max() < NEAR
+
+
+def test_the_later_of_two_touches_is_dated_wherever_the_first_has_pushed_the_block():
+    """At 20 Hz with a finger up to 100 ms late, where the block then stands tells 6 ms in the median."""
+    _, task = scene()
+    off = []
+    for judged in trials_of(WORLDS["late finger"], range(78100, 78108)):
+        (found,) = segment([judged.trial], task, judged.rig)
+        touches = found.spans[1::4]
+        off += [span.start - t for span, t in zip(touches, judged.boundaries[::4], strict=False)]
+    assert np.median(np.abs(off)) < 3e-3 and np.abs(off).max() < 0.02
