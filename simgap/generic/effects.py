@@ -51,8 +51,8 @@ class Kind:
 
 @dataclass(frozen=True)
 class Change:
-    """An effect on given trials: `kinds` of its parameters, one of each a channel (`each` = "channel"), one a channel
-    and event ("event": an oscillation's sine and cosine), or one a subtask ("subtask": of durations)."""
+    """An effect on given trials: `kinds` of its parameters, one of each a channel (`each` = "channel"), one a
+    channel and event ("event": an oscillation's sine and cosine), or one a subtask ("subtask": durations)."""
 
     name: str
     says: str
