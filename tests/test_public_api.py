@@ -88,6 +88,9 @@ def test_readers_take_paths_tables_and_arrays():
     for trial in trials[1:]:
         np.testing.assert_array_equal(trial.channels["fx1"], trials[0].channels["fx1"])
     assert Trial.read(trials[0], rig) is trials[0]
+    row = next(line for line in repr(trials[0]).splitlines() if " fx1 " in line).split("│")
+    assert float(row[3]) == pytest.approx(frame["fx1"].min(), rel=1e-3)
+    assert f"{len(frame)} samples at 20 Hz" in repr(trials[0])
     spans = [segment(source, task, rig)[0].spans for source in (frame, arrays)]
     assert spans[0] == spans[1]
 

@@ -17,6 +17,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, si_factor
+from hmmseg.tables import Tabled
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
@@ -27,8 +28,8 @@ MIN_SAMPLES = 8  # limit: fewer show no task
 MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
 
-@dataclass(frozen=True)
-class Trial:
+@dataclass(frozen=True, repr=False)
+class Trial(Tabled):
     """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
 
     `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
@@ -68,6 +69,20 @@ class Trial:
         hand = None if rig is None else Rig.read(rig)
         order = None if task is None else Task.read(task)
         return read_trial(source, hand, order if isinstance(order, SequenceTask) else None)
+
+    def tables(self) -> list[Any]:
+        """Its channels, with how many samples each lacks and how far it goes."""
+        from rich.table import Table as Shown
+
+        size = f"{self.t.size} samples at {self.rate:.4g} Hz, {self.t[0]:.4g} to {self.t[-1]:.4g} s"
+        table = Shown(title=f"{self.name}: {size}", title_justify="left")
+        for head in ("channel", "missing", "least", "most"):
+            table.add_column(head)
+        for name, values in self.channels.items():
+            there = values[np.isfinite(values)]
+            ends = (f"{there.min():.4g}", f"{there.max():.4g}") if there.size else ("", "")
+            table.add_row(name, str(values.size - there.size or ""), *ends)
+        return [table]
 
     @property
     def rate(self) -> float:

@@ -166,7 +166,7 @@ def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
 
 
 def known(
-    file: str, rate: float, shown: Iterable[Subtask], edges: Sequence[float],
+    file: str, rate: float, shown: Iterable[Subtask], edges: Iterable[float],
     failed: Failure | None = None, recorded: Any = None,
 ) -> Segmentation:  # fmt: skip
     """The subtasks `shown` between `edges` [s] (one more) that are known: without uncertainty or evidence."""
