@@ -2,7 +2,7 @@
 
     python -m experiments.stamps
 
-Figures in docs/figures that were drawn since the last commit, or say nothing yet, get this code's commit.
+Figures in docs/figures that were drawn since the last commit and came out otherwise get this code's commit.
 """
 
 from __future__ import annotations
@@ -31,19 +31,31 @@ def chunks(png: bytes) -> list[tuple[bytes, bytes]]:
     return found
 
 
-def stamped(data: bytes, commit: str) -> bytes:
-    """The picture with this commit in place of any other; ValueError if it is neither PNG nor GIF."""
-    text = KEY + commit.encode("ascii")
+def bare(data: bytes) -> bytes:
+    """The picture without a stamp; ValueError if it is neither PNG nor GIF."""
     if data.startswith(SIGNATURE):
-        kept = [chunk for chunk in chunks(data) if not (chunk[0] == b"tEXt" and chunk[1].startswith(KEY))]
-        kept.insert(len(kept) - 1, (b"tEXt", text))  # before the last, which ends the picture
-        return SIGNATURE + b"".join(
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-            for kind, body in kept
+        return _png(
+            [chunk for chunk in chunks(data) if not (chunk[0] == b"tEXt" and chunk[1].startswith(KEY))]
         )
     if data.startswith(b"GIF8"):
-        return COMMENT.sub(b";", data)[:-1] + b"!\xfe" + bytes([len(text)]) + text + b"\0;"
+        return COMMENT.sub(b";", data)
     raise ValueError("a picture that is neither PNG nor GIF")
+
+
+def stamped(data: bytes, commit: str) -> bytes:
+    """The picture with this commit in place of any other."""
+    plain, text = bare(data), KEY + commit.encode("ascii")
+    if plain.startswith(SIGNATURE):
+        *others, end = chunks(plain)
+        return _png([*others, (b"tEXt", text), end])
+    return plain[:-1] + b"!\xfe" + bytes([len(text)]) + text + b"\0;"
+
+
+def _png(found: list[tuple[bytes, bytes]]) -> bytes:
+    return SIGNATURE + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in found
+    )
 
 
 def stamp_of(data: bytes) -> str | None:
@@ -56,18 +68,25 @@ def stamp_of(data: bytes) -> str | None:
 
 
 def main() -> None:
-    """Stamp what was drawn."""
+    """Stamp what was drawn; what came out as it was keeps its stamp."""
     commit = commit_of()
     if commit is None:
         return
-    said = subprocess.run(["git", "-C", str(ROOT), "status", "--porcelain", "docs/figures"],
-                          check=True, capture_output=True, text=True).stdout  # fmt: skip
-    drawn = {Path(line[3:]).name for line in said.splitlines()}
     for path in sorted(FIGURES.iterdir()):
-        data = path.read_bytes()
-        if path.name in drawn or stamp_of(data) is None:
-            path.write_bytes(stamped(data, commit))
+        data, before = path.read_bytes(), _committed(path)
+        if data == before and stamp_of(data) is not None:
+            continue
+        same = before is not None and stamp_of(before) is not None and bare(before) == bare(data)
+        path.write_bytes(before if before is not None and same else stamped(data, commit))
+        if not same:
             print(f"{path.name}: {commit}")
+
+
+def _committed(path: Path) -> bytes | None:
+    """The figure as it was last committed; None of a new one."""
+    command = ["git", "-C", str(ROOT), "show", f"HEAD:{path.relative_to(ROOT)}"]
+    done = subprocess.run(command, capture_output=True)
+    return done.stdout if done.returncode == 0 else None
 
 
 if __name__ == "__main__":
