@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.segmentation.features import noise_sd
-from simgap.gap.unresolved import kinks, of_a_kink, pushed, speed_jumps
+from simgap.gap.unresolved import changes, kinks, of_a_kink, pushed, speed_jumps
 
 UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
 FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
 ROCKING = 0.1  # prior: a block that is pushed rocks: its sides rise by so much of how far it goes, sd
+FOAM = 2e-3  # prior: s; a pad's damping over its stiffness, as `simgap.world.scene` has it
 NUDGE = 1e-4  # prior: m; fingers that push unequally move a resting block by about as much
 
 
@@ -76,15 +77,22 @@ def residual_noise(one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndar
     return np.stack(columns, 1)
 
 
-def motion_doubt(s: Signals, one: dict[str, np.ndarray], step: float, group: int) -> np.ndarray:
+def motion_doubt(
+    s: Signals, one: dict[str, np.ndarray], step: float, group: int, pad: Fingertip
+) -> np.ndarray:
     """How far (N, C) residuals are off beyond noise where motion is not what equations take it for, sd.
 
     Fingers that push a block move it, and speeds that change within a sample, as that of a pressed fingertip
-    that is let go, no rule gives. Samples are means over `group` finer ones.
+    that is let go, no rule gives; while pads give way quickly, their damping bears a part of the force.
+    Samples are means over `group` finer ones.
     """
     root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))
     push = pushed(mean_of(s, "x"), one["x"] / root2)
     out[:, 0], out[:, 1], out[:, 3] = np.hypot(NUDGE, push), ROCKING * push, 2 * ROCKING * push
+    damped = FOAM / step * changes(np.stack([s.fx1, s.fy1, s.fx2, s.fy2], 1), one["force"])
+    normal, shear = damped[:, ::2] / pad.normal_stiffness, damped[:, 1::2] / pad.shear_stiffness
+    for channel, each in ((0, normal / 2), (1, shear / 2), (2, normal), (3, shear)):
+        out[:, channel] = np.hypot(out[:, channel], each.sum(axis=1))
     for channel, axis in ((4, "x"), (5, "y")):
         place, speed = (mean_of(s, name) for name in (axis, f"v{axis}"))
         jump = speed_jumps(place, one[axis] / root2, step, group)

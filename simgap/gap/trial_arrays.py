@@ -37,20 +37,20 @@ FIRST_TOUCH = 0.2  # chosen: s; one finger touches no earlier before the other, 
 
 
 def without_dropouts(trial: Trial) -> Trial:
-    """The trial with forces missing where all of them are nothing for one sample in the midst of a grip.
+    """The trial with forces missing where a finger's are nothing for one sample in the midst of a grip.
 
-    A block cannot be let go and gripped again from one sample to the next: the reading was lost.
+    No finger can let go and grip again from one sample to the next: the reading was lost. What the other
+    finger reads at that sample is as wrong where a simulator lost the contact.
     """
-    force = np.stack([trial.channels[c] for c in FORCE_CHANNELS], 1)
-    grip = np.minimum(force[:, 0], -force[:, 2])
-    before, here, after = grip[:-2], np.abs(force[1:-1]).max(1), grip[2:]
-    least = np.minimum(before, after)
-    lost = (here < LOST * least) & (np.maximum(before, after) < 2 * least)
+    force = np.stack([trial.channels[c] for c in FORCE_CHANNELS], 1).reshape(-1, 2, 2)
+    size, pressed = np.abs(force).max(axis=2), np.stack([force[:, 0, 0], -force[:, 1, 0]], 1)
+    least, most = np.minimum(pressed[:-2], pressed[2:]), np.maximum(pressed[:-2], pressed[2:])
+    held = ((least > 0) & (most < 2 * least)).all(axis=1)
+    lost = held & (size[1:-1] < LOST * least).any(axis=1)
     if not lost.any():
         return trial
-    gone = np.flatnonzero(lost) + 1
-    channels = {k: np.where(np.isin(np.arange(v.size), gone), np.nan, v) if k in FORCE_CHANNELS else v
-                for k, v in trial.channels.items()}  # fmt: skip
+    gone = np.pad(lost, 1)
+    channels = {k: np.where(gone, np.nan, v) if k in FORCE_CHANNELS else v for k, v in trial.channels.items()}
     return replace(trial, channels=channels)
 
 
@@ -98,7 +98,7 @@ def trial_arrays(
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
-    sd = np.hypot(plain, motion_doubt(signals, sample, step, group))
+    sd = np.hypot(plain, motion_doubt(signals, sample, step, group, rig.fingertip))
     sd[:, 6:] = np.hypot(sd[:, 6:], between_samples(t, force, phase == 0, edge & (phase == 2), boundaries))
     shaken = _shaken(signals, sample, force, phase == 2, subtask, step, group) / rig.gravity
     sd[:, 6:8] = np.hypot(sd[:, 6:8], shaken[:, None])

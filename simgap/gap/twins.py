@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
@@ -29,8 +30,11 @@ from simgap.gap.search import Search, search
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.wrist_gap import as_from_wrist, of_wrist
 from simgap.source_digest import source_digest
-from simgap.world.operator import OperatorSettings
+from simgap.world.operator import OperatorSettings, Plan
 from simgap.world.properties import Block
+from simgap.world.repetition import plan_again
+from simgap.world.sensors import noise_sd
+from simgap.world.simulate import simulate_plans
 
 MOST = 8  # numerics: twins at most
 BATCH = 4  # numerics: twins that are simulated at once
@@ -93,11 +97,23 @@ def _recorded(found: Search, task: BlockTask, rig: Rig, which: range, seed: int)
     hand = rig.model_copy(update={"rate": _rate(found.trials)})
     seeds = [seed + 7_000_000 + 1000 * k + j for k in which for j in range(trials)]
     task = found.problem.frame.task if task.repeat == "unknown" else task
-    simulated = performed(task, hand, [blocks] * len(seeds), seeds, {}, settings(found))
-    every = [recorded(s, task, hand, {}) for s in simulated]
+    every = [blocks] * len(seeds)
+    simulated = simulate_plans(task, hand, _plans(found, task, rig, blocks) * len(which), every, seeds)
+    if not all(np.isfinite(s.boundaries).all() for s in simulated):  # it drops blocks, or never reaches them
+        simulated = performed(task, hand, every, seeds, {}, settings(found))
+    twins = [recorded(s, task, hand, {}) for s in simulated]
     if of_wrist(found.trials):
-        every = [as_from_wrist(twin, found.trials[0]) for twin in every]
-    return [every[k : k + trials] for k in range(0, len(every), trials)]
+        twins = [as_from_wrist(twin, found.trials[0]) for twin in twins]
+    return [twins[k : k + trials] for k in range(0, len(twins), trials)]
+
+
+def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -> list[Plan]:
+    """Commands for the recorded motions of every trial."""
+    noise = noise_sd(rig, "force")
+    return [
+        plan_again(task_space(trial, rig), task, blocks, [s.start for s in a.segmentation.spans[1:]], noise)
+        for trial, a in zip(found.trials, found.aligned.trials, strict=True)
+    ]
 
 
 def blocks_of(found: Search) -> dict[str, Block]:

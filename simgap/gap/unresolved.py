@@ -22,8 +22,15 @@ def pushed(place: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
     The finger that touches first pushes the block for a while, and so does a hand that closes.
     """
-    step = np.pad(np.abs(np.nan_to_num(np.diff(place))), (1, 1))
-    return np.maximum(np.maximum(step[:-1], step[1:]) - MOVES * np.sqrt(2.0) * noise, 0.0)
+    return changes(place, noise)
+
+
+def changes(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """The larger change (N, ...) to either neighbour beyond what `noise` (N,) makes; none where missing."""
+    step = np.abs(np.nan_to_num(np.diff(values, axis=0)))
+    step = np.pad(step, [(1, 1), *[(0, 0)] * (values.ndim - 1)])
+    usual = MOVES * np.sqrt(2.0) * noise.reshape(-1, *[1] * (values.ndim - 1))
+    return np.maximum(np.maximum(step[:-1], step[1:]) - usual, 0.0)
 
 
 def speed_jumps(place: np.ndarray, noise: np.ndarray, step: float, group: int) -> np.ndarray:

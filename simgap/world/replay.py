@@ -72,7 +72,7 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     t = np.arange(signals.t[0], signals.t[-1] + CONTROL_PERIOD / 2, CONTROL_PERIOD)
     position, velocity = (z @ TO_TIPS.T for z in path.at(t))
     constants = physics(rig, [blocks[name] for name in task.objects], surroundings)
-    start = standing(constants, task, _places(signals, path, task, np.asarray(boundaries)))
+    start = standing(constants, task, places(signals, path, task, np.asarray(boundaries)))
     tips = _padded(position).reshape(-1, 2, 2)
     motion = rollout(constants, start, jnp.asarray(tips), jnp.asarray(_padded(velocity).reshape(-1, 2, 2)),
                      CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))  # fmt: skip
@@ -92,7 +92,7 @@ def finger_motion(signals: Signals) -> Motion:
                   pick(("sd_vx", "sd_vy", "sd_vx", "sd_vy")) * scale)  # fmt: skip
 
 
-def _places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:
+def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:
     """Where every block stands at first [m]: where it is first gripped, or first built upon."""
     x: dict[str, float] = {}
     moved: set[str] = set()
