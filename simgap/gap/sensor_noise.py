@@ -44,13 +44,17 @@ def sensor_sd(
     joints: np.ndarray, rates: np.ndarray, one: dict[str, np.ndarray], rig: Rig, group: int
 ) -> np.ndarray:
     """Noise (N, 3) of what was recorded, means over `group` samples: an angle [rad] (a coordinate [m] of a
-    Cartesian hand), its rate and a force [N]. `joints`, `rates` (N, 4); `one` of `sample_noise`."""
-    if not rig.jointed:
-        return np.stack([one["x"], one["vx"], one["force"]], 1)
+    Cartesian hand), its rate and a force [N]. `joints`, `rates` (N, 4); `one` of `sample_noise`.
+
+    Not more than the recording shows: means of speeds that a drive makes of its angles are quieter than what
+    is stated of one.
+    """
+    stated = (one["x"], one["vx"]) if not rig.jointed else (rig.noise.angle, rig.noise.velocity)
     out = np.empty((len(joints), 3))
-    for k, (stated, values) in enumerate(((rig.noise.angle, joints), (rig.noise.velocity, rates))):
-        learned = np.median([noise_sd(column) for column in values.T])
-        out[:, k] = learned if stated is None else stated / np.sqrt(group)
+    for k, (known, values) in enumerate(zip(stated, (joints, rates), strict=True)):
+        shown = float(np.median([noise_sd(column) for column in values.T]))
+        told = shown if known is None else known / (np.sqrt(group) if rig.jointed else 1.0)
+        out[:, k] = np.fmin(told, shown)
     out[:, 2] = one["force"]
     return np.nan_to_num(out)
 
