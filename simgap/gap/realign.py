@@ -28,7 +28,7 @@ def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, all_fit: b
         n = frame.lengths[r]
         names = [f"{kind}{axis}{i}" for kind in ("", "v", "f") for i in (1, 2) for axis in "xy"]
         columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
-        small, _ = thinned(trial)
+        small, _ = thinned(trial, rig)
         rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
     return align(trials, frame.task, _hand(rig, world), all_fit, rows)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
 from hmmseg.hand.grouping import group_size, grouped
+from hmmseg.hand.kinematics import forward, joint_velocity, tip_velocity
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial
@@ -45,7 +46,7 @@ def without_dropouts(trial: Trial) -> Trial:
     force = np.stack([trial.channels[c] for c in FORCE_CHANNELS], 1).reshape(-1, 2, 2)
     size, pressed = np.abs(force).max(axis=2), np.stack([force[:, 0, 0], -force[:, 1, 0]], 1)
     least, most = np.minimum(pressed[:-2], pressed[2:]), np.maximum(pressed[:-2], pressed[2:])
-    held = ((least > 0) & (most < 2 * least)).all(axis=1)
+    held = ((least > LOST * np.nanmax(pressed, initial=0.0)) & (most < 2 * least)).all(axis=1)
     lost = held & (size[1:-1] < LOST * least).any(axis=1)
     if not lost.any():
         return trial
@@ -54,10 +55,11 @@ def without_dropouts(trial: Trial) -> Trial:
     return replace(trial, channels=channels)
 
 
-def thinned(trial: Trial) -> tuple[Trial, int]:
+def thinned(trial: Trial, rig: Rig) -> tuple[Trial, int]:
     """The trial averaged down to MAX_RATE at most, and how many samples went into one.
 
-    Lost readings are left out.
+    Lost readings are left out. Angles and their rates are those of the tips' mean positions and velocities:
+    a finger that moves quickly is not where its mean angles are.
     """
     trial = without_dropouts(trial)
     group = group_size(trial.rate, MAX_RATE)
@@ -65,9 +67,29 @@ def thinned(trial: Trial) -> tuple[Trial, int]:
         return trial, 1
     inertia = None if trial.inertia is None else grouped(trial.inertia, group)[0]
     channels = {k: grouped(v, group)[0] for k, v in trial.channels.items()}
+    for number in (1, 2) if rig.jointed else ():
+        channels |= _of_mean_tip(trial, channels, rig.finger(number), number, group)
     return Trial(
         trial.file, grouped(trial.t, group)[0], channels, hidden=trial.hidden, inertia=inertia
     ), group
+
+
+def _of_mean_tip(
+    trial: Trial, means: dict[str, np.ndarray], finger: Finger, number: int, group: int
+) -> dict[str, np.ndarray]:
+    """Angles and rates of one finger at its tip's mean position and velocity, from their own `means`."""
+    names = [f"q{number}{k}" for k in (1, 2)]
+    rates = [f"d{name}" for name in names]
+
+    def of(channels: dict[str, np.ndarray], which: list[str]) -> np.ndarray:
+        return np.stack([channels[name] for name in which], 1)
+
+    every, angles = of(trial.channels, names), of(means, names)
+    place = grouped(forward(finger, every), group)[0]
+    angles = angles + joint_velocity(finger, angles, place - forward(finger, angles))
+    velocity = grouped(tip_velocity(finger, every, of(trial.channels, rates)), group)[0]
+    rate = joint_velocity(finger, angles, velocity)
+    return dict(zip(names + rates, np.concatenate([angles, rate], 1).T, strict=True))
 
 
 def boundary_quantiles(aligned: TrialAlignment) -> np.ndarray:
@@ -80,7 +102,7 @@ def trial_arrays(
     trial: Trial, quantiles: np.ndarray, steps: tuple[Subtask, ...], rig: Rig
 ) -> dict[str, np.ndarray]:
     """One trial's signals, states and noise, arrays over its samples."""
-    trial, group = thinned(trial)
+    trial, group = thinned(trial, rig)
     first, boundaries, last = quantiles
     signals = task_space(trial, rig)
     t, step = trial.t, np.median(np.diff(trial.t))
