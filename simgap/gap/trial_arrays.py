@@ -10,7 +10,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
 from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.kinematics import forward, joint_velocity, tip_velocity
 from hmmseg.hand.signals import Signals, task_space
-from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Finger, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.robust import bridged
