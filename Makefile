@@ -180,7 +180,7 @@ fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, i
 	PYTHONPATH=tests $(BIN)/python -m experiments.fuzz --cases 100000 --keep build/fuzz
 
 identified: $(INSTALLED)  ## properties and boundaries in labs drawn anew (build/drawn) and in folders of RECORDINGS
-	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 1124001 --fastest 200 --out build/drawn
+	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 1124771 --fastest 200 --out build/drawn
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --keep
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --pooled 1 --keep
 	$(BIN)/python -m experiments.write_tables

@@ -1,6 +1,6 @@
 """Do intervals hold wherever the tool is used? Properties and boundaries in worlds that differ, a row each.
 
-    python -m experiments.calibration_worlds [--rows NAME...] [--replicates 8] [--fresh]
+    python -m experiments.calibration_worlds [--rows NAME...] [--replicates 16] [--fresh]
 
 Every replicate has blocks, an operator's hand and noise of its own, from seeds that nothing was chosen on;
 worlds of one pace share performances, so that rows differ by their world alone. Resumable: a row that
@@ -36,7 +36,7 @@ from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "calibration_worlds.json"
-FIRST, REPLICATES = 91_000, 8
+FIRST, REPLICATES = 92_000, 16
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
 LEVELS = (0.68, 0.95)
 BIAS = 0.02  # N, what [systematic] admits where a row has biases
