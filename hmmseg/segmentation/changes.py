@@ -17,21 +17,13 @@ from scipy.special import ndtr
 
 from hmmseg.levels import SURE
 from hmmseg.segmentation.boundaries import (
-    ONSET,
     UNIFORM,
-    BoundaryPosterior,
-    blurred,
-    crossing_density,
-    first_of,
 )
-from hmmseg.segmentation.motions import POINTS, Crossing, Kind
+from hmmseg.segmentation.motions import Kind
 from hmmseg.segmentation.switching import Penetration, switch_probability
 
 LIKELY = 1e-3  # numerics: least probability of an interval within which the crossing is looked at
 SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another
-# prior: that a grip ends when its force is silent, when it slides, when it has opened
-VIEWS = (0.6, 0.2, 0.2)
-FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 DISCREPANCY, KNOWN = 1e-5, 2.0  # prior: m; usual discrepancy of foam, worth so many contacts
 
 
@@ -84,7 +76,7 @@ class Change:
     """Contacts made, or broken, at one boundary: of two, the last one made and the first one broken count.
 
     `timing` [s] is the uncertainty of the forces' own clock. `slips` [m]: at which penetration each contact
-    that is broken slides.
+    that is broken slides. `unmoved`: the contacts, had the block stood still where it rests later.
     """
 
     contacts: tuple[Penetration, ...]
@@ -93,6 +85,7 @@ class Change:
     kind: Kind
     timing: float
     slips: tuple[float, ...] = ()
+    unmoved: tuple[Penetration, ...] = ()
 
     @property
     def sort(self) -> tuple[Kind, int]:
@@ -122,11 +115,15 @@ def cut(change: Change) -> Change | None:
     if not near.size:
         return None
     index = index[near[0] : near[-1] + 2]
-    return replace(change, contacts=tuple(
-        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index],
-                ahead=None if c.ahead is None else c.ahead[index])
-        for c in change.contacts
-    ))  # fmt: skip
+
+    def near_it(contacts: Sequence[Penetration]) -> tuple[Penetration, ...]:
+        return tuple(
+            replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index],
+                    ahead=None if c.ahead is None else c.ahead[index])
+            for c in contacts
+        )  # fmt: skip
+
+    return replace(change, contacts=near_it(change.contacts), unmoved=near_it(change.unmoved))
 
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
@@ -163,13 +160,13 @@ def _discrepancy(changes: Sequence[Change]) -> float:
 def _abruptness(changes: Sequence[Change]) -> float:
     """Share of contacts that end before the position's way is spent: by maximum likelihood, and its prior."""
     z = np.array([
-        _inside(c, _last_pressed(c, n)) for change in changes if not change.making
+        inside(c, _last_pressed(c, n)) for change in changes if not change.making
         for c, n in zip(change.contacts, change.intervals, strict=True)
     ])  # fmt: skip
     z = z[np.isfinite(z)]
     share = UNIFORM
     for _ in range(ROUNDS):
-        share = (_abrupt(share, z).sum() + UNIFORM * SEEN) / (z.size + SEEN)
+        share = (abrupt(share, z).sum() + UNIFORM * SEEN) / (z.size + SEEN)
     return float(share)
 
 
@@ -191,7 +188,7 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
     return float(np.sqrt(1.0 + z2.size * excess / (z2.size + SEEN)))
 
 
-def _abrupt(share: float, z: np.ndarray | float) -> np.ndarray:
+def abrupt(share: float, z: np.ndarray | float) -> np.ndarray:
     """Probability that a contact ended abruptly whose place is z sds inside when its force is silent.
 
     A relaxed pad is then anywhere outside, of an abrupt end the place is as likely inside.
@@ -199,7 +196,7 @@ def _abrupt(share: float, z: np.ndarray | float) -> np.ndarray:
     return np.asarray(share / (share + (1 - share) * 2 * ndtr(-np.asarray(z))))
 
 
-def _inside(c: Penetration, n: int) -> float:
+def inside(c: Penetration, n: int) -> float:
     """How far inside, in sds of noise, a contact's place still is at the end of interval n."""
     return float(c.place[n + 1] / c.sd_place)
 
@@ -208,89 +205,3 @@ def _last_pressed(c: Penetration, n: int) -> int:
     """The interval up to n at whose start the force last shows contact, whatever positions say."""
     sure = np.flatnonzero(c.pressed[: n + 1] > SURE * c.sd_pressed)
     return int(sure[-1]) if sure.size else n
-
-
-def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
-    """Posterior of the moment of a change, with what is `known` of its sort.
-
-    A grip may be said to end when a pad's friction is spent and it begins to slide, when its force is first
-    silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
-    meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
-    """
-    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
-    views = [contacts]
-    if change.slips:
-        sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
-        opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
-        views += [sliding, opened]
-    found = [_seen(view, change, known) for view in views]
-    weight, t = VIEWS if len(found) > 1 else (1.0,), contacts[0].t
-    sd = float(np.hypot(ONSET, change.timing))
-    times = np.concatenate([times for times, _ in found])
-    masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, found, strict=True)])
-    return blurred(times, masses, float(t[0]), float(t[-1]), sd)
-
-
-def _beyond(c: Penetration, slip: float) -> Penetration:
-    """The contact as far as it is deeper than where it slides [m]."""
-    sd = float(np.hypot(c.sd_place, FRICTION * slip))
-    return replace(c, pressed=np.maximum(c.pressed - slip, 0.0), place=c.place - slip, sd_place=sd)
-
-
-def _seen(
-    contacts: Sequence[Penetration], change: Change, known: Disagreement
-) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and masses of the moment at which contacts are made, or the first is broken."""
-    t, making = contacts[0].t, change.making
-    found = np.array([switch_probability(c, change.log_prior, making, known.louder) for c in contacts])
-    combined = crossing_density if making else first_of
-    inner = (np.arange(POINTS) + 0.5) / POINTS
-    times, masses = [], []
-    for n in range(t.size - 1):
-        width = float(t[n + 1] - t[n])
-        for chosen, mass in _shares(found, n, making):
-            if mass < LIKELY:
-                continue
-            deciding = [_crossing(contacts[i], n, change, known) for i in chosen]
-            density = combined(deciding if all(x.known for x in deciding) else [], width)
-            if not np.isfinite(density).all():
-                density = combined([], width)
-            times.append(t[n] + inner * width)
-            masses.append(mass * density)
-    return np.concatenate(times), np.concatenate(masses)
-
-
-def _shares(found: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ...], float]]:
-    """Which contacts decide the boundary in interval n, and with what probability.
-
-    `found` (num_contacts, num_intervals): independent switch probabilities. Two contacts made in one
-    interval decide together, else the later one; of contacts broken, the earlier.
-    """
-    if len(found) == 1:
-        return [((0,), float(found[0, n]))]
-    done = found[:, :n].sum(axis=1) if making else found[:, n + 1 :].sum(axis=1)
-    a, b = found[:, n]
-    return [((0, 1), float(a * b)), ((0,), float(a * done[1])), ((1,), float(b * done[0]))]
-
-
-def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Crossing:
-    """The crossing of interval n: by position where apart, by force where there is contact."""
-    making, kind = change.making, change.kind
-    touching, apart = (n + 1, n) if making else (n, n + 1)
-    pressed, gap = c.pressed[touching], c.free_place[apart]
-    noise = c.sd_pressed * (known.louder if making else 1.0)
-    sd_pressed = float(np.hypot(noise, c.form * abs(pressed)))
-    if c.hidden:  # a rigid pad hides its compression
-        pressed = max(c.place[touching], 0.0)
-        sd_pressed = c.sd_place + 0.5 * abs(gap)
-    before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
-    if making:
-        found = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-        if len(change.contacts) == 1:  # a block is set down in several motions
-            return replace(found, restless=c.restless(n))
-        if n == 0:
-            return found
-        then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
-        return replace(found, earlier=then) if np.isfinite(then).all() else found
-    share = _abrupt(known.abrupt, _inside(c, n)) if kind == "smooth" else 0.0
-    return Crossing(-pressed, -gap, -before, -after, sd_pressed, c.sd_place, c.sd_rate, kind, float(share))

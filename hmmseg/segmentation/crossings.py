@@ -13,7 +13,7 @@ from hmmseg.hand.signals import Signals, central_differences
 from hmmseg.levels import SURE
 from hmmseg.segmentation.changes import Change, Prior, cut
 from hmmseg.segmentation.emissions import Parameters
-from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.features import WINDOW, noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.switching import Penetration
 
@@ -60,7 +60,8 @@ class Contacts:
             rests = (after if making else before).state == ON_GROUND
             fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
             if making:
-                return cut(Change(fingers, prior, making, "impact", timing))
+                pushed = tuple(self._finger(i, stretch, making, False) for i in (0, 1))
+                return cut(Change(pushed, prior, making, "impact", timing, unmoved=fingers if rests else ()))
             slips = tuple(self._slip(i, stretch) for i in (0, 1))
             return cut(Change(fingers, prior, making, "smooth", timing, slips))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
@@ -74,13 +75,9 @@ class Contacts:
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
-        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other.
-
-        Of two touches the later comes when both are the block's width apart, wherever the first has pushed
-        the block meanwhile: both fingers are halfway to each other then.
-        """
+        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
         inward, rate, sd_inward = self.inward[i], self.inward_rate[:, i], self.sd["inward"]
-        if rests and not making:
+        if rests:
             moved, moving = self._pushed(1 - i, held)
             inward, rate, sd_inward = inward + moved, rate + moving, np.sqrt(2.0) * sd_inward
         else:
@@ -140,8 +137,9 @@ class Contacts:
         moved = self.sensing.delay * np.nan_to_num(rate)
         if not making and self.sensing.delay < 0:
             return replace(c, place=c.place - moved)
-        # What its place says is apart has no compression that could be late: its force rings.
-        sure = (c.pressed > SURE * c.sd_apart) & ~(c.free_place < -SURE * c.sd_place)
+        # What is farther apart than it moves within a reading has no compression to be late: its force rings.
+        meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(self.sensing.delay))
+        sure = (c.pressed > SURE * c.sd_apart) & ~(c.free_place < -SURE * c.sd_place - meanwhile)
         return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
 
 

@@ -12,9 +12,10 @@ from hmmseg.hand.signals import Signals
 from hmmseg.hmm.alignment import AlignmentPosterior
 from hmmseg.levels import DRIFTS
 from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
-from hmmseg.segmentation.changes import Change, Disagreement, Prior, moment
+from hmmseg.segmentation.changes import Change, Disagreement, Prior
 from hmmseg.segmentation.crossings import contacts
 from hmmseg.segmentation.emissions import Parameters
+from hmmseg.segmentation.moment import moment
 from hmmseg.segmentation.motions import Kind
 from hmmseg.segmentation.pads import Sensing
 from hmmseg.segmentation.spans import Span

@@ -9,8 +9,9 @@ import pytest
 
 from hmmseg import Rig, Trial, align, example_folder
 from hmmseg.hand.signals import task_space
-from hmmseg.segmentation.changes import Change, Prior, disagreements, moment
+from hmmseg.segmentation.changes import Change, Prior, disagreements
 from hmmseg.segmentation.crossings import contacts
+from hmmseg.segmentation.moment import moment
 from hmmseg.segmentation.pads import Compliance, Sensing
 from hmmseg.segmentation.switching import Penetration
 
