@@ -36,7 +36,7 @@ from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "calibration_worlds.json"
-FIRST, REPLICATES = 92_000, 16
+FIRST, REPLICATES = 93_000, 16
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
 LEVELS = (0.68, 0.95)
 BIAS = 0.02  # N, what [systematic] admits where a row has biases
