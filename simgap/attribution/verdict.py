@@ -117,12 +117,15 @@ def known(left: float, explained: float, same: Iterable[float] = ()) -> float:
 
 
 def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:
-    """The causes that are likeliest by all sets that have just these."""
+    """The causes that are likeliest by all sets that have just these; fewer of them where doing without the
+    others is not ruled out."""
     chance: dict[tuple[str, ...], float] = {}
     for one in sets:
         if one.causes:
             chance[one.causes] = chance.get(one.causes, 0.0) + one.known * one.weight
-    return max(chance, key=lambda causes: chance[causes], default=())
+    best = max(chance, key=lambda causes: chance[causes], default=())
+    enough = [c for c, value in chance.items() if {*c} <= {*best} and value * RULED_OUT > chance[best]]
+    return min(enough, key=lambda c: (len(c), -chance[c]), default=())
 
 
 def alike(sets: Sequence[Explanation], causes: tuple[str, ...]) -> tuple[str, ...]:

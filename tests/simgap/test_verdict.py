@@ -66,3 +66,12 @@ def test_an_effect_too_small_to_be_a_cause_is_no_cause_beside_an_alternative_eit
 
 def test_a_larger_set_is_no_alternative():
     assert alike([one("a", 0.5), one("bc", 0.5)], ("a",)) == ()
+
+
+def test_what_a_set_can_do_without_is_no_cause():
+    nested = [one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)]
+    assert conclude(nested, SURE).causes == ("a",)
+    assert conclude([one("ab", 0.96), one("a", 0.03)], SURE).causes == ("a", "b")  # ruled out
+    assert conclude([one("ab", 0.6), one("a", 0.3, 0.01)], SURE).causes == ("a", "b")  # it leaves too much
+    other = conclude([one("ab", 0.6), one("c", 0.3)], SURE)  # not a part of the set but an alternative to it
+    assert other.causes == ("a", "b") and other.indistinguishable == ("c",)
