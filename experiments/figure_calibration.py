@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from experiments.stamps import save_figure
+
 PANELS = (
     ("95", "properties, 95 %", (92, 97)), ("68", "properties, 68 %", (63, 73)),
     ("90", "boundaries, 90 %", (86, 94)),
@@ -37,5 +39,5 @@ def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
     axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
     plt.close(figure)

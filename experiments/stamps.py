@@ -13,6 +13,8 @@ import subprocess
 import zlib
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from experiments.saving import ROOT, commit_of
 
 FIGURES = ROOT / "docs" / "figures"
@@ -67,23 +69,33 @@ def stamp_of(data: bytes) -> str | None:
     return found[1].decode("ascii") if found else None
 
 
-def main() -> None:
-    """Stamp what was drawn; what came out as it was keeps its stamp."""
-    commit = commit_of()
-    if commit is None:
+def stamp(path: Path) -> None:
+    """Stamp a figure with this code's commit; one that came out as it was committed keeps its stamp."""
+    commit, data, before = commit_of(), path.read_bytes(), _committed(path)
+    if commit is None or (data == before and stamp_of(data) is not None):
         return
+    if before is not None and stamp_of(before) is not None and bare(before) == bare(data):
+        path.write_bytes(before)
+    else:
+        path.write_bytes(stamped(data, commit))
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Save a figure of a page, stamped."""
+    figure.savefig(path, dpi=110)
+    stamp(path)
+
+
+def main() -> None:
+    """Stamp what was drawn."""
     for path in sorted(FIGURES.iterdir()):
-        data, before = path.read_bytes(), _committed(path)
-        if data == before and stamp_of(data) is not None:
-            continue
-        same = before is not None and stamp_of(before) is not None and bare(before) == bare(data)
-        path.write_bytes(before if before is not None and same else stamped(data, commit))
-        if not same:
-            print(f"{path.name}: {commit}")
+        stamp(path)
 
 
 def _committed(path: Path) -> bytes | None:
     """The figure as it was last committed; None of a new one."""
+    if not path.is_relative_to(ROOT):
+        return None
     command = ["git", "-C", str(ROOT), "show", f"HEAD:{path.relative_to(ROOT)}"]
     done = subprocess.run(command, capture_output=True)
     return done.stdout if done.returncode == 0 else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from experiments.stamps import save_figure
 from experiments.table_text import load, markdown, percent
 
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "sequences.png"
@@ -62,5 +63,5 @@ def _draw(groups: dict[str, Any], path: Path) -> None:
     ax.set_ylabel("share that were true")
     ax.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
     plt.close(figure)
