@@ -117,9 +117,13 @@ def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -
 
 
 def blocks_of(found: Search) -> dict[str, Block]:
-    """The blocks as the fit without any effect has them; ValueError where one cannot be."""
+    """The blocks as measured, else as the fit without any effect has them; ValueError where one cannot be.
+
+    A twin is healthy: what was measured is right of it, so that a wrong measurement shows as a gap.
+    """
     given = found.problem
-    values = given.centre + given.sd * found.healthy.u[: given.num_properties].reshape(-1, 3)
+    fitted = given.centre + given.sd * found.healthy.u[: given.num_properties].reshape(-1, 3)
+    values = np.where(given.measured, given.centre, fitted)
     if not (values > LEAST).all():
         raise ValueError("a property that no block has")
     return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}
