@@ -5,6 +5,7 @@ from __future__ import annotations
 from experiments.blind_check import outside_hand as hand
 from experiments.blind_check import outside_sensors as sensors
 from experiments.blind_check.effects import Change, Made, _sign
+from experiments.blind_check.outside_loads import OUTSIDE as LOADS
 from experiments.blind_check.outside_worlds import OUTSIDE as WORLDS
 from experiments.blind_check.signals import ENCODER, HAND, LINKS, MIX, READOUT, SCALE
 
@@ -99,4 +100,4 @@ OUTSIDE = {
                                              "y": r.uniform(0.2, 0.3)},
               LINKS, hand.sagging),
     )
-} | WORLDS  # fmt: skip
+} | WORLDS | LOADS  # fmt: skip
