@@ -92,6 +92,7 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 	$(BIN)/python -m experiments.blind_check score --sealed $(SET) --results $(SET)/results --json experiments/results/blind_check.json
 	$(BIN)/python -m experiments.spent_sets
 	$(BIN)/python -m paper_figs.gap_reliability
+	$(BIN)/python -m experiments.stamps
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)
