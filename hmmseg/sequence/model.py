@@ -187,7 +187,7 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
         raise InputError(where, f"lacks {error.args[0]}", "a complete model") from None
     except InputError:
         raise
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # the last of an infinite count
         raise InputError(where, "holds values that no model has", "a model written by `hmmseg fit`") from None
     return model
 

@@ -200,6 +200,12 @@ def test_models(folder, model, edits):
     check_model(folder, model, edits)
 
 
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e300])
+def test_a_model_with_any_one_number_impossible(folder, model, value):
+    for k in range(len(model[1])):
+        check_model(folder, model, [(k, value)])
+
+
 @pytest.mark.slow
 @MANY
 @given(text=tables(), table=TABLES, document=DOCUMENTS, lines=LINES, edits=EDITS)
