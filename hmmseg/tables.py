@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # rich is loaded when something is shown
@@ -12,12 +13,12 @@ if TYPE_CHECKING:  # rich is loaded when something is shown
 WIDTH = 120  # look: characters of a `repr`
 
 
-class Tabled:
+class Tabled(ABC):
     """A result that shows itself as its `tables`, after its `words` if it has any."""
 
+    @abstractmethod
     def tables(self) -> list[Table]:
         """The tables that are shown."""
-        raise NotImplementedError
 
     def words(self) -> str:
         """What is said before them, a line or nothing."""

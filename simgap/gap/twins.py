@@ -98,8 +98,11 @@ def _recorded(found: Search, task: BlockTask, rig: Rig, which: range, seed: int)
     seeds = [seed + 7_000_000 + 1000 * k + j for k in which for j in range(trials)]
     task = found.problem.frame.task if task.repeat == "unknown" else task
     every = [blocks] * len(seeds)
-    simulated = simulate_plans(task, hand, _plans(found, task, rig, blocks) * len(which), every, seeds)
-    if not all(np.isfinite(s.boundaries).all() for s in simulated):  # it drops blocks, or never reaches them
+    simulated = None
+    with suppress(ValueError):  # motion that cannot be smoothed, as its noise is not stated
+        simulated = simulate_plans(task, hand, _plans(found, task, rig, blocks) * len(which), every, seeds)
+    # Repeated motions may drop blocks, or never reach them.
+    if simulated is None or not all(np.isfinite(s.boundaries).all() for s in simulated):
         simulated = performed(task, hand, every, seeds, {}, settings(found))
     twins = [recorded(s, task, hand, {}) for s in simulated]
     if of_wrist(found.trials):

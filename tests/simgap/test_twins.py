@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 from demo_recordings import RIG, TASK, TRIALS
 
+from hmmseg.io.rig import Noise
 from simgap.gap import twins
+from simgap.gap.search import search
 
 
 def test_other_code_has_a_cache_of_its_own(monkeypatch):
@@ -16,3 +19,11 @@ def test_other_code_has_a_cache_of_its_own(monkeypatch):
     assert mine == twins._file(TRIALS, TASK, RIG, None, 0) != twins._file(TRIALS, TASK, RIG, None, 1)
     monkeypatch.setattr(twins, "source_digest", lambda: known[::-1])
     assert twins._file(TRIALS, TASK, RIG, None, 0) != mine
+
+
+def test_without_stated_noise_there_are_twins_too():
+    rig = RIG.model_copy(update={"noise": Noise()})
+    found = search(TRIALS[:1], TASK, rig)
+    twin = twins._recorded(found, TASK, rig, range(1), 0)
+    assert len(twin) == 1 and len(twin[0]) == 1
+    assert np.isfinite(twin[0][0].channels["fx1"]).all()
