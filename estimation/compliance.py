@@ -13,14 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.both_err import amid
 from hmmseg.contact.equations import Pads, block_width, block_y, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import CONTRADICTS, TAIL
+from hmmseg.levels import TAIL
 from hmmseg.robust import robust_sd
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
 UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
+STATED_SD = (
+    0.3  # prior: how far, as a share, pads are off a stiffness that is wrong: foams of one make differ by it
+)
+MISSTATED = 0.1  # prior: share of rigs whose pads are off by more than they admit
 CLOSED = 0.15  # chosen: of the grip's own force: below it, one finger may not touch yet
 MIN_SAMPLES = 6  # numerics: of a grip: fewer give a slope no interval of its own
 # prior: standard deviation of one slope beyond its sampling, and of all alike, as forces and positions are
@@ -32,11 +37,13 @@ SLOPE_SD = 0.1
 class Slope:
     """Weights (num_timesteps,) whose sum with readings is their slope over the give, and its variance.
 
+    `alike`: what all slopes of a hand may be off by together, for one reason (part of `variance`).
     `change` [m]: what a landing's give changed by; 0 of a slope within a grip.
     """
 
     weights: np.ndarray
     variance: float
+    alike: float = 0.0
     change: float = 0.0
 
 
@@ -63,13 +70,15 @@ def closed(signals: Signals, inside: np.ndarray) -> np.ndarray:
 
 
 def slope(
-    t: np.ndarray, reading: np.ndarray, give: np.ndarray, groups: list[np.ndarray], noise: float
-) -> Slope | None:
+    t: np.ndarray, reading: np.ndarray, place: np.ndarray, give: np.ndarray, groups: list[np.ndarray],
+    noise: float, sds: tuple[float, float] = (0.0, 0.0),
+) -> Slope | None:  # fmt: skip
     """Robust slope of readings over the give, each group (num_timesteps,) with a level of its own.
 
-    The rate of the give is fitted beside it: it takes what a pad's viscosity, or a force that is late,
-    adds while the give changes. `t` [s]; `noise`: sd of one reading at least [m]. None where too few
-    samples tell.
+    `reading` is what `place`, which positions alone tell, becomes with the nominal give; `place` grows with
+    the give. The rate of the give is fitted beside it: it takes what a pad's viscosity, or a force that is
+    late, adds while the give changes. `t` [s]; `noise`: sd of one reading at least; `sds`: those that sensors
+    are known to have, of a give and of a place [m]. None where too few samples tell.
     """
     rate = np.gradient(give, t)
     groups = [g & np.isfinite(reading) & np.isfinite(give) & np.isfinite(rate) for g in groups]
@@ -77,25 +86,51 @@ def slope(
     if not groups:
         return None
     every = np.logical_or.reduce(groups)
-    trust, found = every.astype(float), None
+    levels = np.stack([np.where(g, 1.0, 0.0) for g in groups])
+    others = np.concatenate([levels, np.where(every, np.nan_to_num(rate), 0.0)[None]])
+    trust, found, doubt = every.astype(float), None, None
     for _ in range(10):
-        levels = np.stack([np.where(g, 1.0, 0.0) for g in groups])
-        others = np.concatenate([levels, np.where(every, np.nan_to_num(rate), 0.0)[None]])
-        x, y = (np.where(every, np.nan_to_num(v), 0.0) for v in (give, reading))
-        x, y = (_less(v, others, trust) for v in (x, y))
+        x, y, p = (
+            _less(np.where(every, np.nan_to_num(v), 0.0), others, trust) for v in (give, reading, place)
+        )
         power = float((trust * x**2).sum())
         if power <= 1e-12 * float((np.nan_to_num(give)[every] ** 2).sum()):
             return None
-        weights = trust * x / power
+        along, alike = _between(x, p, trust, sds, len(others))
+        # Of all samples alike: those that agree with a flat line are those it was weighed by.
+        doubt = alike if doubt is None else max(doubt, alike)
+        if not np.isfinite(doubt):
+            return None
+        weights = trust * along / float((trust * along) @ x)
         residual = np.where(every, y - float(weights @ y) * x, 0.0)
         scale = max(robust_sd(residual[every]), noise)
         trust = np.where(every, (TAIL + 1) / (TAIL + (residual / scale) ** 2), 0.0)
-        # A sample that bears the fit alone shows no residual: the jackknife's (MacKinnon and White 1985).
+        # A sample that bears the fit alone shows no residual: the jackknife's (MacKinnon and White 1985) of
+        # least squares, which is the flat line.
         basis, _ = np.linalg.qr((np.concatenate([x[None], others]) * np.sqrt(trust)).T)
-        alone = residual / np.maximum(1 - (basis**2).sum(axis=1), 1e-3)
-        variance = max(float((weights**2 * alone**2).sum()), scale**2 / power)
-        found = Slope(weights, variance)
+        flat = np.where(every, y - float((trust * x) @ y) / power * x, 0.0)
+        alone = trust * x / power * flat / np.maximum(1 - (basis**2).sum(axis=1), 1e-3)
+        variance = max(float((alone**2).sum()), scale**2 / power) + doubt**2
+        found = Slope(weights, variance, doubt)
     return found
+
+
+def _between(
+    give: np.ndarray, place: np.ndarray, trust: np.ndarray, sds: tuple[float, float], fitted: int
+) -> tuple[np.ndarray, float]:
+    """What to weigh samples by (num_timesteps,) for a slope amid those that noise allows, and its doubt.
+
+    Forces that ring make the slope over their give flat, places that are off make it steep (`amid`).
+    """
+    count = float(trust.sum()) * max(1 - fitted / max(np.count_nonzero(trust), 1), 0.0)
+    both = float(trust @ (give * place))
+    square_give, square_place = float(trust @ give**2), float(trust @ place**2)
+    middle, apart = amid(square_give, both, square_place, count, sds)
+    if middle <= both / square_give or square_place <= middle * both:
+        return give, apart
+    # Weighed by give + k place the slope is (both + k square_place) / (square_give + k both).
+    k = (middle * square_give - both) / (square_place - middle * both)
+    return give + k * place, apart
 
 
 def _less(values: np.ndarray, others: np.ndarray, trust: np.ndarray) -> np.ndarray:
@@ -114,18 +149,32 @@ def middle_share(shares: np.ndarray, variances: np.ndarray, error: np.ndarray | 
     return middle, float(np.sqrt(np.pi / 2 / cumulative[-1]))
 
 
-def unexpected_share(shares: np.ndarray, variances: np.ndarray, stated: bool, admitted: float) -> float:
-    """Share by which all slopes (K,) together disagree with the rig, 0 where it admits as much.
+def shared_error(alike: np.ndarray, variances: np.ndarray) -> float:
+    """What the mean of slopes (K,), weighed by their variances, is off by for the reason they have alike."""
+    return float((alike / variances).sum() / (1 / variances).sum()) if alike.size else 0.0
 
-    `stated`: whether the rig has pads that give; of those that it calls rigid any give is a surprise. The
-    weighted median, so that no single grip decides.
+
+def misstated(
+    shares: np.ndarray, variances: np.ndarray, stated: bool, admitted: float, apart: float = 0.0
+) -> tuple[float, float]:
+    """Share by which all slopes (K,) together disagree with the rig, and the probability that it is wrong.
+
+    `stated`: whether the rig has pads that give; of those that it calls rigid any give is a surprise;
+    `admitted`: sd of the share by [systematic]. The weighted median, so that no single grip decides. `apart`:
+    what all of them may be off by together. A rig that is right leaves the share normal about 0 with these
+    errors, a wrong one (MISSTATED) with the foams' spread beside; both are 0 where slopes speak for the rig.
     """
     if not shares.size:
-        return 0.0
+        return 0.0, 0.0
     # A slope's own error is a share of what truly gives.
     middle, error = middle_share(shares, variances, SLOPE_SD if stated else SLOPE_SD * np.abs(shares))
     alike = SLOPE_SD if stated else SLOPE_SD * abs(middle)
-    return middle if abs(middle) > CONTRADICTS * np.hypot(np.hypot(error, alike), admitted) else 0.0
+    right = max(error**2 + alike**2 + apart**2 + admitted**2, 1e-12)
+    wrong = right + (STATED_SD if stated else UNSTATED) ** 2
+    gain = (np.log(right / wrong) + middle**2 * (1 / right - 1 / wrong)) / 2
+    if gain <= 0:
+        return 0.0, 0.0
+    return middle, float(1 / (1 + (1 / MISSTATED - 1) * np.exp(-min(gain, 500.0))))
 
 
 def possible_share(shares: np.ndarray, variances: np.ndarray) -> float:

@@ -121,8 +121,10 @@ def build(
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in aligned])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
     slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that tell no unknown
-    slope_variance = np.stack([slope_variances(a, moves) for a in aligned])
-    doubt = pad_doubt(slopes, slope_variance, aligned, rig)
+    slope_variance, alike = (
+        np.stack(each) for each in zip(*(slope_variances(a, moves) for a in aligned), strict=True)
+    )
+    doubt = pad_doubt(slopes, slope_variance, alike, aligned, rig)
     slope_variance += doubt.slope_sd()[sloped] ** 2
     deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}

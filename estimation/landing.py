@@ -52,7 +52,7 @@ def landing(
     bend = max(abs(float((parabola - line) @ y)), float(np.abs(np.diff(y, 2)).max()))
     speed = float(np.polyfit(t[before] - moment, y, 1)[0])
     variance = (speed * moment_sd) ** 2 + bend**2 + noise**2 * (float((parabola**2).sum()) + 1 / count)
-    return Slope(weights / change, variance / change**2, change)
+    return Slope(weights / change, variance / change**2, change=change)
 
 
 def first_push(

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.combinations import Terms
-from estimation.compliance import possible_share, shear_give, squeeze_give, unexpected_share, unit_pads
+from estimation.compliance import (
+    misstated,
+    possible_share,
+    shared_error,
+    shear_give,
+    squeeze_give,
+    unit_pads,
+)
 from estimation.nuisance import PadDoubt
 from estimation.observations import (
     Noise,
@@ -45,36 +52,46 @@ def observe_slopes(signals: Signals, aligned: WeighedTrial, rig: Rig, moves: Seq
     return out
 
 
-def slope_variances(aligned: WeighedTrial, moves: Sequence[int]) -> np.ndarray:
-    """Variances (num_moves, len(SLOPES)) of the slopes, infinite of none."""
+def slope_variances(aligned: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Variances (num_moves, len(SLOPES)) of slopes, infinite of none, and what they may be off by alike."""
     found = [[aligned.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
-    return np.array([[np.inf if s is None else s.variance for s in row] for row in found])
+    variance = [[np.inf if s is None else s.variance for s in row] for row in found]
+    return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in found])
 
 
 def pad_doubt(
-    slopes: np.ndarray, variance: np.ndarray, aligned: Sequence[WeighedTrial], rig: Rig
+    slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, aligned: Sequence[WeighedTrial], rig: Rig
 ) -> PadDoubt:
     """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, and usual forces.
 
-    A share that several kinds of slope find is the largest of them.
+    `variance`, `alike`: as in `slope_variances`, of all trials. A share that several kinds of slope find is
+    that of the surest of them.
     """
     admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
-    found, possible = {DISTANCE: 0.0, RISE: 0.0}, {DISTANCE: 0.0, RISE: 0.0}
+    found, possible, shared = {}, {DISTANCE: 0.0, RISE: 0.0}, {}
     for channel, stiffness in (
         (DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness),
     ):  # fmt: skip
         stated = bool(np.isfinite(stiffness))
         kinds = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
+        seen = np.isfinite(slopes[..., kinds])
+        mine = [values[..., kinds][seen] for values in (slopes, variance, alike)]
+        shared[channel] = shared_error(mine[2], mine[1])
+        found[channel] = (0.0, 0.0)
         for k in kinds:
-            mine = slopes[..., k][np.isfinite(slopes[..., k])], variance[..., k][np.isfinite(slopes[..., k])]
-            share = unexpected_share(*mine, stated, admitted if stated else 0.0)
-            found[channel] = max(found[channel], share, key=abs)
+            of_kind = np.isfinite(slopes[..., k])
+            one = [values[..., k][of_kind] for values in (slopes, variance, alike)]
+            apart = shared_error(one[2], one[1])
+            said = misstated(*one[:2], stated, admitted if stated else 0.0, apart)
+            found[channel] = max(found[channel], said, key=lambda share_and_odds: share_and_odds[1])
         if not stated:
-            seen = np.isfinite(slopes[..., kinds])
-            possible[channel] = possible_share(slopes[..., kinds][seen], variance[..., kinds][seen])
+            possible[channel] = possible_share(*mine[:2])
     usual = [float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, aligned), strict=True)]
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
-    return PadDoubt(-found[DISTANCE], found[RISE], possible[DISTANCE], possible[RISE], *usual)
+    return PadDoubt(
+        -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], *usual,
+        (found[DISTANCE][1], found[RISE][1]), (shared[DISTANCE], shared[RISE]),
+    )  # fmt: skip
 
 
 def _usual(aligned: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:

@@ -60,10 +60,12 @@ def _longer_link(finger: int, link: int):
 class PadDoubt:
     """What recordings show of the pads and the rig does not admit: how much softer they are, as shares.
 
-    Along the grip and in shear, 0 for no doubt: the compliance is 1 + share times the nominal, and its
-    extra prior sd is as large. `normal_give`, `shear_give`: how much pads may give, by what the
-    recordings show, whose stiffness the rig leaves unstated; 0 where it states one. `usual_normal`,
-    `usual_shear`: forces of one finger as they usually are in a grip, and where a block is put down [N].
+    `normal`, `shear`: along the grip and in shear the compliance seems 1 + share times the nominal; `odds`
+    are the probabilities that the rig is so wrong, and the extra prior variance is that times the share's
+    square. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
+    how much pads may give, by what the recordings show, whose stiffness the rig leaves unstated; 0 where it
+    states one. `usual_normal`, `usual_shear`: forces of one finger as they usually are in a grip, and where a
+    block is put down [N].
     """
 
     normal: float = 0.0
@@ -72,10 +74,20 @@ class PadDoubt:
     shear_give: float = 0.0
     usual_normal: float = 1.0
     usual_shear: float = 1.0
+    odds: tuple[float, float] = (0.0, 0.0)
+    apart: tuple[float, float] = (0.0, 0.0)
+
+    def extra_sd(self, kind: str) -> float:
+        """Prior standard deviation of the share, "normal" or "shear", beyond what the rig admits."""
+        return abs(getattr(self, kind)) * float(np.sqrt(self.odds[kind == "shear"]))
 
     def slope_sd(self) -> np.ndarray:
-        """Standard deviations (3,) by channel of a slope's own error, a share of what truly gives."""
-        return SLOPE_SD * np.array([1.0, self.normal_give or 1.0, self.shear_give or 1.0])
+        """Standard deviations (3,) by channel of what slopes are off by alike and each of its own.
+
+        A share of what truly gives, and beside it what noise of forces or places may make of all of them.
+        """
+        usual = SLOPE_SD * np.array([1.0, self.normal_give or 1.0, self.shear_give or 1.0])
+        return np.hypot(usual, [0.0, *self.apart])
 
 
 def _softer_pads(fingers: tuple[int, ...], axis: str):
@@ -142,16 +154,20 @@ def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0
                                     _longer_link(finger, link)))  # fmt: skip
     # What slopes show is compliance and exponent together, so either may be off by as much as both; the bend
     # is that of what gives.
-    stated = min(max(abs(doubt.normal), *s.pad_stiffness) / np.log(2), MOST_BENT)
+    stated = min(max(doubt.extra_sd("normal"), *s.pad_stiffness) / np.log(2), MOST_BENT)
     bends = {"normal": MOST_BENT * doubt.normal_give or stated, "shear": MOST_BENT * doubt.shear_give}
+    # Pads of one hand are of one make: of what their stiffness is stated to be in doubt by, most is common.
+    common = min(s.pad_stiffness) * np.sqrt(1 - UNLIKE**2)
     for axis, kind in (("x", "normal"), ("y", "shear")):
-        found, give = abs(getattr(doubt, kind)), getattr(doubt, f"{kind}_give")
+        found, give = doubt.extra_sd(kind), getattr(doubt, f"{kind}_give")
+        admitted = 0.0 if give else common
         both = max(found, UNSTATED if give else 0.0)
+        both = float(np.hypot(np.hypot(both, bends[kind]) if both else 0.0, admitted))
         if both:
-            both = float(np.hypot(both, bends[kind]))
             out.append(Nuisance(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis)))
         for finger in (1, 2):
-            sd = float(np.hypot(0.0 if give else s.pad_stiffness[finger - 1], UNLIKE * max(found, give)))
+            own = 0.0 if give else s.pad_stiffness[finger - 1]
+            sd = float(np.sqrt(own**2 - admitted**2 + (UNLIKE * max(found, give)) ** 2))
             if sd > 0:
                 out.append(Nuisance(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis)))
         if bends[kind] and any(n.name.startswith(f"pad_{kind}") for n in out):

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from estimation.compliance import Slope, closed, shear_give, slope, squeeze_give
+from estimation.compliance import MIN_SAMPLES, Slope, closed, shear_give, slope, squeeze_give, unit_pads
 from estimation.landing import first_push, landing
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
+from hmmseg.robust import white_sd
 
 
 def slopes_within(
@@ -23,14 +24,30 @@ def slopes_within(
     """
     out = {}
     held = {name: closed(signals, group) for name, group in groups.items()}
-    for name, key, give, together in (
-        ("distance", "distance", squeeze_give(signals, rig), [held["distance"]]),
-        ("rise", "place", shear_give(signals, rig), [held["pickup"], held["place"]]),
-    ):
-        found = slope(signals.t, values[key], give, together, scales[key])
+    root2, pads = np.sqrt(2.0), unit_pads(rig)
+    sd_force = np.nan_to_num(signals.sd_force)  # what is not stated is not taken out
+    for name, key, place, sd, give, compliance, together in (
+        ("distance", "distance", -signals.distance, root2 * signals.sd_x, squeeze_give(signals, rig),
+         np.hypot(pads.normal1, pads.normal2), [held["distance"]]),
+        ("rise", "place", signals.y, signals.sd_y / root2, shear_give(signals, rig),
+         np.hypot(pads.shear1, pads.shear2) / 2, [held["pickup"], held["place"]]),
+    ):  # fmt: skip
+        known = sd[np.isfinite(sd)]
+        noise = float(np.median(known)) if known.size else 0.0
+        # What readings are rougher than places is noise of the forces: they ring, what they move does not.
+        rough = [_rough(values[key][group]) for group in together]
+        ringing = np.sqrt(max(max(rough, default=0.0) ** 2 - noise**2, 0.0))
+        sds = (max(sd_force * compliance, ringing), noise)
+        found = slope(signals.t, values[key], place, give, together, scales[key], sds)
         if found is not None:
             out[name] = found
     return out
+
+
+def _rough(readings: np.ndarray) -> float:
+    """White noise (sd) of readings (num_samples,), 0 of too few [m]."""
+    there = readings[np.isfinite(readings)]
+    return white_sd(there) if there.size >= MIN_SAMPLES else 0.0
 
 
 def slope_of_landing(

@@ -18,17 +18,19 @@ from hmmseg.segmentation.align import AlignedTrials
 STEEL = 7850.0  # physics: [kg/m^3]
 DEEPEST = 10.0  # limit: depths of a block in widths; none is held by two pads that is deeper
 LIGHT = 1500.0  # limit: [kg/m^3]: plastics and stone, of which the unit that makes it is the likeliest
+CERTAIN = 0.99  # chosen: probability from which it is said that the rig's pads are wrong
 NOT_LEVEL = 2e-3  # chosen: m; more than a tilted table or a slip in the grip make of a move on a level
 
 
 def soft_pads(design: Design, rig: Rig) -> list[str]:
     """Pads that give otherwise than the rig says, as every grip shows while its force changes."""
     out, tip = [], unit_pads(rig)
-    for kind, share, compliance in (
-        ("normal", design.doubt.normal, tip.normal1), ("shear", design.doubt.shear, tip.shear1),
+    for kind, share, odds, compliance in (
+        ("normal", design.doubt.normal, design.doubt.odds[0], tip.normal1),
+        ("shear", design.doubt.shear, design.doubt.odds[1], tip.shear1),
     ):  # fmt: skip
         stated = getattr(rig.fingertip, f"{kind}_stiffness")
-        if not share:
+        if odds < CERTAIN:
             continue
         true = compliance * (share + (1.0 if np.isfinite(stated) else 0.0))
         seen = f"about {1 / true:.2g} N/m" if true > 0 else "no give at all, or forces that are late"

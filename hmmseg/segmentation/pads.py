@@ -18,14 +18,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmmseg.both_err import amid
 from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import CONTRADICTS, TAIL
+from hmmseg.robust import NORMAL, weighted_median
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.lateness import Squeeze, lateness, squeeze
-from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest, stretches
+from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, ringing, steepest, stretches
 from hmmseg.segmentation.toe import NONE, Toe, find
 
 # prior: of a stated stiffness, where the rig does not say: foams of one make differ by as much
@@ -43,6 +45,7 @@ LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, 
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 SLIDING = 0.9  # chosen: quantile of the steepest ratios of forces of all contacts that is friction's
+LOUD = 0.9  # chosen: quantile of what forces show after releases that is how loud they ring
 ENOUGH = 24  # chosen: stretches that tell a delay
 
 
@@ -158,6 +161,7 @@ def sense(
     loads: list[Stretch] = []
     squeezes: list[Squeeze | None] = []
     ratios: list[float] = []
+    rings: list[tuple[float, float, float]] = []
     for s, (t, path) in zip(signals, paths, strict=True):
         for step in steps:
             if step.state == ON_GROUND and (path == step.index).sum() > 1:
@@ -168,8 +172,11 @@ def sense(
                     if stretch is not None:
                         out.append(stretch)
                 ratios += steepest(s, start, end, parameters)
+                rings += ringing(s, start, end, parameters)
                 if not again:
                     squeezes.append(squeeze(s, *_beside(t, path, steps, step.index), parameters))
+    rung = np.quantile(rings, LOUD, axis=0) if rings else np.zeros(3)
+    squeezes = [q and replace(q, sd_load=float(np.hypot(q.sd_load, rung[2]))) for q in squeezes]
     nominal = pads_of(rig)
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
@@ -182,8 +189,8 @@ def sense(
             delay, sd, late, filtered = _delay((grips, loads), priors)
 
     def found() -> list[Compliance]:
-        return [_compliance([(*_read(s, delay, filtered), s.sd) for s in own], prior)
-                for own, prior in zip((grips, loads), priors, strict=True)]  # fmt: skip
+        return [_compliance([(*_read(s, delay, filtered), s.sd) for s in own], prior, float(r))
+                for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)]  # fmt: skip
 
     normal, shear = found()
     if late and normal.value < priors[0][0] / IMPLAUSIBLE:  # noise that a delay happens to smooth away
@@ -246,43 +253,48 @@ def _delay(
 
 
 def _compliance(
-    readings: Sequence[tuple[np.ndarray, np.ndarray, float]], prior: tuple[float, float]
-) -> Compliance:
-    """Common compliance of all stretches, each with a rest of its own; `prior`: mean and sd [m/N]."""
-    found = [_slope(*one) for one in readings]
-    c, w = (np.array([f[i] for f in found if f[1] > 0]) for i in (0, 1))
+    readings: Sequence[tuple[np.ndarray, np.ndarray, float]], prior: tuple[float, float],
+    ringing: float = 0.0,
+) -> Compliance:  # fmt: skip
+    """Common compliance of all stretches, each with a rest of its own; `prior`: mean and sd [m/N].
+
+    `ringing` [N]: noise that loads are known to have.
+    """
+    found = np.array([_slope(*one, ringing) for one in readings]).reshape(-1, 3)
+    c, w, apart = found[found[:, 1] > 0].T
     if not c.size:
         return Compliance(prior[0], prior[1], FORM)
     telling = w > LEAST * w.max()
-    c, w = c[telling], w[telling]
-    middle = _weighted_median(c, w)
+    c, w, apart = c[telling], w[telling], apart[telling]
+    middle = weighted_median(c, w)
     # Scatter of stretches beyond what noise explains, by a robust method of moments.
-    spread = 1.4826 * _weighted_median(np.abs(c - middle), w)
+    spread = NORMAL * weighted_median(np.abs(c - middle), w)
     between = max(spread**2 - 1 / float(np.median(w)), 0.0) if c.size > 1 else 0.0
     usual = FORM * max(abs(middle), prior[0])
     between = (c.size * between + FORM_STRETCHES * usual**2) / (c.size + FORM_STRETCHES)
     trusted = (TAIL + 1) / (TAIL + (c - middle) ** 2 / (1 / w + between)) / (1 / w + between)
-    total = trusted.sum() + prior[1] ** -2
-    value = max(float((trusted @ c + prior[0] * prior[1] ** -2) / total), 0.0)
+    # Where forces ring all stretches are off for one reason, which their number does not mend.
+    seen = float(trusted @ c / trusted.sum())
+    information = 1 / (1 / trusted.sum() + float(trusted @ apart / trusted.sum()) ** 2)
+    total = information + prior[1] ** -2
+    value = float(max((information * seen + prior[0] * prior[1] ** -2) / total, 0.0))
     return Compliance(value, float(total**-0.5), float(np.sqrt(between)) / max(value, RIGID))
 
 
-def _slope(load: np.ndarray, place: np.ndarray, sd: float) -> tuple[float, float]:
-    """Compliance [m/N] of one stretch, and its information.
+def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tuple[float, float, float]:
+    """Compliance [m/N] of one stretch, its information, and what it is off by as others are.
 
-    Loads that ring while nothing moves flatten the line of places over loads, to none at the worst, and make
-    that of loads over places too steep: the truth lies between (Frisch 1934). How far they differ is doubt.
+    Loads that ring, by `ringing` [N] and maybe more, while nothing moves flatten the line of places over
+    loads, to none at the worst (`amid`).
     """
     slope, weight, _ = fitted(load, place, sd)
     if weight == 0:
-        return float(slope), 0.0
-    steep = float(fitted(place, load, sd * float(np.ptp(load) / max(np.ptp(place), sd)))[0])
-    moved = max(1.0 - sd**2 / max(float(np.var(place)), 1e-300), 0.0)  # the share that is no noise of places
-    apart = max(moved / steep - float(slope), 0.0) if steep > 0 else np.inf
-    return float(slope), float(1.0 / (1.0 / weight + apart**2))
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    order = np.argsort(values)
-    cumulative = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+        return float(slope), 0.0, 0.0
+    x, y = load - load.mean(), place.mean() - place
+    square, free = float(x @ x), load.size - 2.0
+    middle, apart = amid(square, float(x @ y), float(y @ y), free, (ringing, sd))
+    if not np.isfinite(apart):
+        return middle, 0.0, 0.0
+    value = middle if apart else float(slope)
+    sampling = float(((y - value * x) ** 2).sum()) / free * square / (square - free * ringing**2) ** 2
+    return value, float(1.0 / (max(1.0 / weight, sampling) + apart**2)), apart

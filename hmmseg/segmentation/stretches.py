@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from hmmseg.hand.signals import Signals
+from hmmseg.levels import MOVED, TAIL
 from hmmseg.levels import SURE as SIGNIFICANT
-from hmmseg.levels import TAIL
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import noise_sd
@@ -19,6 +19,7 @@ from hmmseg.segmentation.toe import DEPENDENT, NONE, Toe
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
 FARTHEST = 0.5  # numerics: s; values further from a contact than any delay that is tried are not kept
+RINGS = 0.3  # chosen: s after a release in which a contact still rings
 KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there
 
 
@@ -92,6 +93,28 @@ def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]
         if use.any():
             out.append(max(float(np.max((np.abs(shear[use]) - sd) / (grip[use] + sd))), 0.0))
     return out
+
+
+def ringing(s: Signals, start: float, end: float, p: Parameters) -> list[tuple[float, float, float]]:
+    """What loads still show [N] once the fingers have left a hold, or nothing: they ring, or come late.
+
+    Looked at is what follows its end up to RINGS while the fingers are farther apart than they were by more
+    than any pad gives, where there is no contact. The largest along the grip and in shear, and how far those
+    along the grip swing to either side, as what is late does not.
+    """
+    held = (s.t >= start) & (s.t <= end) & np.isfinite(s.distance)
+    if not held.any():
+        return []
+    after = (s.t > end) & (s.t <= end + RINGS)
+    left = after & (s.distance - np.median(s.distance[held]) > MOVED)
+    force = (np.stack([s.fx1, s.fy1, s.fx2, s.fy2]) - np.asarray(p.bias)[:, None])[:, left]
+    force = force[:, np.isfinite(force).all(axis=0)]
+    if not force.size:
+        return []
+    most, least = force.max(axis=1), -force.min(axis=1)
+    x1, y1, x2, y2 = np.maximum(most, least)
+    swing1, _, swing2, _ = np.maximum(np.minimum(most, least), 0.0)
+    return [(float(np.hypot(x1, x2)), float(np.hypot(y1, y2)) / 2, float(np.hypot(swing1, swing2)))]
 
 
 def unfiltered(s: Stretch, constant: float) -> Stretch:

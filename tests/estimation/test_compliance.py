@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from estimation.compliance import SLOPE_SD, UNSTATED, possible_share, slope, unexpected_share
+from estimation.compliance import MISSTATED, SLOPE_SD, UNSTATED, misstated, possible_share
+from estimation.compliance import slope as slope_amid
 
 DT = 0.02
 
@@ -25,6 +26,11 @@ def grip(share=0.0, lag=0.0, noise=0.0, seed=0):
     recorded = give(t - lag)
     reading = 0.02 - (1 + share) * give(t) + recorded
     return t, recorded, reading + noise * np.random.default_rng(seed).normal(size=t.size)
+
+
+def slope(t, reading, recorded, groups, noise, sds=(0.0, 0.0)):
+    """Of a width's reading: places alone are short of it by the give."""
+    return slope_amid(t, reading, recorded - reading, recorded, groups, noise, sds)
 
 
 def held(recorded):
@@ -52,7 +58,7 @@ def test_a_late_force_is_no_softer_pad():
 def test_variance_is_that_of_repeated_noise():
     t, recorded, _ = grip()
     readings = [grip(noise=3e-5, seed=k)[2] for k in range(200)]
-    slopes = [slope(t, reading, recorded, held(recorded), 1e-5) for reading in readings]
+    slopes = [slope(t, reading, recorded, held(recorded), 1e-5, (0.0, 3e-5)) for reading in readings]
     values = [s.weights @ reading for s, reading in zip(slopes, readings, strict=True)]
     stated = np.sqrt(np.mean([s.variance for s in slopes]))
     assert np.std(values) == pytest.approx(stated, rel=0.35)
@@ -72,13 +78,30 @@ def test_too_few_samples_tell_nothing():
     assert slope(t, reading, 0 * recorded, held(recorded + 1), 1e-5) is None
 
 
-def test_what_the_rig_does_not_admit_is_told_once_it_is_certain():
-    shares, variances = np.array([0.5, 0.55, 0.45, 0.5]), np.full(4, 0.02**2)
-    assert unexpected_share(shares, variances, True, 0.0) == pytest.approx(0.5)
-    assert unexpected_share(shares, variances, True, 0.3) == 0.0  # the rig says so itself
-    assert unexpected_share(0.3 * shares, variances, True, 0.0) == 0.0  # within a slope's own error
-    assert unexpected_share(0.8 * shares, variances, False, 0.0) > 0  # of rigid pads any give is a surprise
-    assert unexpected_share(np.array([]), np.array([]), True, 0.0) == 0.0
+def test_forces_that_ring_make_a_slope_doubtful_and_no_stiff_pad():
+    """Ringing that the rig does not state, while places follow the true pads: the flat line says no give."""
+    t, recorded, reading = grip()
+    ring = 1.5e-4 * np.sin(1000 * t**2)
+    groups = [held(recorded)[0] & (t > 0.6) & (t < 2.4)]  # the ramps, which say more, left out
+    found = slope(t, reading + ring, recorded + ring, groups, 1e-5, (0.0, 2e-5))
+    flat = np.polyfit((recorded + ring)[groups[0]], (reading + ring)[groups[0]], 1)[0]
+    assert flat > 0.8
+    assert found.alike > 0.25 and abs(found.weights @ (reading + ring)) < 2.5 * np.sqrt(found.variance)
+    clean = slope(t, reading, recorded, groups, 1e-5, (0.0, 2e-5))
+    assert clean.alike < 0.15 and abs(clean.weights @ reading) < 0.02
+
+
+def test_what_the_rig_does_not_admit_counts_by_its_odds():
+    shares, variances = np.array([0.6, 0.65, 0.55, 0.6]), np.full(4, 0.02**2)
+    share, odds = misstated(shares, variances, True, 0.0)
+    assert share == pytest.approx(0.6) and odds > 0.99
+    assert misstated(shares, variances, True, 0.6) == (0.0, 0.0)  # the rig says so itself
+    _, doubtful = misstated(0.5 * shares, variances, True, 0.0)
+    assert MISSTATED < doubtful < odds
+    assert misstated(shares, variances, True, 0.0, apart=0.6) == (0.0, 0.0)  # all off for one reason
+    assert misstated(0.1 * shares, variances, True, 0.0) == (0.0, 0.0)  # they speak for the rig
+    assert misstated(0.8 * shares, variances, False, 0.0)[1] > 0.5  # of rigid pads any give is a surprise
+    assert misstated(np.array([]), np.array([]), True, 0.0) == (0.0, 0.0)
 
 
 def test_unstated_pads_may_give_what_slopes_show():

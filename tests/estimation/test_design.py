@@ -8,6 +8,7 @@ import pytest
 from estimation.design import build
 from estimation.mode import find_mode
 from estimation.moments import unexpected_bias
+from estimation.nuisance import UNLIKE
 from estimation.observations import aligned_weights
 from estimation.posterior import posterior
 from experiments.bank import simulated_cases
@@ -91,7 +92,10 @@ def test_slopes_show_a_pads_compliance_itself(design):
         mine = design.slope & (design.channel == c)
         # Two blocks, two trials; of heights what shows within a grip and from its landing.
         assert mine.sum() == (4 if c == 1 else 8) and (design.unit[mine] == 1).all()
-        both = design.shifts[mine][:, [j[f"{kind}.1"], j[f"{kind}.2"]]].sum(axis=1) / 0.1
+        # Most of what the rig admits both pads have alike.
+        alike, own = 0.1 * np.sqrt(1 - UNLIKE**2), 0.1 * UNLIKE
+        np.testing.assert_allclose(design.shifts[mine][:, j[kind]] / alike, sign, rtol=1e-6)
+        both = design.shifts[mine][:, [j[f"{kind}.1"], j[f"{kind}.2"]]].sum(axis=1) / own
         np.testing.assert_allclose(both, sign, rtol=1e-6)
         np.testing.assert_allclose(design.mean[mine] / np.sqrt(design.variance[mine]), 0.0, atol=3.0)
 

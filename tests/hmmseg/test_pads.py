@@ -63,7 +63,7 @@ def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
     place = 0.02 - 2.5e-4 * held + 2e-5 * np.random.default_rng(1).standard_normal(s.t.size)
     flat = fitted(held + ring, place, s.sd)
     assert flat[0] < 0.5 * 2.5e-4 and flat[1] > (0.2 * 2.5e-4) ** -2  # and sure of it
-    found = _compliance([(held + ring, place, s.sd)], PRIOR)
+    found = _compliance([(held + ring, place, s.sd)], PRIOR, 2.0)
     assert found.value == pytest.approx(PRIOR[0], abs=found.sd) and found.sd > 0.5 * PRIOR[1]
     clean = _compliance([(held, place, s.sd)], PRIOR)
     assert clean.value == pytest.approx(2.5e-4, abs=3 * clean.sd) and clean.sd < 0.2 * PRIOR[1]
