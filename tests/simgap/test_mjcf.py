@@ -140,3 +140,39 @@ def test_a_patch_touches_only_what_changes(files):
     again = option_set(text, {"timestep": "0.002"})
     assert again is not None and 'timestep="0.002"' in again
     mujoco.MjModel.from_xml_string(again)
+
+
+def test_a_share_of_another_integrator_is_that_one_at_a_finer_step(files):
+    """What a method of first order is off by goes with its step: a third of it at a third of the step."""
+    from simgap.simulators.mjcf.load import load_mjcf
+    from simgap.simulators.mjcf.patch import SPELT
+
+    def swung(xml: str, **change: float) -> np.ndarray:
+        found = load_mjcf(*files(xml.replace('name="pivot"', 'name="pivot" damping="0.2"')))
+        t = np.arange(0, 2, 0.01)
+        log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.sin(5 * t)})
+        found.effects([log])
+        values = {n: p.nominal for n, p in found.simulator.parameters.items()}
+        values |= {f"option.{n}": v for n, v in change.items()}
+        (channels,) = found.simulator.simulate_many([Job(values, log, {"q": 0.1, "q_rate": 0.0})])
+        assert channels is not None
+        return channels["q"]
+
+    coarse = XML.replace('timestep="0.001"', 'timestep="0.01"')
+    plain = swung(coarse)
+    for name in ("euler", "implicit", "implicitfast"):
+        fine = XML.replace('"0.001" integrator="RK4"', f'"0.0025" integrator="{SPELT[name]}"')
+        true = swung(fine)
+        off, left = np.abs(plain - true).max(), np.abs(swung(coarse, **{name: 0.25}) - true).max()
+        assert off > 1e-4 and left < 0.1 * off, name
+    np.testing.assert_allclose(swung(coarse.replace("RK4", "Euler"), rk4=1.0), plain, atol=1e-12)
+
+
+def test_the_model_s_own_integrator_is_no_candidate(files):
+    found, _, _ = loaded(files)
+    mine = {"euler", "rk4", "implicit", "implicitfast"} & {n[7:] for n in found.simulator.parameters}
+    assert mine == {"euler", "implicit", "implicitfast"}
+    with pytest.raises(InputError, match=r"option\.rk4: is the model's own integrator"):
+        loaded(files, "option.rk4")
+    with pytest.raises(InputError, match="option has no integratr"):
+        loaded(files, "option.integratr")

@@ -15,7 +15,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
-from simgap.simulators.mjcf.settable import setting_of
+from simgap.simulators.mjcf.settable import INTEGRATORS, integrator_of, setting_of
 from simgap.simulators.mjcf.setting import Setting, name_of, names_of
 from simgap.simulators.mjcf.state_friction import SHARE, sizes_of, state_friction
 from simgap.simulators.protocol import Parameter
@@ -135,8 +135,9 @@ class _Catalogue:
                 self.add(f"option.{axis}", 0.01, "the base is tilted", effect="gravity.direction")
         says = "the simulator's own time step, relative"
         self.add("option.timestep", 0.5, says, low=-1.1, high=1.0)
-        says = "the simulator's integrator: this share of another's result"
-        self.add("option.integrator", 0.5, says, low=0.0, high=1.1)
+        for name in (n for n in INTEGRATORS if integrator_of(n) != int(self.model.opt.integrator)):
+            says = f"the simulator's integrator: this share of what {name} gives"
+            self.add(f"option.{name}", 0.5, says, low=0.0, high=1.1)
         if self.simulator.touching:
             says = "iterations of the simulator's solver: ten times as many"
             self.add("option.iterations", 0.3, says, low=0.0, high=1.0)

@@ -11,6 +11,8 @@ import numpy as np
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.simulators.mjcf.setting import object_id
 
+SPELT = {"euler": "Euler", "rk4": "RK4", "implicit": "implicit", "implicitfast": "implicitfast"}  # in MJCF
+
 
 def patched(xml: Path, found: RobotDiagnosis) -> tuple[str, list[str]]:
     """The XML's text with the causes at their values, and the causes that no attribute of it holds.
@@ -41,7 +43,7 @@ def _written(text: str, simulator, name: str, parameters: Mapping[str, float]) -
     if kind == "body" and attribute in ("mass", "ipos"):
         return _inertial(text, model, thing, parameters)
     if kind == "option":
-        stated = _option(model, attribute, value, parameters)
+        stated = _option(model, name.removeprefix("option."), attribute, value, parameters)
         return None if stated is None else option_set(text, {attribute: stated})
     if kind == "actuator":
         stated = _actuator(model, thing, attribute, value)
@@ -67,7 +69,9 @@ def _actuator(model, thing: str, attribute: str, value: float) -> str | None:
     return {"kv": number(value), "forcerange": numbers([-value, value])}.get(attribute)
 
 
-def _option(model, attribute: str, value: float, parameters: Mapping[str, float]) -> str | None:
+def _option(model, name: str, attribute: str, value: float, parameters: Mapping[str, float]) -> str | None:
+    if attribute == "integrator":  # a share is none: the nearer of the two
+        return SPELT[name] if round(value) == 1 else None
     if attribute == "timestep":
         return number(model.opt.timestep * max(1 + value, 0.25))
     if attribute != "gravity":

@@ -24,12 +24,18 @@ KNOWN = {
     "site": (),
     "equality": (),
 }
-OPTIONS = ("tilt_x", "tilt_y", "timestep", "integrator", "iterations")
+INTEGRATORS = {"euler": "EULER", "rk4": "RK4", "implicit": "IMPLICIT", "implicitfast": "IMPLICITFAST"}
+OPTIONS = ("tilt_x", "tilt_y", "timestep", *INTEGRATORS, "iterations")
+
+
+def integrator_of(name: str) -> int:
+    """MuJoCo's number of an integrator."""
+    return int(getattr(mujoco.mjtIntegrator, f"mjINT_{INTEGRATORS[name]}"))
 
 
 def option_setting(model: Any, attribute: str) -> Setting | None:
-    """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), integrator (0: as it
-    is, 1: fourth-order Runge-Kutta or, from that, Euler), iterations (0: as they are, 1: ten times)."""
+    """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), one of INTEGRATORS
+    (0: the model's own, 1: this one; None if it is that), iterations (0: as they are, 1: ten times)."""
     down = np.array(model.opt.gravity)
     if attribute in ("tilt_x", "tilt_y"):
         axis = 0 if attribute == "tilt_x" else 1
@@ -49,15 +55,16 @@ def option_setting(model: Any, attribute: str) -> Setting | None:
         return Setting(
             "option.timestep", "1", lambda m: 0.0, scale, False, ("option", "", "timestep", None), -0.75
         )
-    if attribute == "integrator":
-        own = int(model.opt.integrator)
-        fourth, euler = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_EULER)
+    if attribute in INTEGRATORS:
+        number = integrator_of(attribute)
+        if number == int(model.opt.integrator):
+            return None
 
         def other(m: Any, value: float) -> None:
-            m.opt.integrator = euler if own == fourth else fourth
+            m.opt.integrator = number
 
         return Setting(
-            "option.integrator", "1", lambda m: 0.0, other, False, ("option", "", "integrator", None), 1.0
+            f"option.{attribute}", "1", lambda m: 0.0, other, False, ("option", "", "integrator", None), 1.0
         )
     if attribute == "iterations":
         count = int(model.opt.iterations)
@@ -78,6 +85,8 @@ def setting_of(model: Any, name: str) -> Setting:
     kind, _, thing = head.partition(":")
     if kind == "option" and dot:
         found = option_setting(model, attribute)
+        if found is None and attribute in INTEGRATORS:
+            raise InputError(where, "is the model's own integrator", "another one")
         if found is None:
             raise InputError(where, f"option has no {attribute}", nearest(attribute, OPTIONS))
         return found
