@@ -3,9 +3,10 @@
     hmmseg diagnose LOGS/so101_*.csv --simulator experiments/real/so101.py:Arm
 
 Nothing is known of the servos but commands and positions, so a joint is an inertia behind a P controller with
-damping, both fitted along. What holds a joint short of its command by the way it comes from is one of three:
-friction, as large as the P gain times an angle; a band of errors that the controller does not see; or play
-between the gears. Each is one cause with a width [rad] for every joint.
+damping, held off its command by a load; all of these were never measured and are fitted along. What holds a
+joint short of its command by the way it comes from is one of three: friction, as large as the P gain times an
+angle; a band of errors that the controller does not see; or play between the gears. Each is one cause with a
+width [rad] for every joint.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ def _parameters():
             width = {"nominal": 0.0, "sd": 0.01, "unit": "rad", "low": 0.0, "high": 0.2}
             out[f"{cause}.{joint}"] = {**width, "effect": cause}
     for joint in JOINTS:
-        out[f"sag.{joint}"] = {"nominal": 0.0, "sd": 0.01, "unit": "rad", "effect": "sag"}
+        load = {"nominal": 0.0, "sd": 0.05, "unit": "rad", "fitted": True, "effect": "sag"}
+        out[f"sag.{joint}"] = load
     return out
 
 
@@ -41,6 +43,7 @@ class Arm:
         **{f"pos_{j}": {"unit": "rad", "kind": "position", "noise": COUNT / np.sqrt(12)} for j in JOINTS},
     }
     parameters = _parameters()
+    window = 2.0  # s: a servo forgets its start, and what sticks shows itself where the motion turns
     says = {  # noqa: RUF012
         "friction": "Coulomb friction holds a joint within this angle of where the P gain would have it",
         "dead_band": "the controller does not see errors below this",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import expit
@@ -20,6 +21,8 @@ MINOR = 0.1  # chosen: share of the whole gap; causes that explain less leave it
 LEAST = 0.02  # chosen: share of the explained gap below which an effect is told but is no cause
 RULED_OUT = 20.0  # chosen: odds against a set from which on it is no alternative
 LISTED = 1e-4  # look: probability below which a set is one of the others
+
+V = TypeVar("V", bound="Verdict")
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Verdict:
     indistinguishable: tuple[str, ...]
     probabilities: dict[str, float]
 
-    def beside(self, more: Iterable[str]) -> Verdict:
+    def beside(self: V, more: Iterable[str]) -> V:
         """The verdict with more effects that cannot be told from its causes."""
         partners = tuple(sorted({*self.indistinguishable, *more} - {*self.causes}))
         return replace(self, verdict="set", indistinguishable=partners) if partners else self

@@ -65,10 +65,9 @@ def _chances(gain: np.ndarray) -> np.ndarray:
     return student.sf(gains.mean(0) / sd, len(gains) - 1)
 
 
-def chance_of_gain(gap: Gap, one: tuple[int, ...], other: tuple[int, ...], fold: np.ndarray) -> float:
-    """Chance that a set gains as much over another on held-out rows without being any better."""
-    score = held_out_scores(gap, [one, other], fold)
-    return float(_chances(score[:, :1] - score[:, 1:])[0])
+def chance_of(gain: np.ndarray) -> float:
+    """Chance that a set gains as much over another on held-out rows (folds,) without being any better."""
+    return float(_chances(gain[:, None])[0])
 
 
 def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> int | None:

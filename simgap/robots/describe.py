@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from simgap.attribution.document import entries, rows
-from simgap.attribution.posterior import Model, fitted
+from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.robots.diagnose import RobotDiagnosis
 
 
@@ -36,9 +36,11 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
     }
 
 
-def parameters(found: RobotDiagnosis, model: Model, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def parameters(
+    found: RobotDiagnosis, f: Forms, model: Model, effects: tuple[str, ...]
+) -> dict[str, dict[str, Any]]:
     """Of a set's effects: short name, or effect and short name where there are several, to its posterior."""
-    gap, out = found.forms.gap, {}
+    gap, out = f.gap, {}
     z = gap.nuisance.shape[1]
     at = z
     names = [c.name for c in gap.candidates]
@@ -65,10 +67,10 @@ def _effects(found: RobotDiagnosis) -> dict[str, Any]:
     plain = fitted(f, ())
     out: dict[str, Any] = {}
 
-    def entry(effects: tuple[str, ...], model: Model) -> dict[str, Any]:
+    def entry(effects: tuple[str, ...], model: Model, f: Forms = f) -> dict[str, Any]:
         gain = found.shrinkage
         return {
-            "parameters": parameters(found, model, effects),
+            "parameters": parameters(found, f, model, effects),
             "log_evidence": model.score - plain.score,
             "heldout_score": 0.0
             if gain is None or effects != v.causes
@@ -80,8 +82,10 @@ def _effects(found: RobotDiagnosis) -> dict[str, Any]:
         out["+".join(v.causes)] = entry(v.causes, v.model)
         for name in v.causes if len(v.causes) > 1 else ():
             out[name] = entry((name,), v.model)
+    for one in v.stand_ins:
+        out[one.name] = entry((one.name,), one.model, one.forms)
     for name in v.indistinguishable:
-        if name in names:
+        if name in names and name not in out:
             out[name] = entry((name,), fitted(f, (names.index(name),)))
     return out
 

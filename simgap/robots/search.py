@@ -138,14 +138,14 @@ def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
     cov = ask.covariances(linear)
     off = learned(cov, linear.residual)
     whiten = cov.whitener(off)
-    linear, leaders = _leaders(composed, linear, whiten, ask.phases, usable, step.best)
-    f = forms(gap_of(composed, linear, whiten, ask.phases, leaders))
+    linear, names = leaders(composed, linear, whiten, ask.phases, usable, step.best)
+    f = forms(gap_of(composed, linear, whiten, ask.phases, names))
     if ask.forced:
-        chosen = tuple(j for j, n in enumerate(leaders) if n in ask.forced)
+        chosen = tuple(j for j, n in enumerate(names) if n in ask.forced)
         models = [fitted(f, chosen), fitted(f, ())]
     else:
-        models = [one_more(f, [leaders.index(n) for n in step.best if n in leaders])]
-    now = tuple(sorted(leaders[j] for j in models[0].effects))
+        models = [one_more(f, [names.index(n) for n in step.best if n in names])]
+    now = tuple(sorted(names[j] for j in models[0].effects))
     found = Found(linear, whiten, cov, off, f, tuple(models), now)
     first = number == 0 and not step.best and bool(step.point)  # what is fitted along is yet to follow
     settled = now == step.best and not first and _gain(found) < SETTLED
@@ -201,7 +201,7 @@ def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point)
     return out
 
 
-def _leaders(
+def leaders(
     composed: Composed,
     linear: Linear,
     whiten: Whitener,

@@ -15,12 +15,10 @@ from simgap.attribution.invariance import residual_left
 from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.attribution.search import weights
 from simgap.attribution.shares import Shares
-from simgap.attribution.verdict import LEAST, MOST, RULED_OUT, Explanation, Verdict, acting, conclude, known
-from simgap.robots.borne_out import BORNE_OUT, chance_of_gain
+from simgap.attribution.verdict import LEAST, MOST, Explanation, Verdict, acting, conclude, known
 from simgap.robots.explained import Explained
 from simgap.robots.scatter import scattering
-
-RIVALS = 8  # numerics: sets that are compared on held-out rows
+from simgap.robots.stand_ins import StandIn
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,7 @@ class RobotVerdict(Verdict):
     shared: tuple[str, ...]  # effects that the shares are of, in their order
     model: Model  # of all that was borne out, too small to be told or not, discrepancies whitened
     chance: dict[str, float]  # of each candidate to act
+    stand_ins: tuple[StandIn, ...] = ()  # what held-out logs do not tell from a cause, each at its best
 
 
 def rivals(f: Forms, causes: Sequence[int]) -> list[Model]:
@@ -57,14 +56,12 @@ def verdict_on(
     every: Forms,
     fold: np.ndarray,
     forced: bool = False,
-    off: bool = False,
     numerics: tuple[int, ...] = (),
 ) -> RobotVerdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
     `causes` were borne out by held-out rows, and explain what `explains` says, in that order; `every` is the
     gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
-    statistics; `fold` (n,) of each row; `off`: whether the model is off by itself, so that only held-out rows
-    tell small differences; `numerics` are candidates of the solver's own.
+    statistics; `fold` (n,) of each row; `numerics` are candidates of the solver's own.
 
     A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
     channels that it moves, and the gap of these is the one that it explains. What is left in others is the
@@ -83,8 +80,6 @@ def verdict_on(
     ]
     mine = tuple(sorted(names[j] for j in kept))
     verdict = conclude(sets, detection.p_value, forced=mine if forced else (), chosen=mine)
-    if verdict.causes and off and not forced:
-        verdict = verdict.beside(names[j] for j in _not_told_apart(f, models, causes, kept, fold))
     rows, band, sd = every.gap.rows, every.spectrum.band, np.ones(every.gap.rows.channel.size)
     named = tuple(j for j, c in enumerate(every.gap.candidates) if c.name in verdict.causes)
     gap = verdict.verdict != "none"
@@ -129,31 +124,3 @@ def _explanation(
     causes = kept if holds else {*model.effects} - ({*borne} - {*kept})
     named = tuple(sorted(names[j] for j in causes))
     return Explanation(tuple(names[j] for j in model.effects), weight, named, chance if kept else 0.0)
-
-
-def _not_told_apart(
-    f: Forms, models: Sequence[Model], causes: tuple[int, ...], named: tuple[int, ...], fold: np.ndarray
-) -> set[int]:
-    """Effects that take a told cause's place and that held-out rows do not tell from it, though all rows
-    together seem to: where the model is off by itself, its likelihood is no judge of small differences."""
-    best = next(m for m in models if m.effects == causes)
-    found: set[int] = set()
-    rivals_of = [
-        m for m in models if len(set(causes) - set(m.effects)) == 1 and len(m.effects) == len(causes)
-    ]
-    for m in [m for m in rivals_of if set(causes) - set(m.effects) <= set(named)][:RIVALS]:
-        apart = log_prior(f, m) - log_prior(f, best)
-        if apart > -np.log(RULED_OUT) and chance_of_gain(f.gap, causes, m.effects, fold) > BORNE_OUT:
-            found |= set(m.effects) - set(causes)
-    return found
-
-
-def log_prior(f: Forms, model: Model) -> float:
-    """Log prior of a set's parameters at its mode, constants left out (Cauchy; see `Candidate`)."""
-    at, out = f.gap.nuisance.shape[1], 0.0
-    for j in model.effects:
-        k = f.gap.candidates[j].at.size
-        x = model.x[at : at + k]
-        out -= 0.5 * (1 + k) * float(np.log1p(x @ x))
-        at += k
-    return out

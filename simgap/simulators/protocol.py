@@ -83,7 +83,8 @@ class Simulator(Protocol):
     Optional: `state_at(recording, t)` gives state name -> (value, standard deviation) where position
     channels do not tell the state; `contacts(recording)` gives times [s] at which windows are to begin;
     `simulate_many(jobs)` runs several jobs at once, None in the place of one that diverged; `numerics` are
-    parameters of the solver and not of the robot, whose small changes are not varied along with others'.
+    parameters of the solver and not of the robot, whose small changes are not varied along with others';
+    `window` [s] is how long it is run from one start, where errors of a start die out and that may be long.
     """
 
     @property

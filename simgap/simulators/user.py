@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -31,6 +32,7 @@ class UserSimulator:
     poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     by_log: Mapping[str, Parameter] = field(default_factory=dict)
     numerics: frozenset[str] = frozenset()
+    window: float | None = None  # s
 
 
 def load_simulator(spec: str) -> UserSimulator:
@@ -89,6 +91,9 @@ def checked(found: Any, where: str) -> UserSimulator:
     numerics = frozenset(getattr(found, "numerics", None) or ())
     for name in numerics - parameters.keys():
         raise InputError(f"{where}: numerics", f"no parameter {name}", nearest(name, list(parameters)))
+    window = getattr(found, "window", None)
+    if window is not None and not (isinstance(window, int | float) and 0 < window < math.inf):
+        raise InputError(f"{where}: window", f"{window!r}", "seconds above 0")
     return UserSimulator(
         parameters,
         channels,
@@ -98,6 +103,7 @@ def checked(found: Any, where: str) -> UserSimulator:
         poses=poses,
         by_log=by_log,
         numerics=numerics,
+        window=window,
         **optional,
     )
 

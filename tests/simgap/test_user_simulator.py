@@ -67,6 +67,7 @@ def test_a_run_that_diverges_is_none(file):
         ("Robot", GOOD.replace("1e-3", "-1e-3"), "channel y: noise -0.001: expected above 0"),
         ("Robot", GOOD.replace("position", "command"), "no channel to compare"),
         ("Robot", GOOD.replace("class Robot:", "class Robot:\n    numerics = {'slop'}"), "no parameter slop"),
+        ("Robot", GOOD.replace("class Robot:", "class Robot:\n    window = 0"), "window: 0; expected"),
         ("Robot", GOOD.replace("def simulate", "def run"), "cannot be run; expected a method simulate"),
     ],
 )  # fmt: skip

@@ -1,0 +1,169 @@
+"""Effects that could stand in for a named cause, each judged where it fits best.
+
+A straight line from where one hysteresis acts to where another would is no measure of either: about the point
+of a dead band, friction at its neutral value moves nothing. So what could take a cause's place is sought
+about the point without that cause, fitted exactly, and linearised where it then is. It stands in where it
+explains most of what the cause does, unless the cause is the better of the two by more than what nobody
+explains, and logs that took no part in a fit bear that out: where the model is off by itself, all rows
+together are no judge of small differences, and what is left could be anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.verdict import MOST, RULED_OUT
+from simgap.robots.borne_out import BORNE_OUT, chance_of, held_out_scores
+from simgap.robots.discrepancy import learned
+from simgap.robots.fit import moved_to
+from simgap.robots.gap import fitted_along, gap_of
+from simgap.robots.linear import linearise
+from simgap.robots.model import Composed, Point
+from simgap.robots.phases import Phases
+from simgap.robots.search import Found, leaders, point_of
+from simgap.robots.whiten import Whitener, covariances
+
+ROUNDS = 3  # numerics: of an exact fit, each linearised where the last ended
+SETTLED = 2.0  # numerics: squares that a further round must gain
+TRIED = 6  # numerics: effects that are tried in a cause's place: those that gain most there
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """An effect in a cause's place: the gap where it acts, and the set with it there."""
+
+    name: str
+    forms: Forms
+    model: Model
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A set at its own best: where that is, the gap linear about it, its log likelihood by fold, and what it
+    leaves: squares by the sensors' noise alone, less the noise's own."""
+
+    point: Point
+    forms: Forms
+    model: Model
+    held_out: np.ndarray
+    left: float
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What sets are compared in: windows, the fold and the factor on the noise's sd of each row (N,), and the
+    whitening by the discrepancies that the causes themselves leave, and by the sensors' noise alone."""
+
+    composed: Composed
+    phases: Phases
+    fold: np.ndarray
+    factor: np.ndarray
+    whiten: Whitener
+    sensor: Whitener
+
+    def among(self, numbers: Sequence[int], point: Point) -> _Asked:
+        """The same in some of the windows alone."""
+        part, mine = self.composed.among(numbers), np.isin(self.composed.rows.window, numbers)
+        factor = self.factor[mine]
+        linear = linearise(part, point, [])
+        cov = covariances(part, linear, factor)
+        whiten = cov.whitener(learned(cov, linear.residual))
+        return _Asked(part, self.phases, self.fold[mine], factor, whiten, cov.whitener())
+
+    def fit(self, point: Point, causes: Sequence[str]) -> _Fit | None:
+        """A set fitted exactly, from a point; None where the simulator diverges with it."""
+        along, squares = fitted_along(self.composed), np.inf
+        for _ in range(ROUNDS):
+            point = moved_to(self.composed, linearise(self.composed, point, []), self.whiten, point)
+            linear, before = linearise(self.composed, point, [*along, *causes]), squares
+            squares = float(np.sum(self.whiten(np.nan_to_num(linear.residual)) ** 2))
+            if before - squares < SETTLED:
+                break
+        if not {*causes} <= linear.moved.keys():
+            return None
+        f = forms(gap_of(self.composed, linear, self.whiten, self.phases, causes))
+        every = tuple(range(len(causes)))
+        rows = np.flatnonzero(np.isfinite(linear.residual))
+        score = held_out_scores(f.gap, [every], self.fold[rows])[:, 0]
+        left = float(np.sum(self.sensor(np.nan_to_num(linear.residual)) ** 2)) - rows.size
+        return _Fit(point, f, fitted(f, every), score, max(left, 0.0))
+
+    def likely(self, point: Point, wanted: Sequence[str]) -> list[tuple[str, Point]]:
+        """Effects that gain most beside those of a point, and from where each is to be fitted."""
+        along = fitted_along(self.composed)
+        here = [n for n in point if n not in along]
+        linear = linearise(self.composed, point, [*along, *here, *wanted])
+        usable = [n for n in (*here, *wanted) if n in linear.moved]
+        linear, names = leaders(self.composed, linear, self.whiten, self.phases, usable, tuple(here))
+        f = forms(gap_of(self.composed, linear, self.whiten, self.phases, names))
+        mine = [names.index(n) for n in here if n in names]
+        sets = {j: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}
+        gain = {j: fitted(f, effects).score for j, effects in sets.items()}
+        first = sorted(gain, key=lambda j: -gain[j])[:TRIED]
+        return [(names[j], point_of(self.composed, f, sets[j], point)) for j in first]
+
+
+def stand_ins(
+    composed: Composed,
+    phases: Phases,
+    ended: Found,
+    wanted: Sequence[str],
+    causes: Sequence[str],
+    fold: np.ndarray,
+    factor: np.ndarray,
+) -> tuple[StandIn, ...]:
+    """Effects that take the place of one of `causes` (of those that act where the search ended) and that
+    held-out logs do not tell from it. `fold`, `factor` (N,): of each row.
+
+    Most are told apart in some of the windows, and are asked no further.
+    """
+    point = ended.linear.point
+    acting = [n for n in point if n not in fitted_along(composed)]
+    others = [n for n in wanted if n not in acting]
+    asked = [_Asked(composed, phases, fold, factor, ended.whiten, ended.covariances.whitener())]
+    few = composed.thinned()
+    if len(few) < len(composed.windows) and np.unique(fold[np.isin(composed.rows.window, few)]).size > 2:
+        asked.insert(0, asked[0].among(few, point))
+    best = [one.fit(point, acting) for one in asked]
+    found: dict[str, StandIn] = {}
+    for out in causes:
+        fewer = [n for n in acting if n != out]
+        without = {n: values for n, values in point.items() if n != out}
+        bare = [one.fit(without, fewer) for one in asked]
+        for name, begin in asked[0].likely(without, others):
+            fit = None
+            for one, causing, lacking in zip(asked, best, bare, strict=True):
+                fit = one.fit(begin, [*fewer, name])
+                if fit is None or causing is None or lacking is None or _told_apart(causing, fit, lacking):
+                    break
+                begin = fit.point
+            else:
+                if fit is not None:
+                    found[name] = StandIn(name, fit.forms, fit.model)
+    return tuple(found.values())
+
+
+def _told_apart(causing: _Fit, other: _Fit, lacking: _Fit) -> bool:
+    """Whether another set is none of the answers; `lacking` is without the cause and what stands for it."""
+    worse = other.left - causing.left
+    if worse > MOST * (lacking.left - causing.left):
+        return True
+    strange = log_prior(causing.forms, causing.model) - log_prior(other.forms, other.model)
+    if strange > np.log(RULED_OUT):
+        return True
+    return worse > causing.left and chance_of(causing.held_out - other.held_out) <= BORNE_OUT
+
+
+def log_prior(f: Forms, model: Model) -> float:
+    """Log prior of a set's parameters at its mode, constants left out (Cauchy; see `Candidate`)."""
+    at, out = f.gap.nuisance.shape[1], 0.0
+    for j in model.effects:
+        k = f.gap.candidates[j].at.size
+        x = model.x[at : at + k]
+        out -= 0.5 * (1 + k) * float(np.log1p(x @ x))
+        at += k
+    return out

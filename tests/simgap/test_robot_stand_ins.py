@@ -1,0 +1,91 @@
+"""What could stand in for a named cause is found where it fits best, and told with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from simgap.attribution.posterior import fitted, forms
+from simgap.attribution.problem import Candidate, Gap, Rows
+from simgap.robots.describe import body
+from simgap.robots.diagnose import diagnose
+from simgap.robots.stand_ins import _Fit, _told_apart
+from simgap.simulators.recording import Recording
+from simgap.simulators.user import checked
+
+RATE, WIDTH = 50.0, 0.03
+
+
+class Servo:
+    """A joint that follows its command but for a band: of errors that the controller does not see, or of
+    friction, which are one and the same here."""
+
+    parameters = {  # noqa: RUF012
+        n: {"nominal": 0.0, "sd": 0.01, "unit": "rad", "low": 0.0, "high": 0.2} for n in ("band", "friction")
+    }
+    channels = {  # noqa: RUF012
+        "cmd": {"unit": "rad", "kind": "command"},
+        "pos": {"unit": "rad", "kind": "position", "noise": 1e-4},
+    }
+    window = 2.0
+
+    def simulate(self, parameters, recording, start=None):
+        """Positions."""
+        return {
+            "pos": follow(
+                parameters["band"] + parameters["friction"], recording["cmd"], start["pos"] if start else 0.0
+            )
+        }
+
+
+def follow(width: float, command: np.ndarray, begin: float, pushed: np.ndarray | None = None) -> np.ndarray:
+    """A first-order lag towards the command outside of the band."""
+    out = np.full(command.size, begin)
+    for i in range(command.size - 1):
+        error = command[i] - out[i]
+        out[i + 1] = out[i] + 0.2 * np.sign(error) * max(abs(error) - width, 0.0)
+        out[i + 1] += 0.0 if pushed is None else pushed[i]
+    return out
+
+
+def logs(count: int = 4) -> list[Recording]:
+    """Triangles of several paces, and pushes that no candidate explains."""
+    rng, t, out = np.random.default_rng(3), np.arange(0, 8, 1 / RATE), []
+    for k in range(count):
+        command = 0.1 * np.abs(((0.2 + 0.1 * k) * t) % 2 - 1)
+        pushed = np.convolve(2e-4 * rng.standard_normal(t.size), np.ones(5), "same")
+        pos = follow(WIDTH, command, command[0], pushed) + 1e-4 * rng.standard_normal(t.size)
+        out.append(Recording(f"log_{k}.csv", t, {"cmd": command, "pos": pos}))
+    return out
+
+
+def test_two_that_do_the_same_are_a_set_wherever_the_search_ended():
+    found = diagnose(checked(Servo(), "servo"), logs())
+    told = body(found)
+    assert told["verdict"] == "set"
+    assert {*told["causes"], *told["indistinguishable"]} == {"band", "friction"}
+    for name in ("band", "friction"):
+        (width,) = told["effects"][name]["parameters"].values()
+        assert abs(width["mean"] - WIDTH) < 0.2 * WIDTH, name
+
+
+def fit(left: float, size: float = 1.0, held_out: float = 0.0) -> _Fit:
+    rows = Rows(*(np.zeros(4, int),) * 3, np.arange(4.0), ("a",), ("y",), ("whole",))
+    one, none, far = np.ones(1), np.zeros(1), np.full(1, 1e3)
+    column = np.ones((4, 1))
+    made = Candidate("c", ("size",), none, none, one, np.zeros(4), column, -far, far)
+    f = forms(Gap(rows, size * column[:, 0], np.zeros((4, 0)), (made,)))
+    model = replace(fitted(f, (0,)), x=np.array([size]))
+    return _Fit({}, f, model, held_out + np.array([0.0, 0.1, -0.1, 0.05]), left)
+
+
+def test_what_is_told_apart():
+    """Of a gap of 1000 the cause leaves 100: that much worse may be chance, whatever held-out logs say."""
+    cause, lacking = fit(100.0), fit(1000.0)
+    worse = {"held_out": -50.0}
+    assert not _told_apart(cause, fit(150.0, **worse), lacking)
+    assert _told_apart(cause, fit(250.0, **worse), lacking)
+    assert not _told_apart(cause, fit(250.0), lacking)
+    assert _told_apart(cause, fit(600.0), lacking)  # most of what the cause explains is left
+    assert _told_apart(cause, fit(100.0, size=200.0), lacking)  # two hundred usual sizes
