@@ -54,9 +54,11 @@ class Style:
 
 @dataclass(frozen=True)
 class Plan:
-    """Commands x1, y1, x2, y2 (n, 4) [m] at every STEP, servos, block centres and moved blocks in order."""
+    """Commands x1, y1, x2, y2 (n, 4) [m] at every STEP, the hand's roll (n,) [rad] about the grip, servos,
+    block centres and moved blocks in order."""
 
     command: np.ndarray
+    roll: np.ndarray
     servos: tuple[Servo, Servo]
     centres: dict[str, tuple[float, float]]
     moved: tuple[str, ...]
@@ -130,12 +132,13 @@ def plan(
     t = np.arange(int(k.now / STEP) + 1) * STEP
     x, y, left, right = (k.path(name, t) for name in ("x", "y", "left", "right"))
     # Uneven heights are settled by the hand that holds: half a roll up on one side, down on the other.
-    lean = u(*style.uneven) + _rolled(k, t, style.roll, rng) * (left + right)
+    uneven, roll = u(*style.uneven), _rolled(k, t, style.roll, rng)
+    lean = uneven + roll * (left + right)
     command = np.stack([x - left, y - lean / 2, x + right, y + lean / 2], 1)
     tremor, wander = u(2.5e-5, 6e-5, 4), u(3e-5, 1.5e-4, 4)
     for c in range(4):
         command[:, c] += _shake(t, 7.0, 11.0, tremor[c], rng) + _shake(t, 0.1, 0.5, wander[c], rng)
-    return Plan(command, servos, centres, tuple(b for b, _ in task.moves))  # type: ignore[arg-type]
+    return Plan(command, roll, servos, centres, tuple(b for b, _ in task.moves))  # type: ignore[arg-type]
 
 
 class _Yard:

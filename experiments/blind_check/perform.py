@@ -48,9 +48,10 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
     pads = [at[n] for n in ("n1", "s1", "n2", "s2")]
     cubes = [[at[f"x_{n}"], at[f"z_{n}"]] for n in names]
     turns = [at[f"turn_{n}"] for n in names]
+    turning = [at["r1"], at["r2"]]
     data.qpos[fingers] = plan.command[0]
     data.qpos[turns] = world.tilt  # what stands on a slope stands inclined
-    command = plan.command[::EVERY]
+    command, roll = plan.command[::EVERY], plan.roll[::EVERY]
     rows, law = len(command), _PadLaw(world)
     bears = _bearings(model, names)
     q_log, v_log = np.empty((rows, model.nq)), np.empty((rows, model.nv))
@@ -62,6 +63,7 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
         mujoco.mj_step(model, data)
     for r in range(rows):
         data.ctrl[:] = command[r]
+        model.qpos_spring[turning] = roll[r]  # pads turn with the hand, and the block with them
         law.push(data, pads)
         q_log[r], v_log[r], pad_log[r] = data.qpos, data.qvel, law.extra
         mujoco.mj_step(model, data)

@@ -13,7 +13,7 @@ from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder, SmallGap
 from simgap.attribution.heldout import how_far
 from simgap.attribution.invariance import POSITIVE, Invariance, invariance, residual_left
-from simgap.attribution.noise import channel_of, noise_of, small_gap, stated
+from simgap.attribution.noise import channel_of, noise_of, shift_size, small_gap, stated
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought, weights
@@ -174,14 +174,31 @@ def _examined(
     least = LEAST * float(part.sum())
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(
-        j for j, p in zip(effects, part, strict=True)
-        if j in scattering or (p >= least and same[j].log_bayes_factor > POSITIVE and _there(f, model, j))
-    )  # fmt: skip
+        j
+        for j, p in zip(effects, part, strict=True)
+        if j in scattering
+        or (
+            (same[j].log_bayes_factor > POSITIVE and _there(f, model, j))
+            and (p >= least or _matters(f, model, j))
+        )
+    )
     shifting = [same[j] for j in causes if j not in scattering]
     left = explained.inside if shifting else 0.0
     factors = [i.log_bayes_factor for i in shifting]
     sure = known(left, 1 - explained.remainder, factors) if causes else 0.0
     return _Examined(effects, model, explained, same, causes, sure)
+
+
+def _matters(f: Forms, model: Model, effect: int) -> bool:
+    """Whether an effect is more than is tolerated, however little that is beside others."""
+    c, own = f.gap.candidates[effect], coordinates(f, model.effects)[effect]
+    if c.least is not None and (np.abs(c.scale * model.x[own]) >= c.least).any():
+        return True
+    if f.gap.tolerance is None:
+        return False
+    without = fitted(f, tuple(j for j in model.effects if j != effect))
+    shift = residual_left(f, without) - residual_left(f, model)
+    return shift_size(f, shift, f.gap.tolerance) >= 1.0
 
 
 def _there(f: Forms, model: Model, effect: int) -> bool:

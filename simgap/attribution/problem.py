@@ -64,7 +64,8 @@ class Candidate:
     parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
     a parameter is a share of; its deviation from neutral where that is not given, or not finite.
     `frees` (n,): by how much, at most, the variance of cosine coefficients of cells may be larger
-    where it acts, in units of the noise's.
+    where it acts, in units of the noise's. `least` (k,): deviations that matter by themselves, whatever they
+    shift.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Candidate:
     hidden: tuple[str, ...] = ()
     size: Float[np.ndarray, " k"] | None = None
     frees: np.ndarray | None = None
+    least: Float[np.ndarray, " k"] | None = None
 
     def taken(self, rows: np.ndarray) -> Candidate:
         """The candidate on some rows."""
@@ -90,7 +92,7 @@ class Candidate:
         return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
                          self.jacobian[rows], self.low, self.high, variance, self.evidence, self.named,
                          self.form, self.hidden, self.size,
-                         None if self.frees is None else self.frees[rows])  # fmt: skip
+                         None if self.frees is None else self.frees[rows], self.least)  # fmt: skip
 
 
 @dataclass(frozen=True)

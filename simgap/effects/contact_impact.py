@@ -36,7 +36,7 @@ EFFECT = Effect(
     mistaken_for=("structural_vibration",),
     called="shocks as blocks touch down",
     check="Set down more slowly, and see whether the gap is gone.",
-    parameters=(Parameter("impulse", "N s", 0.03),),
+    parameters=(Parameter("impulse", "N s", 0.03, low=0.0),),
     stage=CONTACT,
     correct=_correct,
     apply=_apply,

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from simgap.effects.base import READOUT, Effect, Parameter
-from simgap.gap.trial_arrays import CHANNELS
 
 REPEATED = 0.5  # chosen: share of repeated values that only a lattice has
 WRITTEN = 1e-5  # prior: N; how finely forces are written that were not rounded before
-SHARES = {"fx": 2.0, "fy": 2.0, "grip": 0.5, "shear": 0.5}  # prior: of one sensor's variance, in net forces
 
 
 def _scatter(given, residual: np.ndarray):
@@ -19,11 +17,11 @@ def _scatter(given, residual: np.ndarray):
     most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
     were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each.
     """
+    from simgap.gap.rounding import rounded_variance
     from simgap.gap.scatter import Scatter
 
-    frame = given.frame
-    force = frame.world.force[: frame.num_trials]
-    values = np.concatenate([force[r, :n].ravel() for r, n in enumerate(frame.lengths)])
+    read = np.concatenate([force.ravel() for force in given.frame.forces])
+    values = read[np.isfinite(read)]
     levels = np.unique(np.round(np.abs(values), 6))
     if 1 - levels.size / values.size < REPEATED or levels.size < 4:
         return None
@@ -36,14 +34,8 @@ def _scatter(given, residual: np.ndarray):
     off = np.abs(values / step - np.round(values / step))
     if np.mean(off < 0.1) < 0.9:
         return None
-    weight = given.whitening.weight
-    variance = np.zeros_like(weight)
-    for channel, share in SHARES.items():
-        c = CHANNELS.index(channel)
-        variance[..., c] = share * step**2 / 12 * weight[..., c] ** 2
-    return Scatter(
-        "quantisation", step, 1e-3, variance[weight > 0], float(values.size * np.log(step / WRITTEN))
-    )
+    known = float(4 * sum(given.frame.lengths) * np.log(step / WRITTEN))
+    return Scatter("quantisation", step, 1e-3, rounded_variance(given, step), known)
 
 
 EFFECT = Effect(

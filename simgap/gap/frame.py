@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hmmseg.contact.decompose import Subtask, height_equations
-from hmmseg.io.rig import Rig
+from hmmseg.hand.grouping import group_size
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials
 from simgap.effects.base import World
-from simgap.gap.trial_arrays import boundary_quantiles, trial_arrays
+from simgap.gap.trial_arrays import MAX_RATE, boundary_quantiles, trial_arrays
 
 TRIALS = 4  # numerics: arrays are padded to multiples of it, so that few programs are compiled
 
@@ -45,7 +46,10 @@ class Arrays(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """Everything the diagnosis needs of aligned trials; the first `num_trials` rows are real."""
+    """Everything the diagnosis needs of aligned trials; the first `num_trials` rows are real.
+
+    `forces`: each trial's forces (N, 4) [N] as they were read, of which `groups` became one sample here.
+    """
 
     files: tuple[str, ...]
     steps: tuple[Subtask, ...]
@@ -54,6 +58,8 @@ class Frame:
     world: World
     arrays: Arrays
     lengths: tuple[int, ...]
+    forces: tuple[np.ndarray, ...]
+    groups: tuple[int, ...]
 
     @property
     def num_trials(self) -> int:
@@ -109,6 +115,8 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
         _world(stack, events, rig),
         arrays,
         lengths,
+        tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t, _ in chosen),
+        tuple(group_size(t.rate, MAX_RATE) for t, _ in chosen),
     )
 
 

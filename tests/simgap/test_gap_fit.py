@@ -111,7 +111,7 @@ def test_quantisation_is_seen_and_not_imagined(healthy):
     assert not scatters(given, found.residual, ["quantisation"])
     finish = effect_named("quantisation").finish
     assert finish is not None
-    rounded = given.frame.world._replace(force=finish(given.frame.world.force, {"step": 0.04}))
-    coarse = replace(given, frame=replace(given.frame, world=rounded))
+    rounded = tuple(finish(force, {"step": 0.04}) for force in given.frame.forces)
+    coarse = replace(given, frame=replace(given.frame, forces=rounded))
     (seen,) = scatters(coarse, found.residual, ["quantisation"])
     assert seen.value == pytest.approx(0.04, rel=1e-3) and seen.known > 100
