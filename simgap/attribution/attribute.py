@@ -12,7 +12,13 @@ from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder, SmallGap
 from simgap.attribution.heldout import how_far
-from simgap.attribution.invariance import POSITIVE, Invariance, invariance, residual_left
+from simgap.attribution.invariance import (
+    POSITIVE,
+    Invariance,
+    invariance,
+    residual_left,
+    scatter_between,
+)
 from simgap.attribution.noise import channel_of, noise_of, shift_size, small_gap, stated
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.problem import Gap
@@ -237,7 +243,7 @@ def _effects(
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
         same = None if found is None else found.invariance[j]
-        wide = np.hypot(sd, _wander(same) * np.abs(mean - c.neutral))
+        wide = np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,
             {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))
@@ -245,6 +251,8 @@ def _effects(
     return out
 
 
-def _wander(same: Invariance | None) -> float:
-    """By which share an effect's parameters wander from part to part, 0 where nothing tells."""
-    return 0.0 if same is None or np.isnan(same.wander) else same.wander
+def _between(f: Forms, model: Model, effect: int) -> np.ndarray:
+    """Variance (k,) of an effect's deviations over scale, for trials differ, or channels and subtasks."""
+    rows = f.gap.rows
+    _, place = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
+    return np.maximum(*(scatter_between(f, model, effect, part) for part in (rows.trial, place)))

@@ -14,7 +14,7 @@ from simgap.attribution.background import Background
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.heldout import how_far
-from simgap.attribution.invariance import WANDER, invariance
+from simgap.attribution.invariance import WANDER, invariance, scatter_between
 from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import sought, weights
@@ -130,6 +130,28 @@ def test_invariance_is_the_random_effects_likelihood():
     assert found.log_bayes_factor == pytest.approx(float(one - several), abs=1e-6)
     assert found.log_bayes_factor > 1 and found.p_value > 0.01
     np.testing.assert_allclose(found.estimates[:, 0], 2.0, atol=4 * np.nanmax(found.sds))
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.3])
+def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
+    rows = rows_of(samples=30)
+    part = rows.channel * len(rows.parts) + rows.part
+    held, plain, widened = [], [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        push = np.ones(rows.time.size)
+        sizes = 2.0 * (1 + wander * rng.standard_normal(6))
+        residual = rng.standard_normal(rows.time.size) + sizes[part] * push
+        f = forms(Gap(rows, residual, np.zeros((rows.time.size, 0)), (linear("a", push[:, None]),)))
+        model = fitted(f, (0,))
+        more = scatter_between(f, model, 0, part)[0]
+        sd = np.sqrt(model.covariance[0, 0] + more)
+        held.append(abs(model.x[0] - 2.0) < 1.645 * sd)
+        plain.append(abs(model.x[0] - 2.0) < 1.645 * np.sqrt(model.covariance[0, 0]))
+        widened.append(more / model.covariance[0, 0])
+    # Groups that are off count for less, so that six parts are few: 90 % is not reached, noise alone is far off.
+    assert sum(held) >= (40 if wander else 50)
+    assert sum(plain) < 20 if wander else np.median(widened) < 1
 
 
 def test_what_changes_sign_between_trials_is_no_cause():
