@@ -149,7 +149,7 @@ def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
         held.append(abs(model.x[0] - 2.0) < 1.645 * sd)
         plain.append(abs(model.x[0] - 2.0) < 1.645 * np.sqrt(model.covariance[0, 0]))
         widened.append(more / model.covariance[0, 0])
-    # Groups that are off count for less, so that six parts are few: 90 % is not reached, noise alone is far off.
+    # Parts that are off count for less, which leaves few: noise alone holds 11 of 60 with them, this 42.
     assert sum(held) >= (40 if wander else 50)
     assert sum(plain) < 20 if wander else np.median(widened) < 1
 
