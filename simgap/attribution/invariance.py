@@ -16,6 +16,7 @@ from simgap.attribution.posterior import Forms, Model, coordinates
 
 WANDER = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5])  # prior: shares of the parameters
 OTHER = 0.5  # chosen: wander from which on it is not one cause
+SINGULAR = 1e-12  # numerics: share of the largest eigenvalue below which nothing is told
 # cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
 POSITIVE = float(np.log(3.0))
 
@@ -121,9 +122,11 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
         inner = [np.linalg.inv(one + h @ prior) for h in found.bend]
         bend = sum(each @ h for each, h in zip(inner, found.bend, strict=True))
         pull = sum(each @ g for each, g in zip(inner, found.pull, strict=True))
-        covariance = np.linalg.pinv(bend, rcond=1e-12, hermitian=True)
+        size, axes = np.linalg.eigh(bend)
+        told = size > SINGULAR * size.max()
+        covariance = (axes[:, told] / size[told]) @ axes[:, told].T
         # The mean is known from the same parts (restricted likelihood: Patterson & Thompson, Biometrika 58).
-        score[i] += 0.5 * pull @ covariance @ pull + 0.5 * np.linalg.slogdet(covariance)[1]
+        score[i] += 0.5 * float(pull @ covariance @ pull - np.log(size[told]).sum())
         scatter.append(np.diag(covariance))
     weight = np.exp(score - np.logaddexp.reduce(score))
     out[found.loose] = weight @ np.maximum(np.stack(scatter) - scatter[0], 0.0)

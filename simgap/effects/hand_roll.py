@@ -11,6 +11,7 @@ from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance
 from simgap.gap.trial_arrays import CHANNELS
 
 SLOW = 2.0  # prior: Hz; a hand with a block in it turns no faster (an arm's own modes lie above)
+VARIED = 0.5  # prior: log sd of a carry's roll about that of all: a second of it is one swing or two
 ROLLS = np.geomspace(2e-4, 0.1, 40)  # prior: rad
 
 
@@ -42,7 +43,7 @@ def _scatter(given, residual: np.ndarray):
         square[at] = np.asarray(dct(residual[at], norm="ortho")) ** 2
     if not (unit > 0).any():
         return None
-    found = on_grid("hand_roll", square, unit, ROLLS, rows.cell)
+    found = on_grid("hand_roll", square, unit, ROLLS, rows.cell, VARIED)
     # How much of it there is in which carry and how fast nobody knows: what lies there has its own variance.
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 

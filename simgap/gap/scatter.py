@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
 from simgap.attribution.invariance import POSITIVE
 from simgap.effects import fitted
@@ -29,12 +30,13 @@ class Scatter:
 
 
 def on_grid(
-    effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None
-) -> Scatter:
+    effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None,
+    spread: float = 0.0,
+) -> Scatter:  # fmt: skip
     """The most likely size of a scatter with variance size^2 `unit` (n,), from squares (n,) of residuals.
 
-    `part` (n,): numbers of parts in which one cause has one size. One that would have another in each, by a
-    Bayes factor of POSITIVE, or a size at the grid's end, is an imitation.
+    `part` (n,): numbers of parts in which one cause has one size, but for a log sd of `spread`. One that
+    would have any other in each, by a Bayes factor of POSITIVE, or a size at the grid's end, is an imitation.
     """
     mine = np.flatnonzero(unit > 0)
     variance = 1 + grid[:, None] ** 2 * unit[mine]
@@ -48,7 +50,11 @@ def on_grid(
     if part is not None:
         each = np.stack([np.bincount(part[mine], row) for row in nats])
         several = (np.logaddexp.reduce(each, axis=0) - np.log(grid.size)).sum()
-        one = np.logaddexp.reduce(score) - np.log(grid.size)
+        if spread > 0:
+            near = norm.logpdf(np.log(grid), np.log(grid)[:, None], spread)
+            near -= np.logaddexp.reduce(near, axis=1, keepdims=True)
+            each = np.logaddexp.reduce(near[:, :, None] + each, axis=1)
+        one = np.logaddexp.reduce(each.sum(1)) - np.log(grid.size)
         same = same and bool(one > several - POSITIVE)
     return Scatter(effect, float(grid[best]), sd, grid[best] ** 2 * unit, known, same)
 
