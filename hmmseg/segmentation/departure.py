@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask
-from hmmseg.segmentation.free_contacts import IMPOSSIBLE, FreeContacts, switching
+from hmmseg.segmentation.free_contacts import IMPOSSIBLE, RINGING, FreeContacts, switching
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
 SETTLING, STAGES = 0.2, 3  # prior: s, and most stages (of an Erlang law) in which a contact state settles
-RINGING = 0.1  # prior: share of samples that ring while a contact settles
 BRIEF = 1e-8  # prior: to end before is less likely by this: a bounce is no grip, a halt in the air no place
 
 
@@ -42,7 +41,7 @@ def settled(
     table = scored(free, columns)
     every = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
     every[:, -1] = table
-    every[:, :-1] = _settling_table(table, index, free.states)[:, None]
+    every[:, :-1] = _settling_table(table, index, free)[:, None]
     for i, c in enumerate(columns):  # a block is let go by fingers that open; a path that leaves may lose it
         if c is not None and i > 0 and free.states[c][0] == FREE:
             every[:, 0, i] += free.opened[: len(table)]
@@ -98,17 +97,17 @@ def _settling(
     return np.r_[np.full(stages * log_initial.size, -np.inf), log_initial], np.block(blocks)
 
 
-def _settling_table(
-    table: np.ndarray, columns: np.ndarray, states: tuple[tuple[str, int | None], ...]
-) -> np.ndarray:
+def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) -> np.ndarray:
     """Log-likelihoods (num_timesteps, num_states) while a contact settles.
 
     Fingers and block ring for a while after any contact change. What the forces of a ringing sample
-    do says which block is held, but not how: every hold of it scores as the likeliest of them.
+    do says which block is held, but not how: every hold of it scores as the likeliest of them. Fingers that
+    have just let go ring in the air.
     """
     out = table.copy()
-    blocks = np.array([-1 if block is None else block for _, block in states])
+    blocks = np.array([-1 if block is None else block for _, block in free.states])
     block = np.where(columns < 0, -1, blocks[columns])
+    out[:, (columns >= 0) & (block < 0)] = free.ringing[: len(table), None]
     for number in np.unique(block[block >= 0]):
         same = block == number
         ringing = np.log(RINGING) + table[:, same].max(axis=1, keepdims=True)

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.contact.equations import block_width
+from hmmseg.levels import SURE
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import otsu
 
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
 SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
-APART = 10  # chosen: noise sds of the grip force between free and gripped
+PRESSED = 30  # chosen: noise sds of a grip force that is there all the time, and so no bias
 # chosen: m from the heights at a grip's ends (medians of so many samples) to be lifted
 RAISED, ENDS = 3e-3, 3
 
@@ -50,10 +51,10 @@ def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
         return np.zeros(4), noise, ~every
     split = otsu(grip)
     low, high = grip[there & (grip <= split)], grip[there & (grip > split)]
-    apart = high.size > 0 and np.median(high) - np.median(low) > APART * noise
+    apart = high.size > 0 and np.median(high) - np.median(low) > SURE * noise
     # Where one group alone is there, opposed forces far above the noise are a grip, others a bias.
     opposed = abs(median(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
-    if np.median(low) > (0.3 * np.median(high) if apart else 3 * APART * noise) and opposed:
+    if np.median(low) > (0.3 * np.median(high) if apart else PRESSED * noise) and opposed:
         return np.zeros(4), noise, every
     threshold = np.median(low) + 0.25 * (np.median(high) - np.median(low)) if apart else np.inf
     held = filled(grip) > threshold

@@ -27,6 +27,7 @@ STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in st
 CLOSED = (
     1e-3  # prior: share of blocks let go where they stand by fingers that slide off them, without opening
 )
+RINGING = 0.1  # prior: share of samples that ring while a contact settles
 ROUNDS = 8  # numerics: of an iteration that settles sooner
 # cited: s; no touch that ends sooner can have been meant to lift: grip forces rise for about as long before a
 # lift as loads do in it, 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
@@ -39,7 +40,8 @@ IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never sh
 class FreeContacts:
     """The fitted alternative: `table` (num_timesteps, num_states) of log-likelihoods of `states`.
 
-    Samples are `interval` s apart. A state is (contact state, number of its block in `blocks`; None in
+    Samples are `interval` s apart; `ringing` (num_timesteps,): log-likelihoods of free motion just after a
+    contact. A state is (contact state, number of its block in `blocks`; None in
     free motion); `path` (num_timesteps,) is the most probable sequence of states. `opened` (num_timesteps,):
     log-likelihoods of how far apart the fingers are, if they just let go of a block that stays where it is.
     `taps` [s] are touches of a block before its grip: to the path they are free motion, in the table they say
@@ -52,6 +54,7 @@ class FreeContacts:
     table: np.ndarray
     path: np.ndarray
     opened: np.ndarray
+    ringing: np.ndarray
     interval: float
     taps: tuple[tuple[float, float], ...] = ()
 
@@ -103,9 +106,10 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
     tapped = _tapped(states, path, interval, f)
     taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
     opened = _opened(f, states, path, parameters.bias)
+    ringing = log_likelihoods(f, _subtasks(states[:1]), replace(parameters, levels=()), 0, rung=RINGING)[:, 0]
     for span in tapped:
-        table[span], path[span] = 0.0, 0
-    return FreeContacts(parameters, blocks, states, table, path, opened, interval, taps)
+        table[span], ringing[span], path[span] = 0.0, 0.0, 0
+    return FreeContacts(parameters, blocks, states, table, path, opened, ringing, interval, taps)
 
 
 def _opened(
@@ -155,7 +159,8 @@ def _tapped(
 def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Parameters) -> np.ndarray:
     """Log-likelihoods (num_timesteps, num_states) without levels.
 
-    No free sample may ring: whoever holds what the task does not name would pass for that.
+    No free sample may ring, but just after a contact: whoever holds what the task does not name would pass
+    for that.
     """
     return log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY, rung=0.0)
 
