@@ -27,7 +27,7 @@ from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.spans import Segmentation
 
 RESULTS = Path(__file__).parent / "results"
-FIRST, TRIALS = 84_000, 16
+FIRST, TRIALS = 98_000, 32
 Scored = tuple[Segmentation, np.ndarray]
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -23,22 +22,21 @@ import numpy as np
 
 from experiments.bank import deviated, draw_deviations
 from experiments.saving import save
-from experiments.scoring import boundaries_covered, boundary_residuals
 from experiments.sweeps.cells import Cell
 from experiments.sweeps.trials import GRASP_SPREAD, disturbed, recording_rig, scene
+from experiments.world_scores import Replicate, line, score, summary
 from hmmseg.io.rig import Fingertip, Noise, Rig, Systematic
 from hmmseg.io.task import BlockTask, parse_task
 from hmmseg.io.trial import Trial
 from simgap.gap.synthetic import recorded
 from simgap.world.operator import OperatorSettings
-from simgap.world.properties import Block, random_properties
+from simgap.world.properties import random_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "calibration_worlds.json"
-FIRST, REPLICATES = 93_000, 16
+FIRST, REPLICATES = 96_000, 32
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
-LEVELS = (0.68, 0.95)
 BIAS = 0.02  # N, what [systematic] admits where a row has biases
 PADS = 0.3  # share, likewise of pads
 
@@ -102,17 +100,6 @@ def task_of(blocks: int) -> BlockTask:
     task = parse_task({"objects": {n: {"on": on} for n, on in under.items()}, "moves": moves})
     assert isinstance(task, BlockTask)
     return task
-
-
-@dataclass(frozen=True)
-class Replicate:
-    """Trials as the estimator gets them, with the truth."""
-
-    task: BlockTask
-    rig: Rig
-    trials: list[Trial]
-    boundaries: list[np.ndarray]
-    blocks: dict[str, Block]
 
 
 def replicates(row: Row, num: int) -> Iterator[Replicate]:
@@ -182,94 +169,6 @@ def _told(row: Row, sensors: Rig) -> Rig:
     if row.doubted:
         told = told.model_copy(update={"systematic": Systematic(pad_stiffness=(PADS, PADS))})
     return told.model_copy(update={"systematic": HAND}) if row.deviating else told
-
-
-def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
-    """One replicate: errors, sds and ranks of its properties; errors and intervals of its boundaries."""
-    from estimation import identify
-
-    began = time.process_time()
-    said = identify(found.trials, found.task, found.rig, seed)
-    properties = []
-    for obj, block in found.blocks.items():
-        for prop in ("weight", "width", "height"):
-            if (obj, prop) not in said.names:
-                continue
-            draws, true = said.of(obj, prop), getattr(block, prop)
-            properties.append({
-                "of": f"{obj}.{prop}", "share": float(draws.mean() / true - 1),
-                "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
-            })  # fmt: skip
-    for i, unknown in enumerate(said.combinations):
-        true = sum(c * found.blocks[obj].height for obj, c in unknown.terms.items())
-        draws = said.combined[:, i]
-        properties.append({
-            "of": ".".join(unknown.name), "share": float(draws.mean() / true - 1),
-            "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
-        })  # fmt: skip
-    pairs = [(s, b) for s, b in zip(said.segmentations, found.boundaries, strict=True) if s.complete]
-    residual = [r for s, b in pairs for r in boundary_residuals(s, b)]
-    held = [r for s, b in pairs for r in boundaries_covered(s, b)]
-    return {
-        "properties": properties, "boundaries": [float(r) for r in residual], "held_90": held,
-        "misfits": sum(not s.complete for s in said.segmentations), "trials": len(found.trials),
-        "sampler": None if said.sampled is None else said.sampled.method,
-        "seconds": time.process_time() - began,
-    }  # fmt: skip
-
-
-def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """A row of the table: coverages, each with its standard error over replicates, and rms of z."""
-    out: dict[str, Any] = {
-        "replicates": len(scored), "trials": sum(s["trials"] for s in scored),
-        "misfits": sum(s["misfits"] for s in scored),
-        "laplace": sum(s["sampler"] == "laplace" for s in scored),
-    }  # fmt: skip
-    ranks = [np.array([p["rank"] for p in s["properties"]]) for s in scored]
-    z = np.concatenate([[p["z"] for p in s["properties"]] for s in scored])
-    out["properties"] = int(z.size)
-    out["z_rms"] = float(np.sqrt(np.mean(z**2))) if z.size else None
-    for level in LEVELS:
-        inside = [np.abs(r - 0.5) < level / 2 for r in ranks]
-        out[f"coverage_{100 * level:.0f}"], out[f"se_{100 * level:.0f}"] = clustered(inside)
-    for prop in ("weight", "width", "height"):
-        mine = [p for s in scored for p in s["properties"] if p["of"].endswith(prop)]
-        if mine:
-            out[prop] = {
-                "rms": float(np.sqrt(np.mean([p["share"] ** 2 for p in mine]))),
-                "z_rms": float(np.sqrt(np.mean([p["z"] ** 2 for p in mine]))),
-                "coverage_95": float(np.mean([abs(p["rank"] - 0.5) < 0.475 for p in mine])),
-            }
-    out["coverage_90"], out["se_90"] = clustered([np.array(s["held_90"]) for s in scored])
-    boundaries = np.concatenate([s["boundaries"] for s in scored])
-    out["boundary_median"] = float(np.median(np.abs(boundaries))) if boundaries.size else None
-    return out
-
-
-def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]:
-    """Share inside and its standard error, replicates as clusters; at least that of as many coin tosses."""
-    rows = [np.asarray(r, float) for r in inside if len(r)]
-    if not rows:
-        return None, None
-    every = np.concatenate(rows)
-    share = float(every.mean())
-    scores = np.array([(r - share).sum() for r in rows]) / np.mean([r.size for r in rows])
-    spread = float(np.std(scores, ddof=1) / np.sqrt(len(rows))) if len(rows) > 1 else 0.0
-    # Agresti and Coull's: where all are inside, a standard error of nought says too much.
-    share_at_least = (every.sum() + 2) / (every.size + 4)
-    return share, max(spread, float(np.sqrt(share_at_least * (1 - share_at_least) / (every.size + 4))))
-
-
-def line(name: str, s: dict[str, Any]) -> str:
-    """A row for people."""
-
-    def percent(key: str) -> str:
-        share, se = s[f"coverage_{key}"], s[f"se_{key}"]
-        return "   -   " if share is None else f"{100 * share:4.0f} +- {100 * se:2.0f}"
-
-    z = "" if s["z_rms"] is None else f"{s['z_rms']:.2f}"
-    return (f"{name:26} {s['trials']:3} trials {s['misfits']:2} misfits  68 %: {percent('68')}  95 %: "
-            f"{percent('95')}  z rms {z}  boundaries 90 %: {percent('90')}")  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -52,19 +52,26 @@ def boundaries() -> str | None:
 
 
 def worlds() -> str | None:
-    """Worlds that differ, a row each."""
-    found = load("calibration_worlds")
+    """Worlds that differ, a row each, beside what they were by an earlier code and on other seeds."""
+    found, before = load("calibration_worlds"), load("calibration_worlds_before")
     if found is None:
         return None
     rows = []
     for name, s in found["rows"].items():
+        was = before["rows"].get(name) if before else None
+        earlier = [
+            "" if was is None or was[f"coverage_{k}"] is None else percent(was[f"coverage_{k}"], 0)
+            for k in ("95", "90")
+        ]
         rms = [percent(s[p]["rms"], 2) if p in s else "" for p in ("weight", "width", "height")]
-        z = "" if s["z_rms"] is None else f"{s['z_rms']:.2f}"
+        needed = ["" if s[k] is None else f"x{s[k]:.2f}" for k in ("needed_95", "needed_90")]
         cover = [_covered(s, level) for level in ("68", "95", "90")]
         median = "" if s["boundary_median"] is None else f"{1e3 * s['boundary_median']:.1f} ms"
-        rows.append([name, f"{s['trials']} ({s['misfits']})", f"{s['properties']}", *rms, z, *cover, median])
-    head = ["world", "trials (misfits)", "properties", "weight rms", "width rms", "height rms", "rms of z",
-            "68 % cover", "95 % cover", "boundaries, 90 % cover", "boundaries, median"]  # fmt: skip
+        cells = [*rms, cover[0], earlier[0], cover[1], needed[0], earlier[1], cover[2], needed[1], median]
+        rows.append([name, f"{s['trials']} ({s['misfits']})", *cells])
+    head = ["world", "trials (misfits)", "weight rms", "width rms", "height rms", "68 % cover",
+            "95 % covered before", "now", "would at", "boundaries, 90 % covered before", "now", "would at",
+            "median"]  # fmt: skip
     return markdown(head, rows)
 
 
