@@ -16,7 +16,7 @@ one that differs from grip to grip. Beside the means stand slopes over the pads'
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -97,9 +97,13 @@ class Design:
 
 
 def build(
-    trials: Sequence[Trial], aligned: Sequence[WeighedTrial], noise: Noise, task: BlockTask, rig: Rig
-) -> Design:
-    """Design of the given aligned trials."""
+    trials: Sequence[Trial], aligned: Sequence[WeighedTrial], noise: Noise, task: BlockTask, rig: Rig,
+    doubted: bool | None = None,
+) -> Design:  # fmt: skip
+    """Design of the given aligned trials.
+
+    `doubted`: whether the rig's pads are in doubt by what slopes say against them; None: if that is likelier.
+    """
     moves = list(range(len(task.performed)))
     objects = [task.performed[m].object for m in moves]
     rises = dict(height_equations(task))
@@ -125,6 +129,7 @@ def build(
         np.stack(each) for each in zip(*(slope_variances(a, moves) for a in aligned), strict=True)
     )
     doubt = pad_doubt(slopes, slope_variance, alike, aligned, rig)
+    doubt = replace(doubt, doubted=max(doubt.odds) > 0.5 if doubted is None else doubted)
     slope_variance += doubt.slope_sd()[sloped] ** 2
     deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from estimation.actual import Actual
-from estimation.design import Design, build
+from estimation.design import Design
+from estimation.either import designs, sample_either
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.observations import Noise, WeighedTrial, aligned_weights
-from estimation.posterior import posterior
 from estimation.predictive import PredictiveCheck, check
 from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
 from estimation.rolling import without_roll
-from estimation.sampler import Draws, sample
+from estimation.sampler import Draws
 from estimation.sliding import with_slides
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
@@ -163,7 +163,7 @@ def identify_aligned(
     weighed, noise = aligned_weights(level, rng)
     weighed = with_slides(weighed, noise, aligned.rig)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
-    design = build(trials, weighed, noise, aligned.task, rig)
+    design, other = designs(trials, weighed, noise, aligned.task, rig)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
     hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
     if "friction" in hidden:
@@ -173,8 +173,7 @@ def identify_aligned(
     sampled, predictive = None, None
     reasons = _reasons(aligned, design, friction)
     if design.unknowns:
-        found = posterior(design)
-        sampled = sample(found, seed, progress)
+        found, sampled = sample_either(design, other, seed, progress)
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings

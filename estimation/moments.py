@@ -90,7 +90,7 @@ def pad_doubt(
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
     return PadDoubt(
         -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], *usual,
-        (found[DISTANCE][1], found[RISE][1]), (shared[DISTANCE], shared[RISE]),
+        (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
     )  # fmt: skip
 
 

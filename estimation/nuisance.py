@@ -61,8 +61,8 @@ class PadDoubt:
     """What recordings show of the pads and the rig does not admit: how much softer they are, as shares.
 
     `normal`, `shear`: along the grip and in shear the compliance seems 1 + share times the nominal; `odds`
-    are the probabilities that the rig is so wrong, and the extra prior variance is that times the share's
-    square. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
+    are the probabilities that the rig is so wrong; where it is `doubted`, the extra prior sd is as large as
+    the share. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
     how much pads may give, by what the recordings show, whose stiffness the rig leaves unstated; 0 where it
     states one. `usual_normal`, `usual_shear`: forces of one finger as they usually are in a grip, and where a
     block is put down [N].
@@ -75,11 +75,12 @@ class PadDoubt:
     usual_normal: float = 1.0
     usual_shear: float = 1.0
     odds: tuple[float, float] = (0.0, 0.0)
+    doubted: bool = False
     apart: tuple[float, float] = (0.0, 0.0)
 
     def extra_sd(self, kind: str) -> float:
         """Prior standard deviation of the share, "normal" or "shear", beyond what the rig admits."""
-        return abs(getattr(self, kind)) * float(np.sqrt(self.odds[kind == "shear"]))
+        return abs(getattr(self, kind)) if self.doubted else 0.0
 
     def slope_sd(self) -> np.ndarray:
         """Standard deviations (3,) by channel of what slopes are off by alike and each of its own.

@@ -8,6 +8,7 @@ import numpy as np
 
 from estimation.compliance import unit_pads
 from estimation.design import Design
+from estimation.either import CERTAIN
 from estimation.observations import CHANNELS
 from hmmseg.io.plausibility import Finding, all_changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -18,7 +19,6 @@ from hmmseg.segmentation.align import AlignedTrials
 STEEL = 7850.0  # physics: [kg/m^3]
 DEEPEST = 10.0  # limit: depths of a block in widths; none is held by two pads that is deeper
 LIGHT = 1500.0  # limit: [kg/m^3]: plastics and stone, of which the unit that makes it is the likeliest
-CERTAIN = 0.99  # chosen: probability from which it is said that the rig's pads are wrong
 NOT_LEVEL = 2e-3  # chosen: m; more than a tilted table or a slip in the grip make of a move on a level
 
 

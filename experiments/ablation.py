@@ -26,6 +26,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Fingertip
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import TrialAlignment
+from hmmseg.segmentation.fit import MeanShares
 
 RESULTS = Path(__file__).parent / "results"
 FIRST_SEED = 22_000
@@ -72,10 +73,11 @@ def gaussian() -> Iterator[None]:
 def flat_durations() -> Iterator[None]:
     """Every subtask is expected to last as long as any other."""
 
-    def equal(gammas: Sequence[np.ndarray]) -> np.ndarray:
-        return np.full(gammas[0].shape[1], 1.0 / gammas[0].shape[1])
+    def equal(self: MeanShares, responsibilities: Sequence[np.ndarray]) -> MeanShares:
+        del responsibilities
+        return replace(self, shares=np.full(self.shares.size, 1.0 / self.shares.size))
 
-    with patch("hmmseg.segmentation.fit._mean_share", equal):
+    with patch("hmmseg.segmentation.fit.MeanShares.updated", equal):
         yield
 
 

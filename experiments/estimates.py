@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from estimation.design import build
+from estimation.either import designs, sample_either
 from estimation.mode import find_mode
 from estimation.observations import aligned_weights
 from estimation.posterior import posterior
-from estimation.sampler import sample
 from estimation.unknowns import PROPERTIES
 from experiments.recordings import Case
 from experiments.scoring import boundaries_covered, boundary_residuals
@@ -50,7 +49,7 @@ def estimate(case: Case, trials: slice = slice(None), sampled: bool = True, seed
     pairs = list(zip(segmentations, truth, strict=True))
     rng = np.random.default_rng(seed)
     weighed, noise = aligned_weights(aligned, rng)
-    design = build(chosen, weighed, noise, case.task, case.rig)
+    design, other = designs(chosen, weighed, noise, case.task, case.rig)
     post = posterior(design)
     mode = find_mode(post)
     single = [i for i, u in enumerate(design.unknowns) if u.single]
@@ -60,7 +59,7 @@ def estimate(case: Case, trials: slice = slice(None), sampled: bool = True, seed
     z = (means - true) / sd
     ranks, rhat, ess = np.array([]), np.nan, np.nan
     if sampled:
-        found = sample(post, seed, mode=mode)
+        _, found = sample_either(design, other, seed)
         draws = found.flat[:, single]
         means, ranks, rhat, ess = draws.mean(axis=0), (draws < true).mean(axis=0), found.rhat, found.ess
     return Estimates(

@@ -44,7 +44,8 @@ def test_coverage_with_replicates_as_clusters():
     assert share == 1.0 and 0.02 < error < 0.05  # 48 of 48 do not prove a coverage of 100 %
     assert clustered([np.array([])]) == (None, None)
     only = {"of": "a.weight", "share": 0.01, "z": 1.0, "rank": 0.9}
-    scored = [{"properties": [only], "reach_90": [0.5], "held_90": [1.0, 0.0], "boundaries": [0.01, 0.03], "misfits": 0,
+    scored = [{"properties": [only], "reach_90": [0.5],
+               "held_90": [1.0, 0.0], "boundaries": [0.01, 0.03], "misfits": 0,
                "trials": 1, "sampler": "emcee"}] * 2  # fmt: skip
     row = summary(scored)
     assert row["coverage_68"] == 0.0 and row["coverage_95"] == 1.0 and row["coverage_90"] == 0.5
