@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: robots-check bench-robot gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
+.PHONY: robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -85,6 +85,10 @@ gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what the
 gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn anew (build/gap_drawn); fills docs/gap_results.md
 	$(BIN)/python -m experiments.blind_check open --cases 36 --tiers healthy single --seed 519083 --out build/gap_drawn
 	$(BIN)/python -m experiments.gap_drawn build/gap_drawn --seed 519083
+	$(BIN)/python -m experiments.write_tables
+
+gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md
+	$(BIN)/python -m experiments.gap_arm $(or $(ARM),../shared/panda)
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from experiments import (
     before_after,
+    gap_arm,
     gap_drawn,
     patch_heldout,
     provenance,
@@ -177,6 +178,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
     ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
+    ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_blind_check.table, "blind-check"),
     ("docs/history.md", "blind_sets", spent_sets.table, "blind-check"),
     ("README.md", "kernels", table_speed.kernels_short, "bench"),
