@@ -6,6 +6,7 @@ from experiments.blind_check import outside_hand as hand
 from experiments.blind_check import outside_sensors as sensors
 from experiments.blind_check.effects import Change, Made, _sign
 from experiments.blind_check.outside_loads import OUTSIDE as LOADS
+from experiments.blind_check.outside_snags import OUTSIDE as SNAGS
 from experiments.blind_check.outside_worlds import OUTSIDE as WORLDS
 from experiments.blind_check.signals import ENCODER, HAND, LINKS, MIX, READOUT, SCALE
 
@@ -100,4 +101,4 @@ OUTSIDE = {
                                              "y": r.uniform(0.2, 0.3)},
               LINKS, hand.sagging),
     )
-} | WORLDS | LOADS  # fmt: skip
+} | WORLDS | LOADS | SNAGS  # fmt: skip
