@@ -64,6 +64,7 @@ def mixed(likelier: Draws, other: Draws, props: Sequence[str], doubt: PadDoubt, 
     for channel, odds in zip((DISTANCE, RISE), doubt.odds, strict=True):
         wrong = 1.0 if odds >= CERTAIN else odds
         swapped = rng.uniform(size=len(flat)) < (1 - wrong if doubt.doubted else wrong)
-        mine = [i for i, prop in enumerate(props) if priors.CHANNEL[prop] == channel]
-        flat[np.ix_(swapped, mine)] = instead[np.ix_(swapped, mine)]
+        mine = np.array([priors.CHANNEL[prop] == channel for prop in props])
+        taken = swapped[:, None] & mine
+        flat[taken] = instead[taken]
     return replace(likelier, chain=flat.reshape(chain.shape))

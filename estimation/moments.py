@@ -82,14 +82,16 @@ def pad_doubt(
             of_kind = np.isfinite(slopes[..., k])
             one = [values[..., k][of_kind] for values in (slopes, variance, alike)]
             apart = shared_error(one[2], one[1])
-            said = misstated(*one[:2], stated, admitted if stated else 0.0, apart)
+            said = misstated(one[0], one[1], stated, admitted if stated else 0.0, apart)
             found[channel] = max(found[channel], said, key=lambda share_and_odds: share_and_odds[1])
         if not stated:
-            possible[channel] = possible_share(*mine[:2])
-    usual = [float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, aligned), strict=True)]
+            possible[channel] = possible_share(mine[0], mine[1])
+    normal, shear = (
+        float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, aligned), strict=True)
+    )
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
     return PadDoubt(
-        -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], *usual,
+        -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], normal, shear,
         (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
     )  # fmt: skip
 

@@ -35,7 +35,7 @@ def rounded_variance(given: Problem, step: float) -> np.ndarray:
         for k in np.flatnonzero(of_channel):
             weight = of_channel[k] * scale[mine]
             on = weight[:, None] * _on_plateaus(levels[trial][:, k], sample[mine], group)
-            alike = np.square(dct(on, axis=0, norm="ortho")).sum(1)
+            alike = np.square(np.asarray(dct(on, axis=0, norm="ortho"))).sum(1)
             out[mine] += ALIKE * alike + (1 - ALIKE) * np.mean(weight**2) / group
     return step**2 / 12 * out
 
