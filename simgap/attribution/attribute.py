@@ -19,7 +19,7 @@ from simgap.attribution.invariance import (
     residual_left,
     scatter_between,
 )
-from simgap.attribution.noise import channel_of, noise_of, shift_size, small_gap, stated
+from simgap.attribution.noise import channel_of, noise_of, small_gap, stated
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought, weights
@@ -196,15 +196,9 @@ def _examined(
 
 
 def _matters(f: Forms, model: Model, effect: int) -> bool:
-    """Whether an effect is more than is tolerated, however little that is beside others."""
+    """Whether an effect's own deviation matters, however little it shifts beside others."""
     c, own = f.gap.candidates[effect], coordinates(f, model.effects)[effect]
-    if c.least is not None and (np.abs(c.scale * model.x[own]) >= c.least).any():
-        return True
-    if f.gap.tolerance is None:
-        return False
-    without = fitted(f, tuple(j for j in model.effects if j != effect))
-    shift = residual_left(f, without) - residual_left(f, model)
-    return shift_size(f, shift, f.gap.tolerance) >= 1.0
+    return c.least is not None and bool((np.abs(c.scale * model.x[own]) >= c.least).any())
 
 
 def _there(f: Forms, model: Model, effect: int) -> bool:

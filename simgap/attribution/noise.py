@@ -46,20 +46,11 @@ def stated(rows: Rows) -> np.ndarray:
 def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap:
     """The gap's size, over what matters least, where it is largest."""
     before = residual_left(f, fitted(f, ()))
-    return _largest(f.gap.rows, before, by_group[f.spectrum.group], tolerance)
-
-
-def shift_size(f: Forms, shift: np.ndarray, tolerance: np.ndarray) -> float:
-    """Size of a `shift` (n,) of the spectrum's residual, over what matters least, where it is largest."""
-    return _largest(f.gap.rows, shift, np.zeros(shift.size), tolerance).size
-
-
-def _largest(rows: Rows, values: np.ndarray, noise: np.ndarray, tolerance: np.ndarray) -> SmallGap:
-    """Root mean square of values (n,) beyond noise of a variance (n,), by channel and part, where it is
-    largest over the tolerance (n,)."""
+    rows = f.gap.rows
     key, inverse = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
     count = np.bincount(inverse).astype(float)
-    excess = np.maximum(np.bincount(inverse, values**2) - np.bincount(inverse, noise), 0.0) / count
+    noise = by_group[f.spectrum.group]
+    excess = np.maximum(np.bincount(inverse, before**2) - np.bincount(inverse, noise), 0.0) / count
     chance = np.sqrt(2 / count) * np.bincount(inverse, noise) / count
     amount = np.sqrt(np.maximum(excess - 2 * chance, 0.0))
     sd = np.sqrt(np.bincount(inverse, np.ones(inverse.size) if rows.sd is None else rows.sd**2) / count)
