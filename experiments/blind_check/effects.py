@@ -67,6 +67,11 @@ class Made:
     scored: bool = True  # whether its parameters mean what the contract's mean
 
 
+def fault(name: str, draw: Callable[[Rng, float], Values], stage: int, build) -> Made:
+    """An effect in the chain of sensing alone: `build` makes of its values what happens at `stage`."""
+    return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
+
+
 def _sign(rng: Rng) -> float:
     return float(rng.choice([-1.0, 1.0]))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from experiments.blind_check.effects import Change, Made, _sign
+from experiments.blind_check.effects import _sign, fault
 from experiments.blind_check.signals import ENCODER, READOUT, SCALE, Signals, Stage
 from experiments.blind_check.stages import Rng, Values, added_force
 
@@ -56,17 +56,13 @@ def limping(v: Values) -> Stage:
     return stage
 
 
-def _made(name: str, draw, stage: int, build) -> Made:
-    return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
-
-
 OUTSIDE = {
     made.name: made
     for made in (
-        _made("remembered_load", lambda r, s: {"share": 0.12 * s * _sign(r)}, READOUT, remembered),
-        _made("induced_rate", lambda r, s: {"time": 0.012 * s * _sign(r)}, READOUT, induced),
-        _made("stretching_belt", lambda r, s: {"stretch": 0.006 * s * _sign(r)}, ENCODER, sheared),
-        _made(
+        fault("remembered_load", lambda r, s: {"share": 0.12 * s * _sign(r)}, READOUT, remembered),
+        fault("induced_rate", lambda r, s: {"time": 0.012 * s * _sign(r)}, READOUT, induced),
+        fault("stretching_belt", lambda r, s: {"stretch": 0.006 * s * _sign(r)}, ENCODER, sheared),
+        fault(
             "limping_supply",
             lambda r, s: {"depth": 0.1 * s, "frequency": r.uniform(0.3, 1.5)},
             SCALE,

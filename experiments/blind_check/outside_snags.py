@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from experiments.blind_check.effects import Change, Made
+from experiments.blind_check.effects import fault
 from experiments.blind_check.signals import ENCODER, HAND, LINKS, READOUT, Signals, Stage
 from experiments.blind_check.stages import Rng, Values, added_force
 
@@ -123,24 +123,20 @@ def crumbs(v: Values) -> Stage:
     return stage
 
 
-def _made(name: str, draw, stage: int, build) -> Made:
-    return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
-
-
 OUTSIDE = {
     made.name: made
     for made in (
-        _made("zero_tracking", lambda r, s: {"speed": 0.15 * s, "window": r.uniform(0.4, 0.9)},
+        fault("zero_tracking", lambda r, s: {"speed": 0.15 * s, "window": r.uniform(0.4, 0.9)},
               READOUT, tracking),
-        _made("garbled_words", lambda r, s: {"bit": 0.02 * s, "share": r.uniform(0.02, 0.06),
+        fault("garbled_words", lambda r, s: {"bit": 0.02 * s, "share": r.uniform(0.02, 0.06),
                                              "joint": float(r.integers(4))}, ENCODER, garbled),
-        _made("loose_ballast", lambda r, s: {"weight": 0.16 * s, "knock": 0.2 * s,
+        fault("loose_ballast", lambda r, s: {"weight": 0.16 * s, "knock": 0.2 * s,
                                              "sticks": r.uniform(0.3, 0.6)}, HAND, ballast),
-        _made("whipping_link", lambda r, s: {"share": 0.4 * s, "frequency": r.uniform(2.0, 4.0),
+        fault("whipping_link", lambda r, s: {"share": 0.4 * s, "frequency": r.uniform(2.0, 4.0),
                                              "damping": r.uniform(0.04, 0.15), "upright": r.uniform(0.3, 1),
                                              "finger": float(r.integers(2))}, LINKS, whipping),
-        _made("snagging_cable", lambda r, s: {"force": 0.35 * s, "reach": r.uniform(0.008, 0.02),
+        fault("snagging_cable", lambda r, s: {"force": 0.35 * s, "reach": r.uniform(0.008, 0.02),
                                               "finger": float(r.integers(2))}, HAND, snagging),
-        _made("crumbs", lambda r, s: {"size": 4e-4 * s, "often": r.uniform(0.5, 0.75)}, LINKS, crumbs),
+        fault("crumbs", lambda r, s: {"size": 4e-4 * s, "often": r.uniform(0.5, 0.75)}, LINKS, crumbs),
     )
 }  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from experiments.blind_check.effects import Change, Made, _sign
+from experiments.blind_check.effects import _sign, fault
 from experiments.blind_check.signals import ENCODER, HAND, LINKS, MIX, READOUT, SCALE, Signals, Stage
 from experiments.blind_check.stages import Rng, Values, added_force
 
@@ -146,29 +146,25 @@ def hanging(v: Values) -> Stage:
     return added_force(shift)
 
 
-def _made(name: str, draw, stage: int, build) -> Made:
-    return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
-
-
 OUTSIDE = {
     made.name: made
     for made in (
-        _made("pose_gain", lambda r, s: {"slope1": 0.35 * s * _sign(r),
+        fault("pose_gain", lambda r, s: {"slope1": 0.35 * s * _sign(r),
                                          "slope2": 0.35 * s * r.uniform(-1, 1)}, SCALE, posed),
-        _made("magnetised_blocks", lambda r, s: {"pull": 1.0 * s, "reach": r.uniform(0.004, 0.01)},
+        fault("magnetised_blocks", lambda r, s: {"pull": 1.0 * s, "reach": r.uniform(0.004, 0.01)},
               HAND, magnetised),
-        _made("sloshing_blocks", lambda r, s: {"mass": 0.2 * s, "frequency": r.uniform(1.8, 4),
+        fault("sloshing_blocks", lambda r, s: {"mass": 0.2 * s, "frequency": r.uniform(1.8, 4),
                                                "damping": r.uniform(0.02, 0.1)}, HAND, sloshing),
-        _made("bench_pump", lambda r, s: {"height": 0.3 * s * _sign(r), "strokes": r.uniform(0.8, 2),
+        fault("bench_pump", lambda r, s: {"height": 0.3 * s * _sign(r), "strokes": r.uniform(0.8, 2),
                                           "width": r.uniform(0.04, 0.1), "side": r.uniform(-1, 1)},
               READOUT, pumped),
-        _made("dead_zone", lambda r, s: {"zone": 0.25 * s, "other": r.uniform(0, 1)}, READOUT, deadened),
-        _made("warming_pads", lambda r, s: {"give": 3e-4 * s}, LINKS, warming),
-        _made("late_angles", lambda r, s: {"age": 0.06 * s}, ENCODER, belated),
-        _made("dripping_blocks", lambda r, s: {"rate": 0.15 * s}, HAND, dripping),
-        _made("yielding_mount", lambda r, s: {"down": 1e-3 * s, "along": 1e-3 * s * r.uniform(-1, 1)},
+        fault("dead_zone", lambda r, s: {"zone": 0.25 * s, "other": r.uniform(0, 1)}, READOUT, deadened),
+        fault("warming_pads", lambda r, s: {"give": 3e-4 * s}, LINKS, warming),
+        fault("late_angles", lambda r, s: {"age": 0.06 * s}, ENCODER, belated),
+        fault("dripping_blocks", lambda r, s: {"rate": 0.15 * s}, HAND, dripping),
+        fault("yielding_mount", lambda r, s: {"down": 1e-3 * s, "along": 1e-3 * s * r.uniform(-1, 1)},
               LINKS, mounted),
-        _made("swinging_hose", lambda r, s: {"mass1": 0.04 * s, "mass2": 0.04 * s * r.uniform(-1, 1),
+        fault("swinging_hose", lambda r, s: {"mass1": 0.04 * s, "mass2": 0.04 * s * r.uniform(-1, 1),
                                              "frequency": r.uniform(1.2, 3.5),
                                              "damping": r.uniform(0.02, 0.1)}, MIX, hanging),
     )

@@ -184,8 +184,9 @@ def _examined(
         for j, p in zip(effects, part, strict=True)
         if j in scattering
         or (
-            (same[j].log_bayes_factor > POSITIVE and _there(f, model, j))
-            and (p >= least or _matters(f, model, j))
+            (p >= least or _matters(f, model, j))
+            and same[j].log_bayes_factor > POSITIVE
+            and _there(f, model, j)
         )
     )
     shifting = [same[j] for j in causes if j not in scattering]
@@ -237,7 +238,8 @@ def _effects(
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
         same = None if found is None else found.invariance[j]
-        wide = np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
+        # Of what is in no set that was asked, parts are not compared.
+        wide = sd if found is None else np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,
             {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))

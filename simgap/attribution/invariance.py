@@ -119,9 +119,8 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
     score, scatter = found.score(), []
     for i, wander in enumerate(WANDER):
         prior, one = found.prior(wander), np.eye(found.usual.size)
-        inner = [np.linalg.inv(one + h @ prior) for h in found.bend]
-        bend = sum(each @ h for each, h in zip(inner, found.bend, strict=True))
-        pull = sum(each @ g for each, g in zip(inner, found.pull, strict=True))
+        inner = np.linalg.inv(one + found.bend @ prior)
+        bend, pull = (inner @ found.bend).sum(0), np.einsum("pij,pj->i", inner, found.pull)
         size, axes = np.linalg.eigh(bend)
         told = size > SINGULAR * size.max()
         covariance = (axes[:, told] / size[told]) @ axes[:, told].T
