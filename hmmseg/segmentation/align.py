@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.contact.decompose import Subtask, subtasks
+from hmmseg.hand.bridging import with_heights
 from hmmseg.hand.rates import timely
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.long import LongRecording
@@ -96,7 +97,8 @@ def align(
     """
     if signals is None:
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
-    coarse = [features(thin(s, MAX_RATE), rig) for s in signals]
+    whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
+    coarse = [features(thin(s, MAX_RATE), rig) for s in whole]
     pool, pieces = aligned_rounds([InMemory(s) for s in signals], coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)

@@ -176,14 +176,18 @@ def _log_halting(f: Features, p: Parameters) -> np.ndarray:
 
 
 def _log_ungripped(force: np.ndarray, scale: float, span: float, rung: float) -> np.ndarray:
-    """Log density of forces (num_timesteps, 4) without a grip: no contact, one finger's, or what rings."""
+    """Log density of forces (num_timesteps, 4) without a grip: no contact, one finger's, or what rings.
+
+    How loud a contact rings is not known: amplitudes from `scale` to `span` are alike by their logarithm.
+    """
     silent = log_student(force, scale)
     fingers = silent[:, :2].sum(axis=1), silent[:, 2:].sum(axis=1)
     touching = [
         _log_between(sign * force[:, c], 0.0, span, scale) + _log_between(force[:, c + 1], -span, span, scale)
         for sign, c in ((1.0, 0), (-1.0, 2))
     ]
-    ways = [np.log(rung) - np.log(2 * span) * np.isfinite(force).sum(axis=1)] if rung else []
+    loud = np.log(2 * np.log1p(span / scale)) + np.log(np.abs(force) + scale)
+    ways = [np.log(rung) - np.nansum(loud, axis=1)] if rung else []
     return np.logaddexp.reduce(
         [
             *ways,

@@ -76,8 +76,12 @@ def filled(values: np.ndarray) -> np.ndarray:
     return np.interp(np.arange(values.size), there, values[there]) if there.size else np.zeros(values.size)
 
 
-def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray) -> tuple[Block, ...]:
-    """Distinct blocks among the grips, each grip's width and weight by robust means."""
+def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = False) -> tuple[Block, ...]:
+    """Distinct blocks among the grips, each grip's width and weight by robust means.
+
+    What is weighed is what surely moves. Where its load is lost in noise no weight is known; if `guessing`
+    it is what that load seems to be, two standard errors at least.
+    """
     fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
     fx1, fx2 = (filled(f.force[:, c] - bias[c]) for c in (0, 2))
     widths = block_width(f.d, fx1, fx2, f.pads)
@@ -88,12 +92,13 @@ def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray) -> tuple[Block, .
         width = median(widths[span], np.nan)
         if stop - start < 2 or not np.isfinite(width):
             continue
-        lifted = (fy / f.carrying)[span][_lifted(f, span)]
+        lifted = (fy / f.carrying)[span][_lifted(f, span, guessing)]
         lifted = lifted[np.isfinite(lifted)]
         weight = float(np.median(lifted)) if lifted.size > 2 else np.nan
         # Of the median of n sums of two forces, whose standard error is sqrt(pi / 2) sqrt(2 / n) sds of one.
-        significant = weight > 3 * noise * np.sqrt(np.pi / max(lifted.size, 1))
-        block = Block(width, weight if significant else np.nan)
+        error = noise * np.sqrt(np.pi / max(lifted.size, 1))
+        least = weight if guessing else 3 * error
+        block = Block(width, max(weight, 2 * error) if weight >= least else np.nan)
         match = next((i for i, other in enumerate(found) if block.like(other)), None)
         if match is None:
             found.append(block)
@@ -102,18 +107,19 @@ def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray) -> tuple[Block, .
     return tuple(found)
 
 
-def _lifted(f: Features, span: slice) -> np.ndarray:
-    """Which samples of one grip, (stop - start,), are surely of a lifted block.
+def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
+    """Which samples of one grip, (stop - start,), are surely of a lifted block; if `guessing`, probably.
 
     Whatever is lifted moves vertically; a block that is pushed or only gripped does not. Velocities
     tell it where they are known and exact; heights, which last longer, tell it of poor recordings: far
-    from where the grip begins and from where it ends.
+    from where the grip begins and from where it ends. A block that falls is where its grip ends, so that the
+    guess is what is far from where it begins.
     """
     moving = np.abs(f.vy[span]) > 6 * f.sd_vy[span]
     height = filled(f.y)[span]
     least = np.maximum(4 * f.sd_y[span], RAISED)
     ends = np.median(height[:ENDS]), np.median(height[-ENDS:])
-    return moving | np.all([np.abs(height - end) > least for end in ends], axis=0)
+    return moving | np.all([np.abs(height - end) > least for end in ends[: 1 if guessing else 2]], axis=0)
 
 
 def runs(found: np.ndarray) -> list[tuple[int, int]]:

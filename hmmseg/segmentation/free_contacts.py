@@ -35,6 +35,9 @@ TAP = 0.2
 FIRM = 0.5  # chosen: of the force with which a block is gripped next: who presses less has not gripped it yet
 IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
+States = tuple[tuple[str, int | None], ...]
+Trained = tuple[States, tuple[Block, ...], Parameters, np.ndarray, np.ndarray]
+
 
 @dataclass(frozen=True)
 class FreeContacts:
@@ -69,7 +72,40 @@ class FreeContacts:
 def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
     """Fit the alternative to one trial; `sliding`: whether the task has slides."""
     bias, scale, held = ungripped(f)
-    blocks = blocks_of(f, bias, held)
+    states, blocks, parameters, table, path = _likeliest(f, sliding, bias, scale, held)
+    interval = float(np.median(np.diff(f.t)))
+    tapped = _tapped(states, path, interval, f)
+    taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
+    opened = _opened(f, states, path, parameters.bias)
+    ringing = log_likelihoods(f, _subtasks(states[:1]), replace(parameters, levels=()), 0, rung=RINGING)[:, 0]
+    for span in tapped:
+        table[span], ringing[span], path[span] = 0.0, 0.0, 0
+    return FreeContacts(parameters, blocks, states, table, path, opened, ringing, interval, taps)
+
+
+def _likeliest(f: Features, sliding: bool, bias: np.ndarray, scale: float, held: np.ndarray) -> Trained:
+    """The likelier of two fits: from what is sure of the blocks, and from what is guessed of them.
+
+    Whether a block that could not be weighed for sure was carried is for the whole recording to say: a task
+    with a carry whose block has no weight would have no trial at all.
+    """
+    looks = [blocks_of(f, bias, held)]
+    if any(np.isnan(b.weight) for b in looks[0]):
+        looks.append(blocks_of(f, bias, held, guessing=True))
+    return max((_trained(f, sliding, bias, scale, blocks) for blocks in looks), key=_schwarz)
+
+
+def _schwarz(fit: Trained) -> float:
+    """Log evidence of a fit, a width and a weight of each block paid for (Schwarz, Ann. Stat. 6, 1978)."""
+    states, blocks, _, table, _ = fit
+    num = len(blocks) + sum(np.isfinite(b.weight) for b in blocks)
+    return log_evidence(table, *_any_order(states, len(table))) - 0.5 * num * float(np.log(len(table)))
+
+
+def _trained(
+    f: Features, sliding: bool, bias: np.ndarray, scale: float, blocks: tuple[Block, ...]
+) -> Trained:
+    """Viterbi training from these blocks: states, blocks, parameters, table and path."""
     span = f.span["force"]
     weights = [b.weight for b in blocks if np.isfinite(b.weight)]
     parameters = Parameters(bias, {}, {
@@ -88,7 +124,11 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
         before, path = path, most_probable(table, *_any_order(states, len(table)))
         used = [i for i in range(len(blocks)) if any(states[k][1] == i for k in np.unique(path))]
         if not blocks or np.array_equal(path, before):
-            break
+            known = _unweighed(states, path, blocks)
+            if known is blocks:
+                break
+            blocks, path = known, before[:0]
+            continue
         if len(used) < len(blocks):  # a start that the model does not need
             blocks, path = tuple(blocks[i] for i in used), before[:0]
             continue
@@ -102,14 +142,20 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
             )
             for i, b in enumerate(blocks)
         )
-    interval = float(np.median(np.diff(f.t)))
-    tapped = _tapped(states, path, interval, f)
-    taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
-    opened = _opened(f, states, path, parameters.bias)
-    ringing = log_likelihoods(f, _subtasks(states[:1]), replace(parameters, levels=()), 0, rung=RINGING)[:, 0]
-    for span in tapped:
-        table[span], ringing[span], path[span] = 0.0, 0.0, 0
-    return FreeContacts(parameters, blocks, states, table, path, opened, ringing, interval, taps)
+    return states, blocks, parameters, table, path
+
+
+def _unweighed(states: States, path: np.ndarray, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+    """Blocks without the weights of those never carried; what may be another by its width is that one."""
+    carried = {states[k][1] for k in np.unique(path) if states[k][0] == ABOVE_GROUND}
+    if all(i in carried or np.isnan(b.weight) for i, b in enumerate(blocks)):
+        return blocks
+    kept = [b for i, b in enumerate(blocks) if i in carried]
+    for i, block in enumerate(blocks):
+        unweighed = replace(block, weight=np.nan)
+        if i not in carried and not any(unweighed.like(b) for b in kept):
+            kept.append(unweighed)
+    return tuple(kept)
 
 
 def _opened(

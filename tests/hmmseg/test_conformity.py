@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments import calibration_worlds
 from experiments.boundary_worlds import WORLDS, World, trials_of
 from experiments.calibration_worlds import ROWS, replicates
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
@@ -54,6 +55,29 @@ def test_misfits_are_found_at_the_subtask_that_fails(edit, which):
     assert found.failed.index == expected
     document = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert document["complete"] is False and document["failed"]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("world", "number"),
+    [
+        ("noise x16", 60061),  # a load of four standard errors
+        ("noise x16", 60115),
+        ("missing 40 %", 60075),  # heights that take four angles
+        ("missing 40 %", 60186),
+        ("ringing 1 N", 60008),  # fingers that pass a block's width while they ring in the air
+        ("ringing 1 N", 60028),
+    ],
+)
+def test_poor_recordings_are_no_misfits_and_a_fall_in_them_is_told(world, number, monkeypatch):
+    monkeypatch.setattr(calibration_worlds, "FIRST", number)
+    calibration_worlds._performed.cache_clear()
+    (healthy,) = calibration_worlds.replicates(ROWS[world], 1)
+    calibration_worlds._performed.cache_clear()
+    (found,) = segmentation.segment(healthy.trials, healthy.task, healthy.rig)
+    assert found.complete, found.failed
+    fallen, _ = EDITS["drop_first"](healthy.trials[0], list(healthy.boundaries[0]))
+    (found,) = segmentation.segment([fallen], healthy.task, healthy.rig)
+    assert not found.complete
 
 
 def test_healthy_trials_pass():

@@ -1,5 +1,6 @@
 """Emission densities integrate to one, skip what is missing, and prefer their own samples."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -118,14 +119,20 @@ def test_ungripped_force_density_integrates_to_one():
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(num) + 1e-3
 
 
-def test_a_sample_that_rings_is_as_likely_anywhere():
-    loud = np.array([[3.0, -2.0, 4.0, 2.0], [-1.0, 5.0, 5.0, 0.0]])
-    found = _log_ungripped(loud, 0.01, 6.0, RUNG)
-    np.testing.assert_allclose(found, np.log(RUNG) - 4 * np.log(12.0), atol=0.02)
-    lost = np.where(np.arange(4) == 1, np.nan, loud)
-    np.testing.assert_allclose(
-        _log_ungripped(lost, 0.01, 6.0, RUNG), np.log(RUNG) - 3 * np.log(12.0), atol=0.02
-    )
+def test_how_loud_a_sample_rings_is_as_likely_by_its_logarithm():
+    """P(|f| < a) = log(1 + a / scale) / log(1 + span / scale), signs alike, each channel by itself."""
+    scale, span = 0.01, 6.0
+    rest = np.array([-1.0, 5.0, 5.0])  # no contact and no single finger explains these
+    share = np.linspace(0.3, 0.9, 7)  # of the loudness in logarithms; silence is another thing
+    edges = scale * np.expm1(share * np.log1p(span / scale))
+    inside = []
+    for low, high in itertools.pairwise(edges):
+        f = np.linspace(low, high, 4001)
+        every = np.stack([np.full(f.size, rest[0]), f, *(np.full(f.size, r) for r in rest[1:])], axis=1)
+        inside.append(np.trapezoid(np.exp(_log_ungripped(every, scale, span, RUNG)), f))
+    there = np.array([[rest[0], np.nan, *rest[1:]]])
+    one_sign = 0.5 * 0.1 * np.exp(_log_ungripped(there, scale, span, RUNG)[0])
+    np.testing.assert_allclose(inside, one_sign, rtol=0.02)
 
 
 @pytest.mark.parametrize("state", [FREE, ON_GROUND, SLIDING, ABOVE_GROUND])
