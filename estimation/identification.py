@@ -76,6 +76,11 @@ class Identification(Tabled):
             raise KeyError(f"{obj}.{prop} is undetermined: {self.reasons.get(f'{obj}.{prop}', '')}")
         return self.draws[:, self.names.index((obj, prop))]
 
+    @property
+    def means(self) -> dict[tuple[str, str], float]:
+        """Posterior mean of every determined property, by block and property [N, m]."""
+        return {name: float(column.mean()) for name, column in zip(self.names, self.draws.T, strict=True)}
+
     def to_json(self) -> dict:
         """The body of `identify`'s JSON document."""
         properties: dict[str, dict] = {}

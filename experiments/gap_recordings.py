@@ -22,6 +22,7 @@ import numpy as np
 from estimation.actual import read_actual
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
+from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 
 RESULT = Path(__file__).parent / "results" / "gap_recordings.json"
@@ -56,7 +57,8 @@ def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dic
     """What one diagnosis found, and the processor and wall seconds it took."""
     actual = read_actual(folder / "actual.toml", case.task.objects) if measured else None
     start, busy = time.perf_counter(), time.process_time()
-    body = diagnose(case.trials[:TRIALS], case.task, case.rig, actual, twins=twins).body
+    aligned = align(case.trials[:TRIALS], case.task, case.rig)
+    body = diagnose(aligned, actual, twins=twins).body
     wall, busy = time.perf_counter() - start, time.process_time() - busy
     best = body["effects"].get("+".join(body["causes"]), {"parameters": {}})
     return {

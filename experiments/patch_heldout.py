@@ -19,6 +19,7 @@ from experiments.table_text import RESULTS, load, markdown
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import read_trial
+from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 from simgap.patch import files, reproduced
 
@@ -29,7 +30,7 @@ def measured(folder: Path) -> dict[str, Any]:
     assert isinstance(task, BlockTask)
     trials = [read_trial(f, rig) for f in sorted(folder.glob("trial_*.csv"))]
     half = (len(trials) + 1) // 2
-    body = diagnose(trials[:half], task, rig).body
+    body = diagnose(align(trials[:half], task, rig)).body
     row: dict[str, Any] = {"recording": folder.name, "verdict": body["verdict"], "causes": body["causes"]}
     written = files((folder / "rig.toml").read_text(encoding="utf-8"), body)
     if not written:

@@ -183,6 +183,7 @@ def run(
 ) -> dict[str, Any]:
     """Diagnose, put table, figures and page where `out` has them go, and give the document."""
     from estimation.actual import read_actual
+    from hmmseg.segmentation.align import align
     from simgap.effects import effect_named
     from simgap.gap.diagnose import STAGES
     from simgap.gap.diagnose import diagnose as find
@@ -193,7 +194,10 @@ def run(
     well = read_trials(out, distinct_trials(list(healthy)), rig) if healthy else []
     with out.progress("diagnosing", total=STAGES) as advance:
         tell = lambda text: advance(1)  # noqa: E731
-        found = find(recordings, task, rig, measured, forced, out.seed, tell, healthy=well)
+        found = find(
+            align(recordings, task, rig), measured, forced, out.seed, tell,
+            healthy=align(well, task, rig) if well else None,
+        )  # fmt: skip
     for warning in found.warnings:
         out.warn(warning)
     pads = rig.fingertip.model_dump()

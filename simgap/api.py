@@ -59,8 +59,9 @@ def diagnose(
     `effects` are taken instead of choosing.
     InputError for input at fault or where no trial fits its task.
     """
+    identified = None
     if isinstance(trials, Identification):
-        aligned = trials.aligned
+        aligned, identified = trials.aligned, trials.means
     else:
         aligned = trials if isinstance(trials, AlignedTrials) else align(trials, task, rig)
     order = aligned.task
@@ -68,10 +69,7 @@ def diagnose(
         measured = parse_actual(actual, order.objects)
     else:
         measured = None if actual is None else read_actual(actual, order.objects)
-    recorded = [one.trial for one in aligned.trials]
-    return diagnose_blocks(
-        recorded, order, aligned.rig, measured, tuple(effects), seed, progress, aligned=aligned
-    )
+    return diagnose_blocks(aligned, measured, tuple(effects), seed, progress, identified=identified)
 
 
 def _blocks(properties: Any, task: Any) -> Blocks:

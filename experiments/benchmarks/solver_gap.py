@@ -19,8 +19,7 @@ def gap_problem(folder: Path):
     from simgap.gap.frame import build
     from simgap.gap.problem import neutral, problem
 
-    trials, aligned, rig = aligned_trials(folder)
-    given = problem(build(trials, aligned, rig))
+    given = problem(build(aligned_trials(folder)[1]))
     return given, [Start(effects, neutral(given)) for effects in SETS]
 
 

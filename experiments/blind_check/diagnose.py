@@ -18,9 +18,10 @@ import numpy as np
 from estimation.actual import Actual, read_actual
 from experiments.blind_check.sealing import code_digest
 from hmmseg.errors import InputError
-from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import read_trial
+from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects import name_of
 from simgap.gap.diagnose import Diagnosis, diagnose
 
@@ -108,11 +109,12 @@ def _bic(found: Diagnosis) -> str:
     return min(score, key=lambda k: score[k])
 
 
-def _read(folder: Path) -> tuple[list[Trial], BlockTask, Rig, Actual | None]:
-    """Trials, task, rig and, where measured, properties of a folder."""
+def _read(folder: Path) -> tuple[AlignedTrials, Actual | None]:
+    """Aligned trials and, where measured, properties of a folder."""
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     if not isinstance(task, BlockTask):
         raise InputError(str(folder / "task.toml"), "is a plain ordered task", "objects and moves")
     file = folder / "actual.toml"
     actual = read_actual(file, task.objects) if file.exists() else None
-    return [read_trial(f, rig) for f in sorted(folder.glob("trial_*.csv"))], task, rig, actual
+    trials = [read_trial(f, rig) for f in sorted(folder.glob("trial_*.csv"))]
+    return align(trials, task, rig), actual

@@ -13,6 +13,7 @@ from typing import Any
 from experiments.paper.sources import PRINTED, recorded, save
 from experiments.recordings import Case
 from hmmseg.io.rig import Rig
+from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.gap.diagnose import Diagnosis, diagnose
 
 TRIALS = 4
@@ -52,13 +53,17 @@ def main() -> None:
     """Save the diagnosis with rigid pads, with and without the measured properties, and with nominal pads."""
     case = recorded()
     trials, measured = list(case.trials[:TRIALS]), case.blocks
+
+    def seen(rig: Rig) -> AlignedTrials:
+        return align(trials, case.task, rig)
+
     save("gap", {
         "trials": [t.name for t in trials],
-        "rigid": entry(diagnose(trials, case.task, rigid(case.rig)), case),
-        "rigid_with_actual": entry(diagnose(trials, case.task, rigid(case.rig), measured), case),
-        "rigid_sideways_too": entry(diagnose(trials, case.task, rigid(case.rig, shear=True)), case),
-        "rigid_slip_forced": entry(diagnose(trials, case.task, rigid(case.rig), forced=[SLIP]), case),
-        "nominal": entry(diagnose(trials, case.task, case.rig), case),
+        "rigid": entry(diagnose(seen(rigid(case.rig))), case),
+        "rigid_with_actual": entry(diagnose(seen(rigid(case.rig)), measured), case),
+        "rigid_sideways_too": entry(diagnose(seen(rigid(case.rig, shear=True))), case),
+        "rigid_slip_forced": entry(diagnose(seen(rigid(case.rig)), forced=[SLIP]), case),
+        "nominal": entry(diagnose(seen(case.rig)), case),
     })  # fmt: skip
 
 

@@ -17,7 +17,6 @@ from simgap.gap.trial_arrays import CHANNELS
 
 DRAWS = 2000  # numerics: of the posterior, for intervals
 LISTED = 8  # look: effects that are described
-TOLD = 0.5  # look: sd of the prior below which a property is told by the recordings
 
 
 def body(
@@ -125,13 +124,15 @@ def _evidence(verdict: Attribution, names: tuple[str, ...]) -> float:
 
 
 def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
-    """Properties as fitted without and with the causes, of those that the recordings tell."""
-    given = found.problem
+    """Properties with rig.toml at its word and with the causes, of those that were identified or measured.
+
+    Both are of one model, pads included, so that either can be simulated; what `identify` says is of a rig
+    that may be wrong by what it doubts (`estimation.either`), and stands between them.
+    """
     if causes is None:
         return {}
-    k = given.num_properties
-    before, after = (given.centre + given.sd * f.u[:k].reshape(-1, 3) for f in (found.healthy, causes))
-    known = (causes.push[:, :k] ** 2).sum(0).reshape(-1, 3) > 1 / TOLD**2
+    given, (_, known) = found.problem, found.blocks
+    before, after = given.properties(found.healthy.u), given.properties(causes.u)
     return {
         f"{name}.{kind}": {"before": float(before[o, j]), "after": float(after[o, j]), "unit": UNITS[kind]}
         for o, name in enumerate(given.frame.task.objects)

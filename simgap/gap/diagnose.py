@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 
 from hmmseg.contact.decompose import subtasks
-from hmmseg.io.rig import Rig
-from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
@@ -31,7 +28,7 @@ from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.located import Tally, tallies
 from simgap.gap.problem import Problem
 from simgap.gap.scatter import scatters
-from simgap.gap.search import Search, search
+from simgap.gap.search import Identified, Search, search
 from simgap.gap.tolerance import properties_tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.gap.wrist_gap import check_forced, of_wrist
@@ -110,35 +107,33 @@ class Diagnosis(Tabled):
 
 @double_precision
 def diagnose(
-    trials: Sequence[Trial],
-    task: BlockTask,
-    rig: Rig,
+    aligned: AlignedTrials,
     actual: dict | None = None,
     forced: Sequence[str] = (),
     seed: int = 0,
     progress: Progress | None = None,
     twins: bool = True,
-    healthy: Sequence[Trial] = (),
+    healthy: AlignedTrials | None = None,
     excluded: Sequence[str] = (),
-    aligned: AlignedTrials | None = None,
+    identified: Identified | None = None,
 ) -> Diagnosis:
-    """Diagnose recordings of one block task against the nominal model.
+    """Diagnose aligned recordings of one block task against the nominal model.
 
     `actual` as `estimation.actual.read_actual` gives it; `forced` names effects to be taken instead of
     choosing; `excluded` effects are not thought of. The null are `healthy` recordings of the same task and
-    rig if there are any, else simulated `twins`, else the model itself. `aligned`: what `align` made of the
-    same trials, where that is known already. InputError where no trial fits its task.
+    rig if there are any, else simulated `twins`, else the model itself. `identified`: what `identify` made
+    of the same trials, where that is known already. InputError where no trial fits its task.
     """
     tell = progress or (lambda text: None)
-    if of_wrist(trials):
+    if of_wrist([one.trial for one in aligned.trials]):
         check_forced(forced)
-    found = search(trials, task, rig, actual, excluded, tell, aligned)
+    found = search(aligned, actual, excluded, tell, identified)
     tell("attributing the gap")
 
     def null(value: float) -> Iterable[float]:
-        if healthy:
-            return own_healthy(found, healthy, task, rig, actual)
-        return twin_statistics(found, task, rig, actual, seed, tell) if twins and value > NIL else ()
+        if healthy is not None:
+            return own_healthy(found, healthy, actual)
+        return twin_statistics(found, actual, seed, tell) if twins and value > NIL else ()
 
     gap, verdict = attributed(found, tuple(forced), seed, null)
     causes = _causes(found, gap, verdict)

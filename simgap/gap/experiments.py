@@ -108,7 +108,7 @@ def _gains(
     )
     trials = [recorded(s, frame.task, frame.rig, cause) for s in done]
     known = _measured(blocks) if experiment.measured else actual
-    asked = problem(build(trials, align(trials, frame.task, frame.rig), frame.rig), known)
+    asked = problem(build(align(trials, frame.task, frame.rig)), known)
     healthy = fit(asked, Start((), neutral(asked)))
 
     def cost(name: str) -> float:

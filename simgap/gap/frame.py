@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +11,6 @@ from hmmseg.contact.decompose import Subtask, height_equations
 from hmmseg.hand.grouping import group_size
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials
 from simgap.effects.base import World
 from simgap.gap.trial_arrays import MAX_RATE, boundary_quantiles, trial_arrays
@@ -67,13 +65,14 @@ class Frame:
         return len(self.files)
 
 
-def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
+def build(aligned: AlignedTrials) -> Frame:
     """Frame of the trials that fit their task; ValueError where none does."""
-    steps, task = aligned.subtasks, aligned.task
-    chosen = [(trial, a) for trial, a in zip(trials, aligned.trials, strict=True) if a.segmentation.complete]
+    steps, task, rig = aligned.subtasks, aligned.task, aligned.rig
+    chosen = [a for a in aligned.trials if a.segmentation.complete]
     if not chosen:
         raise ValueError("no trial fits its task")
-    rows = [trial_arrays(trial, boundary_quantiles(a), steps, rig) for trial, a in chosen]
+    trials = [a.trial for a in chosen]
+    rows = [trial_arrays(a.trial, boundary_quantiles(a), steps, rig) for a in chosen]
     length = padded_length(max(r["t"].size for r in rows))
     count = -(-len(rows) // TRIALS) * TRIALS
     stack = {key: _stacked([r[key] for r in rows], length, count) for key in rows[0] if key != "events"}
@@ -108,15 +107,15 @@ def build(trials: Sequence[Trial], aligned: AlignedTrials, rig: Rig) -> Frame:
     )
     lengths = tuple(r["t"].size for r in rows)
     return Frame(
-        tuple(t.name for t, _ in chosen),
+        tuple(t.name for t in trials),
         steps,
         task,
         rig,
         _world(stack, events, rig),
         arrays,
         lengths,
-        tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t, _ in chosen),
-        tuple(group_size(t.rate, MAX_RATE) for t, _ in chosen),
+        tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t in trials),
+        tuple(group_size(t.rate, MAX_RATE) for t in trials),
     )
 
 

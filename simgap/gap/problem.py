@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -11,14 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
+from hmmseg.contact.identifiability import PROPERTIES
 from simgap.effects import fitted as known_effects
 from simgap.effects import free_parameters, name_of
-from simgap.effects.base import Effect, Parameter, tips
+from simgap.effects.base import Effect, Parameter
 from simgap.gap.frame import Frame
 from simgap.gap.marginal import Nuisances
 from simgap.gap.whitening import Whitening, whitening
 
-FLAT = {"weight": 0.4, "width": 0.02, "height": 0.02}  # prior: sd of a property that nothing else tells
+# prior: what measured weight (share), width, height [m] may be off beside their own sd
+MEASURED = (2e-3, 3e-5, 4e-5)
 
 
 @dataclass(frozen=True)
@@ -88,30 +91,39 @@ class Problem:
         return self.existing.size
 
 
-def problem(frame: Frame, actual: dict | None = None) -> Problem:
-    """The problem of a frame; `actual` as `estimation.actual` reads it narrows the prior."""
-    a, w, objects = frame.arrays, frame.world, frame.task.objects
-    valid = (a.there[..., 6] > 0) & (a.phase[..., 2] > 0)
-    centre, width = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
+def problem(
+    frame: Frame, actual: dict | None = None, identified: Mapping[tuple[str, str], float] | None = None
+) -> Problem:
+    """The problem of a frame; `actual` as `estimation.actual` reads it narrows the prior.
+
+    The prior is identification's (log-normal, `estimation.priors`), linearised about what was `identified`
+    (block, property) [N, m], else about its median: in here properties are departures from those.
+    """
+    objects = frame.task.objects
+    centre, sd = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
     measured = np.zeros((len(objects), 3), bool)
-    net = w.force[..., 1] + w.force[..., 3]
-    position, _ = tips(jax.tree.map(jnp.asarray, w))
-    distance = np.asarray(position[..., 2] - position[..., 0])
-    distance = distance + w.force[..., 0] * w.give_normal[0] - w.force[..., 2] * w.give_normal[1]
     for o, name in enumerate(objects):
-        mine = valid & (np.einsum("tnm,m->tn", a.onehot, a.objects[:, o]) > 0)
         given = (actual or {}).get(name, {})
-        guess = (float(np.median(net[mine])), float(np.median(distance[mine]))) if mine.any() else (0.4, 0.02)
-        for k, prop in enumerate(("weight", "width", "height")):
-            start = max(guess[k], 1e-3) if k < 2 else 0.015
-            centre[o, k], width[o, k] = start, FLAT[prop]
+        for k, prop in enumerate(PROPERTIES):
+            centre[o, k] = (identified or {}).get((name, prop), PROPERTY_MEDIAN[prop])
+            sd[o, k] = centre[o, k] * PROPERTY_LOG_SD[prop]
             if prop in given:
-                value, sd = given[prop]
-                centre[o, k], width[o, k] = value, np.hypot(sd, (2e-3 * value, 3e-5, 4e-5)[k])
+                value, own = given[prop]
+                usual = MEASURED[k] * (value if prop == "weight" else 1.0)
+                centre[o, k], sd[o, k] = value, np.hypot(own, usual)
                 measured[o, k] = True
+    return _bare(frame, centre, sd, measured)
+
+
+def on(frame: Frame, given: Problem) -> Problem:
+    """The problem of the same blocks in another frame, without nuisances."""
+    return _bare(frame, given.centre, given.sd, given.measured)
+
+
+def _bare(frame: Frame, centre: np.ndarray, sd: np.ndarray, measured: np.ndarray) -> Problem:
     white = whitening(frame)
     none = Nuisances(np.zeros((int((white.weight > 0).sum()), 0)))
-    return Problem(frame, white, centre, width, measured, none)
+    return Problem(frame, white, centre, sd, measured, none)
 
 
 def free_of(key: str) -> list[Parameter]:

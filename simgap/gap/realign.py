@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
-from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects.base import tips
 from simgap.gap.evaluation import world_without
@@ -18,9 +16,9 @@ from simgap.gap.problem import Problem
 from simgap.gap.trial_arrays import thinned
 
 
-def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, all_fit: bool = False) -> AlignedTrials:
+def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bool = False) -> AlignedTrials:
     """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
-    frame, rig = given.frame, given.frame.rig
+    frame, rig, trials = given.frame, given.frame.rig, [a.trial for a in aligned.trials]
     world = world_without(given, found.effects, found.u)
     (position, velocity), force = tips(world), world.force
     rows = []
@@ -30,7 +28,8 @@ def realigned(trials: Sequence[Trial], given: Problem, found: Fitted, all_fit: b
         columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
         small, _ = thinned(trial, rig)
         rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
-    return align(trials, frame.task, _hand(rig, world), all_fit, rows)
+    again = align(trials, frame.task, _hand(rig, world), all_fit, rows)
+    return replace(again, rig=rig)
 
 
 def _hand(rig: Rig, world) -> Rig:

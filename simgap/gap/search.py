@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.identification import identify_aligned
+from hmmseg.contact.identifiability import PROPERTIES
 from hmmseg.errors import InputError
-from hmmseg.io.rig import Rig
-from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.problem import Gap
@@ -20,7 +20,7 @@ from simgap.gap.carried import noise_gained, redrawn
 from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import Problem, neutral, problem
+from simgap.gap.problem import Problem, neutral, on, problem
 from simgap.gap.realign import moved, realigned
 from simgap.gap.scatter import Scatter, scatters
 from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
@@ -31,15 +31,15 @@ ATTEMPTS = 3  # numerics: leading candidates that are taken out in turn where no
 HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
 WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
 Progress = Callable[[str], None]
+Identified = Mapping[tuple[str, str], float]
 
 
 @dataclass(frozen=True)
 class Search:
     """Aligned `trials`, their `problem`, the fit without any effect, and every candidate's own; `gap`: all of
     that as an attribution takes it, its first candidates those of `fits`; `redrawn`: the problem with more
-    noise on the recordings."""
+    noise on the recordings; `identified`: the blocks' properties as `identify` has them [N, m]."""
 
-    trials: tuple[Trial, ...]
     aligned: AlignedTrials
     problem: Problem
     healthy: Fitted
@@ -47,42 +47,59 @@ class Search:
     scatters: tuple[Scatter, ...]
     gap: Gap
     redrawn: tuple[Problem, ...]
+    identified: Identified
     warnings: tuple[str, ...]
+
+    @property
+    def trials(self) -> list[Trial]:
+        """The recordings that fit their task."""
+        return [one.trial for one in self.aligned.trials]
+
+    @property
+    def blocks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weight, width, height (O, 3) of the blocks, and which are known: measured apart or identified.
+
+        What is measured is as the recordings leave it, what nothing tells as the prior does.
+        """
+        values, known = self.problem.properties(self.healthy.u), self.problem.measured.copy()
+        for (name, kind), value in self.identified.items():
+            at = self.problem.frame.task.objects.index(name), PROPERTIES.index(kind)
+            if not known[at]:
+                values[at], known[at] = value, True
+        return values, known
 
 
 def search(
-    trials: Sequence[Trial],
-    task: BlockTask,
-    rig: Rig,
+    aligned: AlignedTrials,
     actual: dict | None = None,
     excluded: Sequence[str] = (),
     tell: Progress = lambda text: None,
-    aligned: AlignedTrials | None = None,
+    identified: Identified | None = None,
 ) -> Search:
-    """Fit the catalogue to recordings of one block task; InputError where no trial fits its task.
+    """Fit the catalogue to aligned trials; InputError where none fits its task.
 
-    `aligned`: what `align` made of the same trials, where that is known already.
+    `identified`: what `identify` made of the same trials, where that is known already.
     """
     misled: list[str] = []
-    if aligned is None:
-        tell("aligning trials")
-        aligned = align(trials, task, rig)
-    names = candidate_names(rig, excluded)
+    names, trials = candidate_names(aligned.rig, excluded), [one.trial for one in aligned.trials]
     keys = shifting(names)
     if of_wrist(trials):
         keys = [key for key in shown_forms(names) if key in keys]
         names = shown(names)
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
-        aligned, misled = _aligned_all(trials, aligned, rig, actual, keys)
-    trials, aligned, warnings = _complete(trials, aligned)
+        aligned, misled = _aligned_all(aligned, actual, keys)
+    aligned, warnings = _complete(aligned)
+    if identified is None:
+        tell("identifying properties")
+        identified = identify_aligned(aligned).means
     tell("fitting single effects")
-    given = with_nuisances(problem(build(trials, aligned, rig), actual))
+    given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, Start((), neutral(given)))
     fits = [best_fit(given, key, healthy) for key in keys]
     others = redrawn(given)
     for _ in range(ROUNDS):
-        again = _anew(trials, aligned, given, healthy, fits, actual, others)
+        again = _anew(aligned, given, healthy, fits, others)
         if again is None:
             break
         tell("aligning again without the best explanation")
@@ -92,17 +109,15 @@ def search(
     gap = gap_of(given, healthy, fits, scattering, others)
     if of_wrist(trials):
         warnings = [not_compared(trials), *warnings]
-    return Search(tuple(trials), aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
-                  (*misled, *warnings))  # fmt: skip
+    return Search(aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
+                  identified, (*misled, *warnings))  # fmt: skip
 
 
 def _anew(
-    trials,
-    aligned,
+    aligned: AlignedTrials,
     given: Problem,
     healthy: Fitted,
     fits: Sequence[Fitted],
-    actual,
     others: Sequence[Problem],
 ):
     """Everything once more with boundaries from forces without the best explanation, if that fits better.
@@ -113,10 +128,10 @@ def _anew(
     gained = healthy.cost - best.cost
     if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
         return None
-    again = realigned(trials, given, best)
+    again = realigned(aligned, given, best)
     if not SHIFT < moved(aligned, again) < np.inf:
         return None
-    other = with_nuisances(problem(build(trials, again, given.frame.rig), actual))
+    other = with_nuisances(on(build(again), given))
     if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
         return None
     plain = fit(other, Start((), healthy.u))
@@ -129,37 +144,33 @@ def _known(fits: Sequence[Fitted]) -> list[Fitted]:
 
 
 def _aligned_all(
-    trials: Sequence[Trial], failed: AlignedTrials, rig: Rig, actual: dict | None, keys: Sequence[str]
+    failed: AlignedTrials, actual: dict | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
     """Another alignment of trials that all `failed`, if most fit their task without one of the candidates.
 
     Forces that a fault displaces may look like another task. Where no candidate helps, `failed` as it is; the
     second is a warning that says which one did.
     """
-    aligned = align(trials, failed.task, rig, all_fit=True)
+    aligned = align([one.trial for one in failed.trials], failed.task, failed.rig, all_fit=True)
     for _ in range(ROUNDS):
-        given = problem(build(trials, aligned, rig), actual)
+        given = problem(build(aligned), actual)
         healthy = fit(given, Start((), neutral(given)))
         if healthy.cost > HOPELESS * given.size:
             break
         found = _known([best_fit(given, key, healthy) for key in keys])
         for f in found[:ATTEMPTS]:
-            again = realigned(trials, given, f)
-            if 2 * sum(t.segmentation.complete for t in again.trials) > len(trials):
+            again = realigned(aligned, given, f)
+            if 2 * sum(t.segmentation.complete for t in again.trials) > len(again.trials):
                 why = failed.trials[0].segmentation.failed
                 return again, [f"{why}; without {name_of(f.effects[0])} it fits"]
-        aligned = realigned(trials, given, found[0], all_fit=True)
+        aligned = realigned(aligned, given, found[0], all_fit=True)
     return failed, []
 
 
-def _complete(
-    trials: Sequence[Trial], aligned: AlignedTrials
-) -> tuple[list[Trial], AlignedTrials, list[str]]:
+def _complete(aligned: AlignedTrials) -> tuple[AlignedTrials, list[str]]:
     """The trials that fit their task, and warnings of the others."""
-    failed = [a.segmentation.failed for a in aligned.trials]
-    keep = [k for k, failure in enumerate(failed) if failure is None]
+    failed = [(one.trial, one.segmentation.failed) for one in aligned.trials if one.segmentation.failed]
+    keep = tuple(one for one in aligned.trials if one.segmentation.failed is None)
     if not keep:
-        raise InputError(trials[0].file, str(failed[0]), "a recording that shows every subtask")
-    out = [f"{t.name}: {f}; left out" for t, f in zip(trials, failed, strict=True) if f is not None]
-    chosen = replace(aligned, trials=tuple(aligned.trials[k] for k in keep))
-    return [trials[k] for k in keep], chosen, out
+        raise InputError(failed[0][0].file, str(failed[0][1]), "a recording that shows every subtask")
+    return replace(aligned, trials=keep), [f"{t.name}: {why}; left out" for t, why in failed]

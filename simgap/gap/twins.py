@@ -23,10 +23,11 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import cache_folder
+from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import forms
 from simgap.attribution.search import sought
-from simgap.gap.search import Search, search
+from simgap.gap.search import Identified, Search, search
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.wrist_gap import as_from_wrist, of_wrist
 from simgap.source_digest import source_digest
@@ -45,8 +46,6 @@ Progress = Callable[[str], None]
 
 def twin_statistics(
     found: Search,
-    task: BlockTask,
-    rig: Rig,
     actual: dict | None,
     seed: int,
     tell: Progress = lambda text: None,
@@ -55,7 +54,8 @@ def twin_statistics(
 
     Where this hand or these blocks cannot be simulated there are none.
     """
-    file = _file(found.trials, task, rig, actual, seed)
+    frame = found.problem.frame
+    file = _file(found.trials, frame.task, frame.rig, actual, seed)
     known: list[float] = []
     with suppress(OSError, ValueError):
         known = [float(v) for v in json.loads(file.read_text(encoding="utf-8"))]
@@ -63,7 +63,7 @@ def twin_statistics(
     for start in range(len(known) - len(known) % BATCH, MOST, BATCH):
         tell("simulating healthy twins")
         try:
-            twins = _recorded(found, task, rig, range(start, start + BATCH), seed)
+            twins = _recorded(found, range(start, start + BATCH), seed)
         except (InputError, ValueError):
             return
         for k, trials in enumerate(twins, start):
@@ -71,32 +71,34 @@ def twin_statistics(
                 continue
             with suppress(InputError):  # a twin that drops its block is none
                 tell("diagnosing healthy twins")
-                known.append(healthy_statistic(trials, task, rig, actual))
+                twin = align(trials, frame.task, frame.rig)
+                known.append(healthy_statistic(twin, actual, found.identified))
                 _keep(file, known)
                 yield known[-1]
 
 
-def healthy_statistic(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None) -> float:
-    """The statistic of one healthy recording, through the whole search."""
-    f = forms(search(trials, task, rig, actual).gap)
+def healthy_statistic(
+    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None
+) -> float:
+    """The statistic of one healthy recording, through the whole search; its blocks as `identified`."""
+    f = forms(search(aligned, actual, identified=identified).gap)
     return statistic(f, sought(f, 1))
 
 
-def own_healthy(
-    found: Search, healthy: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None
-) -> Iterator[float]:
+def own_healthy(found: Search, healthy: AlignedTrials, actual: dict | None) -> Iterator[float]:
     """The statistics of a user's own healthy recordings, as many trials at a time as were diagnosed."""
-    size = min(found.problem.frame.num_trials, len(healthy))
-    for start in range(0, len(healthy) - size + 1, size):
-        yield healthy_statistic(healthy[start : start + size], task, rig, actual)
+    every = healthy.trials
+    size = min(found.problem.frame.num_trials, len(every))
+    for start in range(0, len(every) - size + 1, size):
+        yield healthy_statistic(replace(healthy, trials=every[start : start + size]), actual)
 
 
-def _recorded(found: Search, task: BlockTask, rig: Rig, which: range, seed: int) -> list[list[Trial]]:
+def _recorded(found: Search, which: range, seed: int) -> list[list[Trial]]:
     """Recordings of as many trials each as were searched."""
-    trials, blocks = found.problem.frame.num_trials, blocks_of(found)
+    frame, blocks = found.problem.frame, blocks_of(found)
+    trials, task, rig = frame.num_trials, frame.task, frame.rig
     hand = rig.model_copy(update={"rate": _rate(found.trials)})
     seeds = [seed + 7_000_000 + 1000 * k + j for k in which for j in range(trials)]
-    task = found.problem.frame.task if task.repeat == "unknown" else task
     every = [blocks] * len(seeds)
     simulated = None
     with suppress(ValueError):  # motion that cannot be smoothed, as its noise is not stated
@@ -120,13 +122,12 @@ def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -
 
 
 def blocks_of(found: Search) -> dict[str, Block]:
-    """The blocks as measured, else as the fit without any effect has them; ValueError where one cannot be.
+    """The blocks as measured, else as identified; ValueError where one cannot be.
 
     A twin is healthy: what was measured is right of it, so that a wrong measurement shows as a gap.
     """
     given = found.problem
-    fitted = given.centre + given.sd * found.healthy.u[: given.num_properties].reshape(-1, 3)
-    values = np.where(given.measured, given.centre, fitted)
+    values = np.where(given.measured, given.centre, found.blocks[0])
     if not (values > LEAST).all():
         raise ValueError("a property that no block has")
     return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}

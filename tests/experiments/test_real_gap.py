@@ -129,8 +129,9 @@ def test_the_published_worked_case_blames_the_pads_and_no_slip():
 
 @pytest.mark.slow
 def test_rigid_fingertips_are_diagnosed_again():
+    from hmmseg.segmentation.align import align
     from simgap.gap.diagnose import diagnose
 
     case = recorded()
-    found = diagnose(list(case.trials[:2]), case.task, rigid(case.rig))
+    found = diagnose(align(list(case.trials[:2]), case.task, rigid(case.rig)))
     assert found.body["causes"] == ["fingertip_compliance"]

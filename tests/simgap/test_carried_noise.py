@@ -106,7 +106,7 @@ def given(shared):
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     assert isinstance(task, BlockTask)
     trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2, 3, 4)]
-    frame = double_precision(lambda: build(trials, align(trials, task, rig), rig))()
+    frame = double_precision(lambda: build(align(trials, task, rig)))()
     return double_precision(lambda: with_nuisances(problem(frame)))()
 
 

@@ -35,9 +35,7 @@ def trials(effects, operator=None):
 @pytest.fixture(scope="module")
 def fast():
     """The problem of healthy work twice as fast as usual, and its fit."""
-    made = trials({}, TWICE)
-    aligned = align(made, TASK, RIG)
-    given = problem(build(made, aligned, RIG))
+    given = problem(build(align(trials({}, TWICE), TASK, RIG)))
     return given, fit(given, Start((), neutral(given)))
 
 

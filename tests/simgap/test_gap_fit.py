@@ -27,8 +27,7 @@ def read(folder, count=2):
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     assert isinstance(task, BlockTask)
     trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in range(1, count + 1)]
-    aligned = align(trials, task, rig)
-    return build(trials, aligned, rig)
+    return build(align(trials, task, rig))
 
 
 def own(given, found, name):

@@ -50,7 +50,7 @@ def given(shared):
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     assert isinstance(task, BlockTask)
     trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
-    return double_precision(lambda: problem(build(trials, align(trials, task, rig), rig)))()
+    return double_precision(lambda: problem(build(align(trials, task, rig))))()
 
 
 def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):

@@ -75,7 +75,7 @@ def test_a_sample_that_may_be_on_either_side_of_a_lift_is_of_neither():
     columns = [CHANNELS.index(c) for c in ("y", "fy")]
 
     def told(at: float, known_to: float) -> np.ndarray:
-        there = build(trials, _lift(aligned, at, known_to), rig).arrays.there[0]
+        there = build(_lift(aligned, at, known_to)).arrays.there[0]
         return there[j - 2 : j + 2, columns].sum(1)
 
     step = t[j] - t[j - 1]

@@ -39,7 +39,7 @@ def test_properties_without_an_effect_are_those_identified(source):
     """Each within one standard deviation of what `identify` says: two summaries of the same samples."""
     aligned = source(FOLDER)
     found = identify_aligned(aligned)
-    given = problem(build([one.trial for one in aligned.trials], aligned, aligned.rig))
+    given = problem(build(aligned))
     healthy = fit(given, Start((), neutral(given)))
     values = given.centre + given.sd * healthy.u[: given.num_properties].reshape(-1, 3)
     assert len(found.names) == 6
@@ -53,15 +53,21 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
     found = identify_aligned(recorded(FOLDER))
 
     def never(*args):
-        raise AssertionError("aligned again")
+        raise AssertionError("aligned or identified again")
 
     monkeypatch.setattr("simgap.gap.search.align", never)
+    monkeypatch.setattr("simgap.gap.search.identify_aligned", never)
     told = diagnose(found)
     assert told.body["verdict"] == "none"
     np.testing.assert_array_equal(
         [a.quantile(0.5) for a in told.search.aligned.trials[0].boundaries],
         [a.quantile(0.5) for a in found.aligned.trials[0].boundaries],
     )
+    # Its document has the properties that were identified, and shifts them from there.
+    forced = diagnose(found, effects=("force_gain",)).body["effects"]["force_gain"]["property_shift"]
+    assert set(forced) == {".".join(name) for name in found.means}
+    for name, mean in found.means.items():
+        assert abs(forced[".".join(name)]["before"] - mean) < found.of(*name).std(), name
     # A result like others: it reads like the terminal, and its draws are what its document sums up.
     assert repr(told).startswith(told.words()) and "probabilities" in repr(told)
     assert "<td>none</td>" in told._repr_html_()

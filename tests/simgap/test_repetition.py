@@ -56,7 +56,7 @@ def test_a_reading_that_one_finger_lost_is_left_out(quick):
 
 def test_what_pads_damp_is_in_doubt_and_quick_fingers_are_where_their_mean_is(quick):
     rig = RIG.model_copy(update={"rate": 500.0})
-    frame = build([quick.trial], align([quick.trial], TASK, rig), rig)
+    frame = build(align([quick.trial], TASK, rig))
     n, column, arrays = frame.lengths[0], CHANNELS.index("distance"), frame.arrays
     phase = frame.world.ground[0, :n] + frame.world.carry[0, :n]
     there = (arrays.there[0, :n, column] > 0) & (phase > 0)

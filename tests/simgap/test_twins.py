@@ -8,6 +8,7 @@ import numpy as np
 from demo_recordings import RIG, TASK, TRIALS
 
 from hmmseg.io.rig import Noise
+from hmmseg.segmentation.align import align
 from simgap.gap import twins
 from simgap.gap.search import search
 
@@ -23,7 +24,7 @@ def test_other_code_has_a_cache_of_its_own(monkeypatch):
 
 def test_without_stated_noise_there_are_twins_too():
     rig = RIG.model_copy(update={"noise": Noise()})
-    found = search(TRIALS[:1], TASK, rig)
-    twin = twins._recorded(found, TASK, rig, range(1), 0)
+    found = search(align(TRIALS[:1], TASK, rig))
+    twin = twins._recorded(found, range(1), 0)
     assert len(twin) == 1 and len(twin[0]) == 1
     assert np.isfinite(twin[0][0].channels["fx1"]).all()

@@ -26,7 +26,7 @@ def read_all(recordings, **said):
 
 def test_channels_that_a_wrist_has_not_are_compared_with_nothing(recordings):
     trials, rig = read_all(recordings)
-    there = build(trials, align(trials, TASK, rig), rig).arrays.there
+    there = build(align(trials, TASK, rig)).arrays.there
     seen = {name for k, name in enumerate(CHANNELS) if there[..., k].any()}
     assert seen == {"x", "y", "fx", "fy"}
 
@@ -34,7 +34,7 @@ def test_channels_that_a_wrist_has_not_are_compared_with_nothing(recordings):
 def test_a_grip_force_adds_the_grip(recordings):
     with_grip = [columns | {"grip": np.where(columns["gap"] < 0.045, 10.0, 0.0)} for columns in recordings]
     trials, rig = read_all(with_grip, grip_force="grip")
-    there = build(trials, align(trials, TASK, rig), rig).arrays.there
+    there = build(align(trials, TASK, rig)).arrays.there
     seen = {name for k, name in enumerate(CHANNELS) if there[..., k].any()}
     assert seen == {"x", "y", "fx", "fy", "distance", "grip"}
 
@@ -45,7 +45,7 @@ def test_effects_of_one_finger_are_not_thought_of(recordings):
     assert "force_lag" in keys
     assert not any("/" in key for key in keys)
     with pytest.raises(InputError, match=r"force_bias.*unseen by a wrist"):
-        diagnose(trials, TASK, rig, forced=["force_bias"])
+        diagnose(align(trials, TASK, rig), forced=["force_bias"])
     assert shown(["force_bias", "force_lag"]) == ["force_lag"]
 
 
@@ -61,7 +61,7 @@ def test_twins_are_recorded_by_a_wrist(recordings):
 @pytest.mark.slow
 def test_healthy_is_none_and_late_forces_are_named(recordings):
     trials, rig = read_all(recordings)
-    found = diagnose(trials, TASK, rig)
+    found = diagnose(align(trials, TASK, rig))
     assert found.body["verdict"] == "none"
     assert any("offset, shear, vx, vy, distance, grip are not" in w for w in found.warnings)
     late = []
@@ -69,4 +69,4 @@ def test_healthy_is_none_and_late_forces_are_named(recordings):
         t = columns["t"]
         late.append(columns | {f"F{a}": np.interp(t - 0.06, t, columns[f"F{a}"]) for a in "xyz"})
     trials, rig = read_all(late)
-    assert "force_lag" in diagnose(trials, TASK, rig).body["causes"]
+    assert "force_lag" in diagnose(align(trials, TASK, rig)).body["causes"]
