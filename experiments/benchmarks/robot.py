@@ -27,7 +27,7 @@ import pandas as pd
 
 from experiments.robots_check.faults import drawn
 from experiments.robots_check.robots import ROBOTS, map_toml, nominal_xml
-from experiments.robots_check.worlds import NOISE, motion, run, usual, world_of
+from experiments.robots_check.worlds import motion, noise_of, run, usual, world_of
 from experiments.saving import save
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_robot.json"
@@ -46,11 +46,12 @@ def drawn_arm(models: Path, seconds: float, folder: Path) -> list[str]:
     faults = [drawn(arm, plain, kind, rng) for kind in FAULTS]
     wanted = motion(arm, rng)
     shown = pd.DataFrame(run(replace(arm, seconds=seconds), world_of(xml, faults, sizes), wanted, rate=RATE))
-    for joint in arm.read:
-        shown[f"q_{joint}"] += NOISE * rng.standard_normal(len(shown))
+    noise = noise_of(arm, xml)
+    for joint, sd in noise.items():
+        shown[f"q_{joint}"] += sd * rng.standard_normal(len(shown))
     shown.to_csv(folder / "log.csv", index=False, float_format="%.7g")
     (folder / "robot.xml").write_text(xml, encoding="utf-8")
-    (folder / "map.toml").write_text(map_toml(arm, NOISE), encoding="utf-8")
+    (folder / "map.toml").write_text(map_toml(arm, noise), encoding="utf-8")
     return [f"{f.kind} of {f.thing}" for f in faults]
 
 

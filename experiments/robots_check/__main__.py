@@ -25,13 +25,13 @@ import pandas as pd
 from experiments.robots_check.faults import FAULTS, drawn
 from experiments.robots_check.robots import ROBOTS, map_toml, nominal_xml
 from experiments.robots_check.score import scored
-from experiments.robots_check.worlds import LOGS, NOISE, motion, run, usual, world_of
+from experiments.robots_check.worlds import LOGS, motion, noise_of, run, usual, world_of
 from experiments.saving import save
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "robots_check.json"
 KINDS = ("single", "healthy", "pair", "single", "outside", "single", "dense", "healthy")
 COUNT = {"healthy": 0, "single": 1, "pair": 2, "dense": 4, "outside": 1}
-TURNS = ("pendulum", "ur5e", "pendulum", "manipulator", "pendulum")
+TURNS = ("ur5e", "manipulator", "pendulum", "reacher", "acrobot")
 
 
 def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> dict:
@@ -44,7 +44,7 @@ def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> 
     robot = next(r for r in ROBOTS if r.name == turns[number % len(turns)])
     kind = KINDS[number % len(KINDS)]
     xml = nominal_xml(robot, models, rng)
-    sizes = usual(robot, xml)
+    sizes, noise = usual(robot, xml), noise_of(robot, xml)
     known = [k for k, f in FAULTS.items() if f.outside == (kind == "outside")]
     chosen = rng.choice(known, COUNT[kind], replace=False)
     plain = world_of(xml, [], sizes)
@@ -54,12 +54,12 @@ def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> 
         paths = []
         for log in range(LOGS):
             shown = pd.DataFrame(run(robot, world_of(xml, faults, sizes), motion(robot, rng)))
-            for joint in robot.read:
-                shown[f"q_{joint}"] += NOISE * rng.standard_normal(len(shown))
+            for joint, sd in noise.items():
+                shown[f"q_{joint}"] += sd * rng.standard_normal(len(shown))
             paths.append(Path(folder) / f"log_{log}.csv")
             shown.to_csv(paths[-1], index=False, float_format="%.7g")
         (Path(folder) / "robot.xml").write_text(xml, encoding="utf-8")
-        (Path(folder) / "map.toml").write_text(map_toml(robot, NOISE), encoding="utf-8")
+        (Path(folder) / "map.toml").write_text(map_toml(robot, noise), encoding="utf-8")
         loaded = load_mjcf(Path(folder) / "robot.xml", Path(folder) / "map.toml")
         logs = [loaded.read(p) for p in paths]
         more = loaded.effects(logs)

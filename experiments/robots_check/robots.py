@@ -20,7 +20,10 @@ LONGEST = 0.005  # s: solver's step of the diagnosing model at most
 @dataclass(frozen=True)
 class Robot:
     """Where its model stands in a folder of unzipped wheels; `driven`: actuator to joint and command's unit;
-    `read`: joints that are recorded; `reach` [rad] and `rate` [Hz] of its motions; `seconds` of a log."""
+    `read`: joints that are recorded; `reach` [rad] and `rate` [Hz] of its motions about the pose `about`;
+    `seconds` of a log. `grip`: actuator to its constant command; `carried`: two slides that bring a body to a
+    site, where it is gripped before a log begins; `without` which bodies the model is read; its solver's
+    `step` [s], if another than the package's."""
 
     name: str
     file: str
@@ -30,6 +33,10 @@ class Robot:
     rate: float
     seconds: float
     about: Mapping[str, float] = field(default_factory=dict)
+    grip: Mapping[str, float] = field(default_factory=dict)
+    carried: tuple[str, str, str] | None = None
+    without: tuple[str, ...] = ()
+    step: float | None = None
 
 
 UR5E = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -78,12 +85,17 @@ ROBOTS = (
         "manipulator",
         "dm_control/suite/manipulator.xml",
         {"root": ("arm_root", "1"), "shoulder": ("arm_shoulder", "1"), "elbow": ("arm_elbow", "1"),
-         "wrist": ("arm_wrist", "1"), "grasp": ("thumb", "1")},
-        ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "thumb", "thumbtip", "finger", "fingertip"),
-        0.5,
-        0.7,
-        2.5,
-        {"arm_shoulder": 0.8, "arm_elbow": 0.8},
+         "wrist": ("arm_wrist", "1")},
+        ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "thumb", "thumbtip", "finger", "fingertip",
+         "ball_x", "ball_z", "ball_y"),
+        0.4,
+        0.8,
+        1.0,
+        {"arm_root": 0.3, "arm_shoulder": 0.8, "arm_elbow": 0.8, "arm_wrist": 0.3},
+        {"grasp": 0.4},
+        ("ball_x", "ball_z", "grasp"),
+        ("peg", "slot", "cup", "target_ball", "target_peg"),
+        0.002,
     ),
 )  # fmt: skip
 
@@ -96,6 +108,8 @@ def nominal_xml(robot: Robot, models: Path, rng: np.random.Generator) -> str:
             spec.delete(geom)
     for mesh in list(spec.meshes):
         spec.delete(mesh)
+    for name in robot.without:
+        spec.delete(spec.body(name))
     for body in spec.bodies:
         if body.explicitinertial:
             share = rng.uniform(0.85, 1.15)
@@ -103,12 +117,13 @@ def nominal_xml(robot: Robot, models: Path, rng: np.random.Generator) -> str:
             body.inertia = np.array(body.inertia) * share
     for joint in spec.joints:
         joint.damping = np.array(joint.damping) * rng.uniform(0.6, 1.6)
-    spec.option.timestep = min(spec.option.timestep, LONGEST)
+    spec.option.timestep = min(robot.step or spec.option.timestep, LONGEST)
     return spec.to_xml()
 
 
-def map_toml(robot: Robot, noise: float) -> str:
-    """Which column is which: commands by actuator, positions by joint."""
-    out = [f'[columns.u_{a}]\nactuator = "{a}"\nunit = "{unit}"\n' for a, (_, unit) in robot.driven.items()]
-    out += [f'[columns.q_{j}]\njoint = "{j}"\nnoise = {noise}\n' for j in robot.read]
+def map_toml(robot: Robot, noise: Mapping[str, float]) -> str:
+    """Which column is which: commands by actuator, positions by joint, with their `noise`."""
+    units = {a: unit for a, (_, unit) in robot.driven.items()} | dict.fromkeys(robot.grip, "1")
+    out = [f'[columns.u_{a}]\nactuator = "{a}"\nunit = "{unit}"\n' for a, unit in units.items()]
+    out += [f'[columns.q_{j}]\njoint = "{j}"\nnoise = {noise[j]}\n' for j in robot.read]
     return "".join(out)

@@ -16,10 +16,12 @@ from experiments.robots_check.robots import Robot
 
 LIKE: Any = mujoco
 RATE = 100.0  # Hz of logs
-NOISE = 5e-4  # rad
+NOISE = 5e-4  # rad, of hinges
+PLACE_NOISE = 1e-4  # m, of slides
 FINER = 3  # the world's step is the model's over this
 LOGS = 3
 PACE = 2.5  # Hz: of the controller
+HELD, SETTLED = 1.0, 0.5  # s: while a body is held where the grip closes on it, and then until the log begins
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,13 @@ def motion(robot: Robot, rng: np.random.Generator) -> Callable[[float], np.ndarr
     return lambda t: about + np.sum(sizes * np.sin(rates * t + phases), 1)
 
 
+def noise_of(robot: Robot, xml: str) -> dict[str, float]:
+    """By recorded joint, the sd of one sample."""
+    model = LIKE.MjModel.from_xml_string(xml)
+    slide = int(LIKE.mjtJoint.mjJNT_SLIDE)
+    return {j: PLACE_NOISE if int(model.joint(j).type[0]) == slide else NOISE for j in robot.read}
+
+
 def run(
     robot: Robot,
     world: World,
@@ -75,37 +84,44 @@ def run(
     read = [int(model.jnt_qposadr[model.joint(j).id]) for j in robot.read]
     for place, (joint, _) in zip(places, robot.driven.values(), strict=True):
         data.qpos[place] = robot.about.get(joint, 0.0)
+    for name, command in robot.grip.items():
+        data.ctrl[model.actuator(name).id] = command
     LIKE.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     steps = round(1 / rate / model.opt.timestep)
+    before = round((HELD + SETTLED) * rate) if robot.carried else 0
     rows = round(robot.seconds * rate)
-    t, log, commands = np.arange(rows) / rate, np.zeros((rows, len(read))), np.zeros((rows, len(dofs)))
+    t, log, commands = np.arange(-before, rows) / rate, np.zeros((rows, len(read))), []
     shown = {j: ([], [], []) for j, _ in robot.driven.values()}
     limits = np.where(model.actuator_ctrllimited[actuators], model.actuator_ctrlrange[actuators, 1], np.inf)
     gear = model.actuator_gear[actuators, 0]
-    for i in range(rows):
-        log[i] = data.qpos[read]
+    for i in range(-before, rows):
+        log[max(i, 0)] = data.qpos[read]
         LIKE.mj_fullM(model, inertia, data.qM) if hasattr(data, "qM") else LIKE.mj_fullM(model, data, inertia)
         mass = np.maximum(np.diag(inertia)[dofs], 1e-6)
-        off, pace = wanted(t[i]) - data.qpos[places], 2 * np.pi * PACE
+        off, pace = wanted(max(i, 0) / rate) - data.qpos[places], 2 * np.pi * PACE
         pull = mass * (pace**2 * off - 2 * pace * data.qvel[dofs]) + model.dof_damping[dofs] * pace * off
-        commands[i] = np.clip((pull + data.qfrc_bias[dofs]) / gear, -limits, limits)
-        past = commands[: i + 1]
+        commands.append(np.clip((pull + data.qfrc_bias[dofs]) / gear, -limits, limits))
+        past = np.array(commands)
         for act in world.command:
-            past = act(t[: i + 1], past)
+            past = act(t[: len(past)], past)
         data.ctrl[actuators] = past[-1]
         for _ in range(steps):
+            if i < -round(SETTLED * rate):
+                _hold(robot, model, data)
             data.qfrc_applied[:] = 0.0
             for push in world.torque:
-                push(data, t[i])
+                push(data, i / rate)
             LIKE.mj_step(model, data)
-        if measure:
+        if measure and i >= 0:
             for (joint, _), d, k in zip(robot.driven.values(), dofs, range(len(dofs)), strict=True):
                 shown[joint][0].append(past[-1][k] * gear[k])
                 shown[joint][1].append(data.qvel[d])
                 shown[joint][2].append(data.qacc[d])
+    t, given = t[before:], np.array(commands)[before:]
     out: dict[str, Any] = {"t": t}
-    out |= {f"u_{a}": commands[:, k] for k, a in enumerate(robot.driven)}
+    out |= {f"u_{a}": given[:, k] for k, a in enumerate(robot.driven)}
+    out |= {f"u_{a}": np.full(rows, command) for a, command in robot.grip.items()}
     for k, joint in enumerate(robot.read):
         values = log[:, k]
         for act in world.read.get(joint, []):
@@ -117,6 +133,16 @@ def run(
             for j, each in shown.items()
         }
     return out
+
+
+def _hold(robot: Robot, model: Any, data: Any) -> None:
+    """Keep what is carried where the grip closes on it."""
+    if robot.carried is None:
+        return
+    along, up, site = robot.carried
+    for joint, value in ((along, data.site(site).xpos[0]), (up, data.site(site).xpos[2])):
+        data.qpos[int(model.joint(joint).qposadr[0])] = value
+        data.qvel[int(model.joint(joint).dofadr[0])] = 0.0
 
 
 def world_of(xml: str, faults: list[Fault], sizes: Mapping[str, tuple[float, float, float]]) -> World:

@@ -205,7 +205,7 @@ def _concluded(
     linear, sensor = ended.linear, ended.covariances.whitener()
     rows = np.flatnonzero(np.isfinite(linear.residual))
     s = forms(gap_of(composed, linear, sensor, phases, ended.names))
-    explains = explained(composed, linear, sensor, plain, ended.best, whole)
+    explains = explained(composed, linear, sensor, plain, ended.best, whole, twins.plain)
     every = s if whole is composed else _every(whole, linear.point, ended.best, phases)
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
     numerics = tuple(j for j, n in enumerate(ended.names) if composed.numeric(n))

@@ -31,8 +31,8 @@ SEEN = 3.0  # chosen: standard deviations of noise's squares: a smaller gap of a
 @dataclass(frozen=True)
 class Explained:
     """Squares by regime and channel: `before` (R, C) with nothing but what is fitted along, `after` (R, C)
-    with all causes, `without` (J, R, C) with one of them left out, `floor` (R, C) the noise's own. `asked`
-    (R,): regimes in which causes were sought; they rest on no other."""
+    with all causes, `without` (J, R, C) with one of them left out, `floor` (R, C) what healthy twins
+    have. `asked` (R,): regimes in which causes were sought; they rest on no other."""
 
     causes: tuple[str, ...]
     regimes: tuple[str, ...]
@@ -89,10 +89,19 @@ def regimes_of(rows: Rows) -> tuple[tuple[str, ...], np.ndarray]:
 
 
 def explained(
-    composed: Composed, linear: Linear, sensor: Whitener, plain: Point, causes: Sequence[str], whole: Composed
+    composed: Composed,
+    linear: Linear,
+    sensor: Whitener,
+    plain: Point,
+    causes: Sequence[str],
+    whole: Composed,
+    healthy: Sequence[np.ndarray] = (),
 ) -> Explained:
     """Of causes that act at the linear model's point, fitted to its rows and told of all rows of `whole`;
-    `plain`: where what is fitted along is without them."""
+    `plain`: where what is fitted along is without them; `healthy`: twins' residuals (N,) of its rows.
+
+    An uncertain start takes up some of every window's noise, so that the noise's own squares are fewer than
+    rows: they are the twins' mean where there are twins."""
     asked = _Squares.of(composed, linear, sensor)
     every, rows = asked, linear.rows
     if whole is not composed:
@@ -111,11 +120,14 @@ def explained(
     mine = {n: dict(linear.point[n]) for n in along}
     before = least(plain, mine) if along else every({})
     sought = np.isin(np.unique(rows.regime), np.unique(linear.rows.regime))
+    floor = every.floor
+    if healthy:
+        floor[sought] = np.mean([asked.squares(r) for r in healthy], 0)
     if not causes:
-        return Explained((), names, before, before, np.zeros((0, *before.shape)), every.floor, sought)
+        return Explained((), names, before, before, np.zeros((0, *before.shape)), floor, sought)
     after = least(linear.point)
     without = [least({n: v for n, v in linear.point.items() if n != out}) for out in causes]
-    return Explained(tuple(causes), names, before, after, np.array(without), every.floor, sought)
+    return Explained(tuple(causes), names, before, after, np.array(without), floor, sought)
 
 
 @dataclass(frozen=True)
@@ -136,7 +148,10 @@ class _Squares:
         return cls(composed, sensor, np.isfinite(linear.residual), cell, shape)
 
     def __call__(self, point: Point) -> np.ndarray:
-        residual = self.composed.rows.observed - base_at(self.composed, point).rows
+        return self.squares(self.composed.rows.observed - base_at(self.composed, point).rows)
+
+    def squares(self, residual: np.ndarray) -> np.ndarray:
+        """Of a residual (N,), by regime and channel (R, C)."""
         white = self.sensor(np.where(self.there & np.isfinite(residual), residual, 0.0)) ** 2
         return self._by_cell(np.where(self.there, white, 0.0))
 

@@ -137,7 +137,7 @@ class Solved:
                     trace[k] += float(np.diag(inverse)[at] @ own)
                     pull[k] += float(alpha[at] ** 2 @ own)
                 else:
-                    trace[k] += float(np.sum(inverse[np.ix_(at, at)] * own))
+                    trace[k] += float(np.sum(source.across(inverse) * own))
                     pull[k] += float(alpha[at] @ own @ alpha[at])
         return trace, pull
 

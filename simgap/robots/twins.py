@@ -25,10 +25,12 @@ TWINS = 6  # numerics: drawn; they bound a chance from below by their ranks
 
 @dataclass(frozen=True)
 class Twins:
-    """`factor` (N,) by which the recording's noise grows, and each twin's whitened residuals with it."""
+    """`factor` (N,) by which the recording's noise grows, each twin's residuals whitened with it, and those
+    residuals as they are, in their units (0 where there are none)."""
 
     factor: np.ndarray
     residuals: tuple[np.ndarray, ...]
+    plain: tuple[np.ndarray, ...] = ()
 
 
 def healthy_twins(composed: Composed, plain: Linear, seed: int) -> Twins:
@@ -40,19 +42,20 @@ def healthy_twins(composed: Composed, plain: Linear, seed: int) -> Twins:
     rng = np.random.default_rng(seed)
     make = along_windows if _begins_anew(composed, plain.point) else along_logs
     steps = {n: max(resolution(r[n]) for r in composed.recordings) for n in composed.noise}
-    found = []
+    found, left = [], []
     for _ in range(TWINS):
         twin = make(composed, plain.point, steps, rng)
         if twin is None:
             return Twins(np.ones(plain.residual.size), ())
         linear = linearise(twin, plain.point, [])
         white = covariances(twin, linear).whitener()
-        found.append(white(np.where(np.isfinite(linear.residual), linear.residual, 0.0)))
+        left.append(np.where(np.isfinite(linear.residual), linear.residual, 0.0))
+        found.append(white(left[-1]))
     rows = composed.rows
     group = rows.window * len(rows.channels) + rows.channel
     ratio = np.bincount(group, np.mean(np.square(found), 0)) / np.maximum(np.bincount(group), 1)
     factor = np.sqrt(np.maximum(ratio, 1.0))[group]
-    return Twins(factor, tuple(white / factor for white in found))
+    return Twins(factor, tuple(white / factor for white in found), tuple(left))
 
 
 def _begins_anew(composed: Composed, point: Point) -> bool:

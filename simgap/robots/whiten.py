@@ -81,8 +81,20 @@ class Source:
 
     def add(self, total: np.ndarray, variance: float) -> None:
         """Add it to a block's covariance, in place."""
-        across = self.rows if self.covariance.ndim == 1 else self.rows[:, None]
-        total[across, self.rows] += variance * self.covariance
+        total[self._where] += variance * self.covariance
+
+    def across(self, matrix: np.ndarray) -> np.ndarray:
+        """What a block's matrix (n, n) has where this has its covariance."""
+        return matrix[self._where]
+
+    @property
+    def _where(self) -> tuple:
+        if self.covariance.ndim == 1:
+            return self.rows, self.rows
+        first, end = int(self.rows[0]), int(self.rows[-1]) + 1
+        if end - first == self.rows.size:  # rows ascend: a part of the matrix, which needs no copy
+            return slice(first, end), slice(first, end)
+        return self.rows[:, None], self.rows
 
 
 @dataclass(frozen=True)
@@ -165,7 +177,7 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
             continue
         if rate is not None and regime == STRIKES:
             response = _propagated(t, since, channel, rate[block])
-            moved = np.flatnonzero(np.abs(response).max(1))
+            moved = every if response.any() else every[:0]
             response = response[moved]
         else:
             moved, response = np.flatnonzero(mine), np.eye(t.size)

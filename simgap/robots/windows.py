@@ -22,6 +22,7 @@ FEWEST = 6  # numerics: samples of a window
 # chosen: s of samples on either side that a start is smoothed from, and at least NEIGHBOURS of them
 REACH = 0.03
 NEIGHBOURS = 5  # numerics: samples
+DEGREES = (2, 3, 4)  # numerics: of polynomials through them
 # chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
 DOUBT = 3.0
 FREE = "free"  # what a simulator's `contact_states` call the state in which nothing touches
@@ -63,7 +64,9 @@ def cut(
         rests = touching & resting(log, reach)
         turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
         marks = [*_marks(simulator, log), *log.t[turns].tolist()]
-        for begin, end in itertools.pairwise(_edges(log, marks, length)):
+        edges = _edges(log, marks, length)
+        edges[0] = _readable(simulator, log, edges[1])
+        for begin, end in itertools.pairwise(edges):
             near = any(abs(float(log.t[begin]) - m) < REACH for m in marks)
             regime = FLIES
             if touching[begin:end].any():
@@ -133,6 +136,16 @@ def _touching(simulator: Simulator, log: Recording) -> np.ndarray:
     return np.array([label != FREE for label in what])[np.maximum(latest, 0)]
 
 
+def _readable(simulator: Simulator, log: Recording, end: int) -> int:
+    """The first row with samples on either side to smooth a start from, of a first window up to `end`.
+
+    A log often begins with a jerk, of which a parabola through later samples alone makes a rate."""
+    if getattr(simulator, "state_at", None) is not None:
+        return 0
+    row = max(int(np.searchsorted(log.t - log.t[0], REACH - 1e-9)), NEIGHBOURS // 2)
+    return row if end - row >= FEWEST else 0
+
+
 def _edges(log: Recording, contacts: Sequence[float], length: float) -> list[int]:
     """First rows of the windows, and one past the last."""
     span = float(log.t[-1] - log.t[0])
@@ -169,9 +182,11 @@ def start_of(
 def smoothed(
     t: np.ndarray, values: np.ndarray, row: int, noise: float, forward: bool = False
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Value and rate at a row, each with its standard deviation, of a parabola through its neighbours.
+    """Value and rate at a row, each with its standard deviation, of a polynomial through its neighbours: a
+    parabola, or more where samples show a jerk, of which a parabola would make a rate (AIC: Akaike, IEEE
+    Transactions on Automatic Control 19, 1974).
 
-    `forward` takes later samples alone: a contact changes rates. What the parabola misses counts as noise.
+    `forward` takes later samples alone: a contact changes rates. What the polynomial misses counts as noise.
     """
     near = np.flatnonzero(np.isfinite(values) & (np.abs(t - t[row]) <= REACH))
     if near.size < NEIGHBOURS or forward:
@@ -180,10 +195,16 @@ def smoothed(
         near = np.sort(seen[np.argsort(np.abs(t[seen] - t[row]))[: max(NEIGHBOURS, near.size // 2)]])
     since = t[near] - t[row]
     scale = float(np.abs(since).max())
-    design = np.vander(since / scale, 3, increasing=True)
-    inverse = np.linalg.inv(design.T @ design)
-    found = inverse @ design.T @ values[near]
-    misses = values[near] - design @ found
-    variance = max(noise**2, float(misses @ misses) / max(near.size - 3, 1))
-    sd = DOUBT * np.sqrt(variance * np.diag(inverse))
+    fits = [_fit(since / scale, values[near], k, noise) for k in DEGREES if near.size > k + 1]
+    found, sd, _ = min(fits, key=lambda fit: fit[2])
     return (float(found[0]), float(sd[0])), (float(found[1] / scale), float(sd[1] / scale))
+
+
+def _fit(x: np.ndarray, y: np.ndarray, degree: int, noise: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Coefficients of a polynomial with their standard deviations, and its AIC at this noise."""
+    design = np.vander(x, degree + 1, increasing=True)
+    inverse = np.linalg.inv(design.T @ design)
+    found = inverse @ design.T @ y
+    left = float(np.sum((y - design @ found) ** 2))
+    variance = max(noise**2, left / max(x.size - degree - 1, 1))
+    return found, DOUBT * np.sqrt(variance * np.diag(inverse)), left / noise**2 + 2 * (degree + 1)

@@ -17,7 +17,7 @@ from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises, resolution
 from simgap.robots.whiten import NONE, covariances
-from simgap.robots.windows import smoothed
+from simgap.robots.windows import REACH, smoothed
 from simgap.simulators.user import checked
 
 
@@ -34,11 +34,12 @@ def whitened(model: Composed, point=None, effects=()):
     return whiten(linear.residual), {n: whiten(m.jacobian) for n, m in linear.moved.items()}, linear
 
 
-def test_windows_tile_every_log():
+def test_windows_tile_every_log_from_where_a_start_can_be_read():
     model = composed([log(0), log(1, seconds=2.05)])
     for number, recording in enumerate(model.recordings):
         mine = [w for w in model.windows if w.log == number]
-        assert mine[0].begin == 0 and mine[-1].end == len(recording)
+        assert recording.t[mine[0].begin] - recording.t[0] == pytest.approx(REACH, abs=1e-3)
+        assert mine[-1].end == len(recording)
         assert all(a.end == b.begin for a, b in itertools.pairwise(mine))
 
 
@@ -51,6 +52,16 @@ def test_a_start_is_right_within_what_it_says():
         off.append([(value - 0.3 * np.sin(2.0)) / sd, (rate - 1.5 * np.cos(2.0)) / rate_sd])
     # what is said is three times what white noise makes of it
     assert np.all(np.std(off, 0) < 0.45) and np.all(np.std(off, 0) > 0.2)
+
+
+def test_the_start_of_a_jerk_is_read_as_such():
+    t = np.linspace(0, 1, 101)
+    values = 300.0 * np.maximum(t - 0.485, 0.0) ** 3 + 1e-4 * np.random.default_rng(0).standard_normal(t.size)
+    _, (rate, sd) = smoothed(t, values, 50, 1e-4)
+    true = 900.0 * (t[50] - 0.485) ** 2
+    assert abs(rate - true) < sd
+    x = t[47:54] - t[50]  # a parabola takes the jerk for a rate
+    assert abs(np.polyfit(x, values[47:54], 2)[1] - true) > 3 * sd
 
 
 def test_whitened_residuals_of_a_true_model_are_white():
