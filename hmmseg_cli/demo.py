@@ -34,6 +34,6 @@ def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: See
         out.print("\nThe same recordings, the fingertips thought rigid as the paper has them:")
         out.report = finding
         paper = rig.model_copy(update={"fingertip": rigid})
-        body["diagnosis"] = diagnose.run(out, trials, task, paper, None, [])
+        body["diagnosis"] = diagnose.run(out, trials, task, paper, None, []).body
         out.print(f"figures are in {figures}; the findings are told in {page} and {finding}")
         out.finish(body)

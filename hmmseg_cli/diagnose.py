@@ -37,7 +37,7 @@ from simgap.report.finding import sentence
 from simgap.report.tables import tables
 
 if TYPE_CHECKING:
-    from hmmseg.io.trial import Trial
+    from simgap.gap.diagnose import Diagnosis
 
 EffectOption = Annotated[
     list[str] | None,
@@ -143,26 +143,24 @@ def diagnose(
         hand = read_rig(rig)
         if patch is not None:
             check_folder("--patch", patch)
-        body = run(out, paths, description, hand, actual, effect or [], healthy or [])
+        found = run(out, paths, description, hand, actual, effect or [], healthy or [])
         if patch is not None:
-            _patch(out, body, rig, patch, read_trials(out, paths, hand), description)
-        out.finish(body)
+            _patch(out, found, rig, patch)
+        out.finish(found.body)
 
 
-def _patch(
-    out: Output, body: dict[str, Any], rig: Path, folder: Path, trials: Sequence[Trial], task: BlockTask
-) -> None:
+def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
     """Write the corrected model; a warning where there is no cause to correct, or where it predicts worse."""
-    from hmmseg.io.rig import read_rig
     from simgap.patch import files, reproduced
 
     if (folder / "rig.toml").resolve() == rig.resolve():
         raise InputError(f"--patch {folder}", f"would replace the input {rig}", "another folder")
-    written = files(rig.read_text(encoding="utf-8"), body)
+    frame = found.problem.frame
+    written = files(rig.read_text(encoding="utf-8"), found.body)
     if not written:
         out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
         return
-    nominal, corrected = reproduced(written, body, trials, task, read_rig(rig))
+    nominal, corrected = reproduced(written, found.body, found.search.trials, frame.task, frame.rig)
     text = f"forces differ from the recorded ones by {corrected:.3g} N with it, {nominal:.3g} N without"
     if not corrected < nominal:
         out.warn(f"--patch {folder}: the corrected model is no better ({text}); nothing is written")
@@ -180,22 +178,20 @@ def run(
     actual: Path | None,
     effect: Sequence[str],
     healthy: Sequence[Path] = (),
-) -> dict[str, Any]:
-    """Diagnose, put table, figures and page where `out` has them go, and give the document."""
+) -> Diagnosis:
+    """Diagnose, and put table, figures and page where `out` has them go."""
     from estimation.actual import read_actual
     from hmmseg.segmentation.align import align
-    from simgap.effects import effect_named
     from simgap.gap.diagnose import STAGES
     from simgap.gap.diagnose import diagnose as find
 
     measured = None if actual is None else read_actual(actual, task.objects)
-    forced = [effect_named(name).name for name in dict.fromkeys(effect)]
     recordings = read_trials(out, paths, rig)
     well = read_trials(out, distinct_trials(list(healthy)), rig) if healthy else []
     with out.progress("diagnosing", total=STAGES) as advance:
         tell = lambda text: advance(1)  # noqa: E731
         found = find(
-            align(recordings, task, rig), measured, forced, out.seed, tell,
+            align(recordings, task, rig), measured, effect, out.seed, tell,
             healthy=align(well, task, rig) if well else None,
         )  # fmt: skip
     for warning in found.warnings:
@@ -203,7 +199,7 @@ def run(
     pads = rig.fingertip.model_dump()
     out.print(sentence(found.body, pads), *tables(found.body))
     _draw(out, found, recordings, task, rig, measured)
-    return found.body
+    return found
 
 
 def _against(

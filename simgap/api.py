@@ -49,6 +49,7 @@ def diagnose(
     rig: Source = None,
     actual: str | Path | dict | None = None,
     effects: Sequence[str] = (),
+    healthy: Source | Sequence[Source] | AlignedTrials | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
@@ -56,8 +57,9 @@ def diagnose(
 
     `trials`, `task`, `rig`: paths, tables or what the readers give; or what `hmmseg.align` or `identify`
     gave, alone: the alignment is then theirs. `actual`: properties measured apart (a path or a table);
-    `effects` are taken instead of choosing.
-    InputError for input at fault or where no trial fits its task.
+    `effects` are taken instead of choosing; `healthy` recordings of the same task and hand are the null, not
+    simulated twins; `progress` is given what is being done, in words.
+    InputError for input at fault, an effect that is unknown or cannot act, or where no trial fits its task.
     """
     identified = None
     if isinstance(trials, Identification):
@@ -69,7 +71,11 @@ def diagnose(
         measured = parse_actual(actual, order.objects)
     else:
         measured = None if actual is None else read_actual(actual, order.objects)
-    return diagnose_blocks(aligned, measured, tuple(effects), seed, progress, identified=identified)
+    if healthy is not None and not isinstance(healthy, AlignedTrials):
+        healthy = align(healthy, order if task is None else task, aligned.rig)
+    return diagnose_blocks(
+        aligned, measured, tuple(effects), seed, progress, healthy=healthy, identified=identified
+    )
 
 
 def _blocks(properties: Any, task: Any) -> Blocks:

@@ -8,6 +8,7 @@ from itertools import product
 
 import numpy as np
 
+from hmmseg.errors import InputError
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder, SmallGap
@@ -152,9 +153,13 @@ def _by_name(
 
 
 def _forced(f: Forms, names: tuple[str, ...]) -> Model:
-    """The best set of these effects, one form of each."""
+    """The best set of these effects, one form of each; InputError for one that cannot act here."""
+    possible = dict.fromkeys(c.name for c in f.gap.candidates if c.named)
+    for name in names:
+        if name not in possible:
+            raise InputError(f"effect {name!r}", "cannot act on these recordings", ", ".join(possible))
     forms_of = [[j for j, c in enumerate(f.gap.candidates) if c.name == name] for name in names]
-    sets = {tuple(sorted(each)) for each in product(*(mine for mine in forms_of if mine))}
+    sets = {tuple(sorted(each)) for each in product(*forms_of)}
     return max((fitted(f, each) for each in sets), key=lambda m: m.score)
 
 

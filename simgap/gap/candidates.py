@@ -19,9 +19,9 @@ LEADERS = 3  # numerics: starts screened
 PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
 
 
-def candidate_names(rig: Rig, excluded: Sequence[str] = ()) -> list[str]:
-    """The effects to choose from, decoys included: a Cartesian hand has no joints."""
-    chosen = {n: e for n, e in catalogue().items() if e.chosen} | decoys()
+def candidate_names(rig: Rig, excluded: Sequence[str] = (), forced: Sequence[str] = ()) -> list[str]:
+    """The effects to choose from, decoys included, or that are `forced`: a Cartesian hand has no joints."""
+    chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced} | decoys()
     return [n for n, e in chosen.items() if n not in excluded and (rig.jointed or e.acts_on != "kinematics")]
 
 

@@ -19,7 +19,7 @@ from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
 from simgap.attribution.verdict import ALARM
-from simgap.effects import free_parameters, name_of
+from simgap.effects import effect_named, free_parameters, name_of
 from simgap.gap.assemble import together
 from simgap.gap.body import body, drawn, parameters
 from simgap.gap.evaluation import residual_at
@@ -122,12 +122,14 @@ def diagnose(
     `actual` as `estimation.actual.read_actual` gives it; `forced` names effects to be taken instead of
     choosing; `excluded` effects are not thought of. The null are `healthy` recordings of the same task and
     rig if there are any, else simulated `twins`, else the model itself. `identified`: what `identify` made
-    of the same trials, where that is known already. InputError where no trial fits its task.
+    of the same trials, where that is known already. InputError where no trial fits its task, or no effect has
+    a forced name or could act on these recordings.
     """
     tell = progress or (lambda text: None)
+    forced = tuple(effect_named(name).name for name in dict.fromkeys(forced))
     if of_wrist([one.trial for one in aligned.trials]):
         check_forced(forced)
-    found = search(aligned, actual, excluded, tell, identified)
+    found = search(aligned, actual, excluded, forced, tell, identified)
     tell("attributing the gap")
 
     def null(value: float) -> Iterable[float]:
@@ -135,7 +137,7 @@ def diagnose(
             return own_healthy(found, healthy, actual)
         return twin_statistics(found, actual, seed, tell) if twins and value > NIL else ()
 
-    gap, verdict = attributed(found, tuple(forced), seed, null)
+    gap, verdict = attributed(found, forced, seed, null)
     causes = _causes(found, gap, verdict)
     following = None
     if verdict.verdict == "set":

@@ -73,15 +73,16 @@ def search(
     aligned: AlignedTrials,
     actual: dict | None = None,
     excluded: Sequence[str] = (),
+    forced: Sequence[str] = (),
     tell: Progress = lambda text: None,
     identified: Identified | None = None,
 ) -> Search:
-    """Fit the catalogue to aligned trials; InputError where none fits its task.
+    """Fit the catalogue, and what is `forced`, to aligned trials; InputError where none fits its task.
 
     `identified`: what `identify` made of the same trials, where that is known already.
     """
     misled: list[str] = []
-    names, trials = candidate_names(aligned.rig, excluded), [one.trial for one in aligned.trials]
+    names, trials = candidate_names(aligned.rig, excluded, forced), [one.trial for one in aligned.trials]
     keys = shifting(names)
     if of_wrist(trials):
         keys = [key for key in shown_forms(names) if key in keys]

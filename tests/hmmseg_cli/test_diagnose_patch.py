@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace as NS
 
 import pandas as pd
 import pytest
 from demo_recordings import FOLDER
 
+from hmmseg.io.trial import read_trial
 from hmmseg_cli import diagnose as command
 from hmmseg_cli.main import main
 from simgap.world.properties import PAPER_BLOCKS
@@ -37,7 +39,12 @@ def test_only_a_model_that_predicts_better_is_written(found, tmp_path, monkeypat
     table = pd.read_csv(FOLDER / "trial_01.csv")
     table["fy1"] += BIAS
     table.to_csv(tmp_path / "trial.csv", index=False)
-    monkeypatch.setattr(command, "run", lambda *given: named(found))
+
+    def run(out, paths, task, rig, *more):
+        trials = [read_trial(path, rig) for path in paths]
+        return NS(body=named(found), search=NS(trials=trials), problem=NS(frame=NS(task=task, rig=rig)))
+
+    monkeypatch.setattr(command, "run", run)
     folder, document = tmp_path / "corrected", tmp_path / "gap.json"
     args = ["diagnose", str(tmp_path / "trial.csv"), "--task", str(FOLDER / "task.toml"),
             "--rig", str(FOLDER / "rig.toml"), "--patch", str(folder), "--json", str(document)]  # fmt: skip

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.identification import identify_aligned
+from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
@@ -76,3 +77,20 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
     for key, p in entry["parameters"].items():
         assert np.median(drawn[f"{name}.{key}"]) == pytest.approx(p["mean"])
         assert np.percentile(drawn[f"{name}.{key}"], (5, 95)) == pytest.approx(p["interval_90"])
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("force_bais", r"unknown effect.*force_bias"), ("actual", "cannot act on these recordings")],
+)
+def test_an_effect_that_cannot_be_taken_is_said(name, wrong):
+    """A property that nobody measured cannot be wrong, and a name that is misspelt means nothing."""
+    with pytest.raises(InputError, match=wrong):
+        diagnose(recorded(FOLDER), effects=(name,))
+
+
+def test_an_effect_that_is_never_chosen_is_taken_where_asked_for():
+    """And healthy recordings of one's own are the null."""
+    aligned = recorded(FOLDER)
+    found = diagnose(aligned, effects=("object_inertia",), healthy=aligned)
+    assert abs(found.body["effects"]["object_inertia"]["parameters"]["scale"]["mean"] - 1) < 0.1
