@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
+.PHONY: untidy robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -154,6 +154,11 @@ calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds 
 boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/segmentation_results.md
 	$(BIN)/python -m experiments.calibration_boundaries
 	$(BIN)/python -m experiments.table_boundaries
+
+untidy: $(INSTALLED)  ## misfits found and false alarms in worlds that differ; untidy contact by both simulators; fills docs/calibration.md
+	$(BIN)/python -m experiments.misfit_worlds
+	$(BIN)/python -m experiments.untidy_contacts
+	$(BIN)/python -m experiments.write_tables
 
 sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL, PANDA, HANDS: folders; fills docs/sequences.md
 	$(BIN)/python -m experiments.sequences check $(if $(REAL),--real $(REAL)) $(if $(PANDA),--panda $(PANDA)) $(if $(HANDS),--hands $(HANDS))

@@ -27,7 +27,7 @@ from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.spans import Segmentation
 
 RESULTS = Path(__file__).parent / "results"
-FIRST, TRIALS = 98_000, 32
+FIRST, TRIALS = 115_000, 32
 Scored = tuple[Segmentation, np.ndarray]
 
 
@@ -50,7 +50,7 @@ def score(pairs: Sequence[Scored]) -> dict:
         row[name] = {
             "shift": float(np.median(r)), "median": float(np.median(np.abs(r))),
             "percentile_95": float(np.percentile(np.abs(r), 95)), "coverage_90": float(i.mean()),
-            "half_width": float(np.median(h)),
+            "percentile_90": float(np.percentile(np.abs(r), 90)), "half_width": float(np.median(h)),
             "se": float(np.std(i.mean(axis=1), ddof=1) / np.sqrt(len(i))) if len(i) > 1 else None,
         }  # fmt: skip
     return row

@@ -35,7 +35,7 @@ from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "calibration_worlds.json"
-FIRST, REPLICATES = 96_000, 32
+FIRST, REPLICATES = 116_000, 32
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
 BIAS = 0.02  # N, what [systematic] admits where a row has biases
 PADS = 0.3  # share, likewise of pads

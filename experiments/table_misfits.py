@@ -49,6 +49,49 @@ def misfits() -> str | None:
     return f"{alarms}\n\n{between}\n\n{markdown(head, rows)}"
 
 
+def by_world() -> str | None:
+    """False alarms and what was found of misfits, by world."""
+    found = load("misfit_worlds")
+    if found is None:
+        return None
+    edits = [k for k in next(iter(found["rows"].values())) if k in NAMES]
+    rows = [
+        [name, f"{row['alarms']} of {row['trials']}",
+         *(f"{row[e]['found']}, {row[e]['right']} of {row[e]['trials']}" for e in edits)]
+        for name, row in found["rows"].items()
+    ]  # fmt: skip
+    alarms, trials = (sum(r[k] for r in found["rows"].values()) for k in ("alarms", "trials"))
+    of = {
+        k: sum(r[e][k] for r in found["rows"].values() for e in edits) for k in ("found", "right", "trials")
+    }
+    note = (
+        f"In all: {alarms} of {trials} healthy trials are rejected; of {of['trials']} that do not fit "
+        f"{of['found']} are found, {of['right']} at the subtask that fails. Commit {found['made_by']}, trials "
+        f"from number {found['first']} on."
+    )
+    return f"{markdown(['world', 'false alarms', *(NAMES[e] for e in edits)], rows)}\n\n{note}"
+
+
+def untidy() -> str | None:
+    """Contact that is not tidy, by both simulators."""
+    found = load("untidy_contacts")
+    if found is None:
+        return None
+    rows = []
+    for row in found["rows"]:
+        simulator = {"own": "ours", "mujoco": "MuJoCo"}[row["simulator"]]
+        cells = [f"{row['rate']:g} Hz", f"{len(row['misfits'])} of {row['trials']}"]
+        cells += [
+            f"{row['median']:.1f} ms", f"{row['percentile_95']:.1f} ms",
+            f"{row['beyond_a_sample']} of {row['boundaries']}", percent(row["coverage_90"], 0),
+        ] if "median" in row else [""] * 4  # fmt: skip
+        rows.append([f"{row['kind']}, {simulator}", *cells])
+    head = ["hands that are not tidy, simulator", "rate", "misfits", "median error", "95 % below",
+            "off by more than a sample", "90 % cover"]  # fmt: skip
+    note = f"Commit {found['made_by']}; trials from number {found['first']} on, seed {found['seed']}."
+    return f"{markdown(head, rows)}\n\n{note}"
+
+
 def _share(shares: dict | None) -> str:
     if shares is None:
         return ""

@@ -28,7 +28,7 @@ from experiments import (
     table_speed,
     wrist,
 )
-from experiments.table_misfits import misfits
+from experiments.table_misfits import by_world, misfits, untidy
 from experiments.table_real import real
 from experiments.table_text import covered, load, markdown, milliseconds, percent
 from hmmseg.contact.identifiability import PROPERTIES
@@ -174,6 +174,8 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/calibration.md", "reference", table_calibration.reference, "calibrate"),
     ("docs/calibration.md", "moves", moves, "results"),
     ("docs/calibration.md", "misfits", misfits, "results"),
+    ("docs/calibration.md", "misfits_by_world", by_world, "untidy"),
+    ("docs/calibration.md", "untidy", untidy, "untidy"),
     ("docs/results.md", "gap", table_gap.summary, "gap-results"),
     ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
     ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
