@@ -60,14 +60,13 @@ def by_world() -> str | None:
          *(f"{row[e]['found']}, {row[e]['right']} of {row[e]['trials']}" for e in edits)]
         for name, row in found["rows"].items()
     ]  # fmt: skip
-    alarms, trials = (sum(r[k] for r in found["rows"].values()) for k in ("alarms", "trials"))
-    of = {
-        k: sum(r[e][k] for r in found["rows"].values() for e in edits) for k in ("found", "right", "trials")
-    }
+    every = list(found["rows"].values())
+    alarms, trials = (sum(row[k] for row in every) for k in ("alarms", "trials"))
+    of = {k: sum(row[e][k] for row in every for e in edits) for k in ("found", "right", "trials")}
     note = (
         f"In all: {alarms} of {trials} healthy trials are rejected; of {of['trials']} that do not fit "
-        f"{of['found']} are found, {of['right']} at the subtask that fails. Commit {found['made_by']}, trials "
-        f"from number {found['first']} on."
+        f"{of['found']} are found, {of['right']} at the subtask that fails. Commit {found['made_by']}, "
+        f"trials from number {found['first']} on."
     )
     return f"{markdown(['world', 'false alarms', *(NAMES[e] for e in edits)], rows)}\n\n{note}"
 

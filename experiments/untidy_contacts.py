@@ -3,8 +3,9 @@
     python -m experiments.untidy_contacts
 
 The project's own simulator (experiments/untidy.py) and the blind check's in MuJoCo
-(experiments/blind_check/untidy.py), each row's trials segmented one by one; every boundary should lie within a
-sample of where it truly is. Writes experiments/results/untidy_contacts.json, which docs/calibration.md shows.
+(experiments/blind_check/untidy.py), each row's trials segmented one by one; every boundary should lie
+within a sample of where it truly is. Writes experiments/results/untidy_contacts.json, which
+docs/calibration.md shows.
 """
 
 from __future__ import annotations
