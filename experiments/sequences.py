@@ -206,7 +206,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=("check", "learn"))
     parser.add_argument("--worlds", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=95_000)
+    parser.add_argument("--seed", type=int, default=117_000)
     parser.add_argument("--real", type=Path, help="folder of hiro_snap")
     parser.add_argument("--panda", type=Path, help="folder of a simulated arm's recordings")
     parser.add_argument("--hands", type=Path, nargs="*", default=[], help="folders of a hand's recordings")

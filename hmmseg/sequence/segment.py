@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -90,7 +91,9 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     starts: list[_Boundary] = [(first, 0.0, (first, first))]
     elsewhere: list[tuple[Place, ...]] = [()]
     for k in kept[1:]:
-        median, sd, (low, high) = _boundary(data.edges, known.crossing[:, k - 1], first, last)
+        median, sd, (low, high) = _boundary(
+            data.edges, known.crossing[:, k - 1], first, last, scattered=bool(model.courses)
+        )
         if model.courses and near(data.edges, known.crossing[:, k - 1], median) < MAIN:
             median = _boundary(data.edges, own[:, k - 1], first, last)[0]
         median = max(median, starts[-1][0])
@@ -111,20 +114,44 @@ def _visit_probabilities(alignment: AlignmentPosterior) -> np.ndarray:
     return visited
 
 
-def _boundary(edges: np.ndarray, probability: np.ndarray, first: float, last: float) -> _Boundary:
+def _boundary(
+    edges: np.ndarray, probability: np.ndarray, first: float, last: float, scattered: bool = False
+) -> _Boundary:
     """Median, standard deviation and 90 % interval of a boundary [s].
 
     `probability` (num_cells - 1,) lies on the inner edges; each is spread evenly over one cell's
     width, as nothing is known within a cell. What is missing to 1 (a skipped subtask's boundary
-    at the very start) lies at the first edge.
+    at the very start) lies at the first edge. `scattered`: it may lie in places far apart, between which
+    there is nothing; the interval is then the shortest instead of that of equal tails.
     """
     step = edges[1] - edges[0]
     middle = (edges[1:] + edges[:-1]) / 2
     cumulative = np.concatenate([[0.0], np.cumsum(probability)])
     total = max(cumulative[-1], np.finfo(float).tiny)
     low, median, high = np.interp([0.05, 0.5, 0.95], cumulative / total, middle)
+    if scattered:
+        low, high = _shortest(middle, cumulative / total)
     inner = edges[1:-1]
     mean = (probability * inner).sum() / total
     variance = (probability * (inner - mean) ** 2).sum() / total + step**2 / 12
     clip = lambda t: float(np.clip(t, first, last))  # noqa: E731
     return clip(median), float(np.sqrt(variance)), (clip(low), clip(high))
+
+
+def _shortest(middle: np.ndarray, cumulative: np.ndarray) -> tuple[float, float]:
+    """The shortest interval that holds 90 % of what rises linearly between `cumulative` at `middle`.
+
+    Between two of them its length is linear in where it begins, so that one of its ends is at one.
+    """
+
+    def reached(level: np.ndarray, side: Literal["left", "right"]) -> np.ndarray:
+        """Where a level is first reached ("left"), or last left behind: they differ where nothing is."""
+        i = np.clip(np.searchsorted(cumulative, level, side), 1, middle.size - 1)
+        rise = np.maximum(cumulative[i] - cumulative[i - 1], np.finfo(float).tiny)
+        share = np.clip((level - cumulative[i - 1]) / rise, 0.0, 1.0)
+        return middle[i - 1] + share * (middle[i] - middle[i - 1])
+
+    below = np.r_[cumulative[cumulative <= 0.1], cumulative[cumulative >= 0.9] - 0.9]
+    lows, highs = reached(below, "right"), reached(np.minimum(below + 0.9, 1.0), "left")
+    shortest = int(np.argmin(highs - lows))
+    return float(lows[shortest]), float(highs[shortest])

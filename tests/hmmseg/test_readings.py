@@ -17,7 +17,7 @@ from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import NamedCourse, load_model, save_model
 from hmmseg.sequence.naming import NEAR, WEIGHING, best_choice, naming, probabilities
 from hmmseg.sequence.places import places, together
-from hmmseg.sequence.segment import segment_sequence
+from hmmseg.sequence.segment import _shortest, segment_sequence
 
 TASK = SequenceTask(("wait", "push", "pull"))
 
@@ -228,3 +228,20 @@ def test_courses_are_saved(tmp_path):
 def test_labels_that_do_not_fit_are_refused(labels, message):
     with pytest.raises(InputError, match=message):
         fit_sequence(ambiguous(1)[0], TASK, labels)
+
+
+def test_the_shortest_interval_holds_nine_tenths_and_none_on_a_fine_grid_is_shorter():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        middle = np.arange(rng.integers(4, 30) + 1.0)
+        probability = rng.exponential(size=middle.size - 1) * (rng.random(middle.size - 1) < 0.6)
+        probability[0] += 1e-3
+        cumulative = np.r_[0.0, np.cumsum(probability) / probability.sum()]
+        low, high = _shortest(middle, cumulative)
+        held = np.interp([low, high], middle, cumulative)
+        assert held[1] - held[0] > 0.9 - 1e-9
+        fine = np.linspace(0.0, middle[-1], 2001)
+        of = np.interp(fine, middle, cumulative)
+        ends = np.searchsorted(of, of + 0.9 - 1e-9)
+        lengths = [fine[end] - start for start, end in zip(fine, ends, strict=True) if end < fine.size]
+        assert high - low < min(lengths) + 1e-9
