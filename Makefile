@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: untidy robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
+.PHONY: then-and-now untidy robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -158,6 +158,10 @@ boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that diff
 untidy: $(INSTALLED)  ## misfits found and false alarms in worlds that differ; untidy contact by both simulators; fills docs/calibration.md
 	$(BIN)/python -m experiments.misfit_worlds
 	$(BIN)/python -m experiments.untidy_contacts
+	$(BIN)/python -m experiments.write_tables
+
+then-and-now: $(INSTALLED)  ## what was reported of release 0.1.0 beside what holds now; RECORDINGS: folder with towers, 1 kHz and misfits
+	$(BIN)/python -m experiments.then_and_now $(RECORDINGS)
 	$(BIN)/python -m experiments.write_tables
 
 sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL, PANDA, HANDS: folders; fills docs/sequences.md

@@ -26,6 +26,7 @@ from experiments import (
     table_robots,
     table_sequences,
     table_speed,
+    then_and_now,
     wrist,
 )
 from experiments.table_misfits import by_world, misfits, untidy
@@ -176,6 +177,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/calibration.md", "misfits", misfits, "results"),
     ("docs/calibration.md", "misfits_by_world", by_world, "untidy"),
     ("docs/calibration.md", "untidy", untidy, "untidy"),
+    ("docs/calibration.md", "then_and_now", then_and_now.table, "then-and-now"),
     ("docs/results.md", "gap", table_gap.summary, "gap-results"),
     ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
     ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
