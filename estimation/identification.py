@@ -226,7 +226,7 @@ def source_subtasks(steps: tuple[Subtask, ...], task: BlockTask, obj: str, prop:
             return False
         return s.state == ABOVE_GROUND if prop == "weight" else s.state != FREE
 
-    return list(dict.fromkeys(f"{s.name} {s.object}" for s in steps if tells(s)))
+    return list(dict.fromkeys(s.label for s in steps if tells(s)))
 
 
 def _reasons(

@@ -277,7 +277,7 @@ def _show(
     from hmmseg_cli.gap_report import Setting, page
     from simgap.report.figures import draw_all, draw_how_far
 
-    names = list(dict.fromkeys(f"{s.name} {s.object or ''}".strip() for s in subtasks(task)))
+    names = list(dict.fromkeys(s.label for s in subtasks(task)))
 
     def draw(path: Callable[[str], Path]) -> None:
         signal(path("gap_signal.png"))

@@ -69,8 +69,8 @@ def picture(
     fits = Text("fits its task", "green")
     if failed is not None:
         fits = Text(f"does not fit its task at {failed['subtask']}: {failed['reason']}", "bold red")
-    after = "end" if then is None else f"{then.name} {then.object}"
-    head = Text.assemble((f"{answer.t:9.2f} s  ", "bold"), (f"{step.name} {step.object or ''}", "bold cyan"),
+    after = "end" if then is None else then.label
+    head = Text.assemble((f"{answer.t:9.2f} s  ", "bold"), (step.label, "bold cyan"),
                          f"  next: {after}  ", fits)  # fmt: skip
     bars = Table.grid(padding=(0, 1))
     for k, (s, p) in enumerate(zip(watcher.filter.steps, answer.probabilities.tolist(), strict=True)):

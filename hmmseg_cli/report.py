@@ -68,7 +68,7 @@ def _trial(i: int, signals: Signals, trial: Trial, segmentation: Segmentation,
         "name": trial.name, "rate": f"{segmentation.rate:.4g}", "complete": segmentation.complete,
         "log_evidence": "none" if evidence is None else f"{evidence:.1f}", "figures": pictures,
         "spans": [
-            (f"{s.subtask} {s.object or ''}", s.state, f"{s.start:.3f}",
+            (s.label, s.state, f"{s.start:.3f}",
              f"{s.start_90[0]:.3f} to {s.start_90[1]:.3f}" if s.start_sd else "", f"{s.end:.3f}")
             for s in segmentation.spans
         ],

@@ -12,6 +12,11 @@ from hmmseg.io.task import AnyTask
 from hmmseg.tables import Tabled
 
 
+def labelled(subtask: str, obj: str | None) -> str:
+    """A subtask with its object, as `carry block1`; by its name alone where it has none."""
+    return subtask if obj is None else f"{subtask} {obj}"
+
+
 @dataclass(frozen=True)
 class Subtask:
     """One step of a task: its name, contact state and manipulated object.
@@ -29,6 +34,11 @@ class Subtask:
     move: int | None
     support: str | None = None
     constraints: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """As the interface names it, as `carry block1`."""
+        return labelled(self.name, self.object)
 
 
 @dataclass(frozen=True)

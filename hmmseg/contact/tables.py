@@ -32,8 +32,7 @@ def decomposition_table(found: Decomposition) -> Table:
         for entry, evidence in found.reveals(subtask.index):
             column = FRICTION_ON if entry.name.startswith(FRICTION_ON) else entry.name
             cells[column] = cell(found, subtask.index, entry, evidence)
-        subject = f"{subtask.name} {subtask.object}" if subtask.object else subtask.name
-        table.add_row(str(subtask.index + 1), subject, subtask.state, *cells.values())
+        table.add_row(str(subtask.index + 1), subtask.label, subtask.state, *cells.values())
     return table
 
 

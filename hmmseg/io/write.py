@@ -129,7 +129,7 @@ def lerobot_files(folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Spa
     from hmmseg.io.formats.lerobot import data_files, read_info
 
     info = read_info(folder)
-    names = list(dict.fromkeys(_name(s) for _, spans in labelled.values() for s in spans))
+    names = list(dict.fromkeys(s.label for _, spans in labelled.values() for s in spans))
     indices = {name: i for i, name in enumerate(names)}
     feature = {"dtype": "int64", "shape": [1], "names": None}
     if "subtask_index" in info["features"]:
@@ -146,10 +146,6 @@ def lerobot_files(folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Spa
     for file in data_files(folder):
         out[file.relative_to(folder)] = lambda path, file=file: _write_episodes(path, file, labelled, indices)
     return out
-
-
-def _name(span: Span) -> str:
-    return f"{span.subtask} {span.object or ''}".strip()
 
 
 def _write_names(path: Path, names: Sequence[str]) -> None:
@@ -173,7 +169,7 @@ def _write_episodes(path: Path, file: Path, labelled: Mapping[int, tuple[Trial, 
         if rows.sum() != trial.t.size:
             continue
         labels = label(trial.t, spans)
-        codes = np.array([*(indices[_name(span)] for span in labels.spans), -1])
+        codes = np.array([*(indices[span.label] for span in labels.spans), -1])
         index[rows], sd[rows] = codes[labels.index], labels.boundary_sd
     table = table.append_column("subtask_index", pa.array(index)).append_column("boundary_sd", pa.array(sd))
     pq.write_table(table, path)

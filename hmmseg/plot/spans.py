@@ -42,8 +42,9 @@ def stacked_panels(
     axes[-1].set_xlim(t[0], t[-1])
     name_spans(axes[0], segmentation)
     if segmentation.failed is not None:
-        step = f"{segmentation.failed.subtask} {segmentation.failed.object or ''}".strip()
-        figure.suptitle(f"does not fit its task at {step}", fontsize=8, fontweight="bold")
+        figure.suptitle(
+            f"does not fit its task at {segmentation.failed.label}", fontsize=8, fontweight="bold"
+        )
     state_legend(figure, segmentation)
     return axes
 
@@ -66,10 +67,9 @@ def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
 def name_spans(ax: Axes, segmentation: Segmentation) -> None:
     """Subtask names above a panel, slanted so that short subtasks keep theirs."""
     for span in segmentation.spans:
-        name = f"{span.subtask} {span.object or ''}".strip()
         anchor = 0.65 * span.start + 0.35 * span.end
         ax.annotate(
-            name, (anchor, 1.0), xycoords=("data", "axes fraction"), xytext=(-2, 3),
+            span.label, (anchor, 1.0), xycoords=("data", "axes fraction"), xytext=(-2, 3),
             textcoords="offset points", rotation=LABEL_SLANT, ha="left", va="bottom",
             rotation_mode="anchor", fontsize=7,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hmmseg.contact.decomposition import Subtask
+from hmmseg.contact.decomposition import Subtask, labelled
 from hmmseg.tables import Tabled
 
 
@@ -52,6 +52,11 @@ class Span:
     end_90: tuple[float, float]
     alternatives: tuple[Place, ...] = ()
 
+    @property
+    def label(self) -> str:
+        """As `carry block1`."""
+        return labelled(self.subtask, self.object)
+
     def to_json(self) -> dict:
         """The entry of one segment in the JSON of `segment`."""
         document = asdict(self)
@@ -73,10 +78,14 @@ class Failure:
     reason: str
     repetition: int | None = None
 
+    @property
+    def label(self) -> str:
+        """As `carry block1`."""
+        return labelled(self.subtask, self.object)
+
     def __str__(self) -> str:
-        step = f"{self.subtask} {self.object or ''}".strip()
         number = "" if self.repetition is None else f"repetition {self.repetition}: "
-        return f"does not fit its task at {step}: {number}{self.reason}"
+        return f"does not fit its task at {self.label}: {number}{self.reason}"
 
     def to_json(self) -> dict:
         """The entry `failed` of one trial."""

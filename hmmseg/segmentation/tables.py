@@ -24,9 +24,8 @@ def spans_table(segmentation: Segmentation) -> Table:
     for span in segmentation.spans:
         low, high = span.start_90
         interval = f"{low:.3f} to {high:.3f}" if high > low else ""
-        name = f"{span.subtask} {span.object or ''}".strip()
         places = ", ".join(f"{p.time:.3f} ({100 * p.probability:.0f} %)" for p in span.alternatives)
-        row = [name, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}"]
+        row = [span.label, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}"]
         table.add_row(*row, *[places] * elsewhere)
     return table
 

@@ -13,7 +13,6 @@ from simgap.effects import catalogue, decoys, fitted, name_of
 from simgap.gap.carried import again, carried
 from simgap.gap.evaluation import residual_at
 from simgap.gap.fit import Fitted
-from simgap.gap.frame import subtask_name
 from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.scatter import Scatter
@@ -27,7 +26,7 @@ def rows_of(given: Problem) -> Rows:
     trial, sample, channel = np.nonzero(there)
     return Rows(
         trial, channel, frame.arrays.subtask[trial, sample], frame.world.t[trial, sample],
-        frame.files, CHANNELS, tuple(f"{k}:{subtask_name(s)}" for k, s in enumerate(frame.steps)), BANDS,
+        frame.files, CHANNELS, tuple(f"{k}:{s.label}" for k, s in enumerate(frame.steps)), BANDS,
     )  # fmt: skip
 
 

@@ -94,9 +94,8 @@ class Diagnosis(Tabled):
         """Share of the gap by channel and subtask; the axes. Saved where a path is given."""
         from simgap.report.figures import draw_heat_map
 
-        steps = subtasks(self.problem.frame.task)
-        names = list(dict.fromkeys(f"{step.name} {step.object or ''}".strip() for step in steps))
-        return draw_heat_map(self.body, names, None if path is None else Path(path))
+        names = dict.fromkeys(step.label for step in subtasks(self.problem.frame.task))
+        return draw_heat_map(self.body, list(names), None if path is None else Path(path))
 
     def plot_causes(self, path: str | Path | None = None):
         """Whether each effect acts and what share of the gap it explains; the axes."""

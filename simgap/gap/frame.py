@@ -170,8 +170,3 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
         carry=carry,
         events=events,
     )
-
-
-def subtask_name(step: Subtask) -> str:
-    """A subtask as the interface names it, as `carry block1`."""
-    return step.name if step.object is None else f"{step.name} {step.object}"

@@ -16,7 +16,6 @@ from simgap.effects import fitted, name_of
 from simgap.effects.base import World, tips
 from simgap.gap.evaluation import raw_residual_at, world_without
 from simgap.gap.fit import Fitted
-from simgap.gap.frame import subtask_name
 from simgap.gap.problem import Problem
 from simgap.gap.trial_arrays import CHANNELS
 
@@ -36,7 +35,7 @@ def where(given: Problem, found: Sequence[Cell], causes: Fitted | None) -> list[
     known = {(c.trial, c.channel, c.part) for c in found}
     mean = shifts(given, causes)
     for r, s, c in np.argwhere(mean >= SHIFTED):
-        name = subtask_name(frame.steps[s])
+        name = frame.steps[s].label
         if (frame.files[r], CHANNELS[c], f"{s}:{name}") not in known:
             out.append({"trial": frame.files[r], "channel": CHANNELS[c], "subtask": name,
                          "band": [0.0, 1.0], "share": 0.0, "z": float(mean[r, s, c])})  # fmt: skip

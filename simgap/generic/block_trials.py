@@ -26,7 +26,7 @@ def block_ensembles(real: Sequence[Trial], sim: Sequence[Trial], task: BlockTask
             if not found.complete:
                 warnings.append(f"{trial.name}: does not fit its task and is left out")
                 continue
-            names = tuple(f"{s.subtask} {s.object or ''}".strip() for s in found.spans)
+            names = tuple(s.label for s in found.spans)
             edges = np.array([found.spans[0].start, *(s.end for s in found.spans)])
             channels = {c: np.asarray(getattr(signal, c)) for c in CHANNELS}
             cuts[kind].append(Cut(Trial(trial.file, np.asarray(signal.t), channels), edges))
