@@ -18,6 +18,7 @@ from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, u
 from estimation.rolling import without_roll
 from estimation.sampler import Draws
 from estimation.sliding import with_slides
+from estimation.summary import summary
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
@@ -29,8 +30,6 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
-
-INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
 
 
 @dataclass(frozen=True, repr=False)
@@ -207,12 +206,6 @@ def identify_aligned(
         {k: f for k, f in friction.items() if f.lower_bound is not None}, reasons, predictive,
         tuple(warnings), tuple(notes),
     )  # fmt: skip
-
-
-def summary(draws: np.ndarray, unit: str) -> dict:
-    """Mean, sd, median and intervals of posterior draws (num_draws,)."""
-    out = {"unit": unit, "mean": draws.mean(), "sd": draws.std(ddof=1), "median": np.median(draws)}
-    return out | {name: np.percentile(draws, q) for name, q in INTERVALS.items()}
 
 
 def source_subtasks(steps: tuple[Subtask, ...], task: BlockTask, obj: str, prop: str) -> list[str]:

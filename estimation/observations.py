@@ -32,6 +32,7 @@ from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.features import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
+FARTHEST_LAG = 11  # numerics: samples; autocorrelations beyond are noise
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
 MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
 LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior
@@ -148,16 +149,14 @@ class WeighedTrial:
     weights: Weights
 
 
-def aligned_weights(
-    aligned: AlignedTrials, rng: np.random.Generator, num_alignments: int = NUM_ALIGNMENTS
-) -> tuple[list[WeighedTrial], Noise]:
+def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[list[WeighedTrial], Noise]:
     """Weights of every grip's means for drawn alignments, and the noise of each channel."""
     steps, rig = aligned.subtasks, aligned.rig
     prepared, felt, touches = [], [], []  # felt: what the fingers press with is measured
     for trial in aligned.trials:
         thinned = thin(trial.signals, MAX_RATE)
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
-        drawn = draw_boundaries(trial, rng, num_alignments)
+        drawn = draw_boundaries(trial, rng, NUM_ALIGNMENTS)
         best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]
         present = held_as_described(trial.present, steps)
         masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
@@ -263,7 +262,7 @@ def _noise(pooled: dict[str, list], scales: dict[str, float]) -> Noise:
     return Noise(variance, count)
 
 
-def autocorrelation_time(series: list[np.ndarray], max_lag: int = 11) -> float:
+def autocorrelation_time(series: list[np.ndarray]) -> float:
     """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
 
     Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of
@@ -285,7 +284,7 @@ def autocorrelation_time(series: list[np.ndarray], max_lag: int = 11) -> float:
         return products / power * size / pairs + bias
 
     total, lags = -1.0, 1
-    for lag in range(0, max_lag, 2):
+    for lag in range(0, FARTHEST_LAG, 2):
         pair = rho(lag) + rho(lag + 1)
         # A pair counts only where it stands out of its own sampling noise.
         if lag > 0 and pair <= 2 / np.sqrt(size):

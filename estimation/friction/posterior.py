@@ -3,7 +3,7 @@
 Coulomb's law: |shear| <= mu x normal force in every held sample (the paper's Table 3 takes the
 largest ratio of the recorded ones). The bound here is the posterior of the largest true ratio
 (ratio_bound.py); a finger that slips (slip.py) is at the limit, so the bound is then mu itself.
-Where a block is slid, the net force tells the friction against its support (ground_friction.py).
+Where a block is slid, the net force tells the friction against its support (ground.py).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from estimation.friction.ground import GroundFriction, ground_friction
 from estimation.friction.ratio_bound import largest_ratio
 from estimation.friction.slip import SlipEvidence, Stretch, slip_evidence
 from estimation.observations import MIN_FREE, WeighedTrial
+from estimation.summary import summary
 from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask, subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -27,6 +28,7 @@ from hmmseg.robust import robust_sd
 # chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
 # ratio of two small forces says little: samples below this share of the grip's median are left out.
 FIRM = 0.5
+DRAWS = 2000  # numerics: of each coefficient
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class FrictionPosterior:
         """The entry `friction` of one block in the JSON of `identify`."""
         out: dict = {"unit": "1", "lower_bound": self.lower_bound}
         if self.mu_draws is not None:
-            out |= _summary(self.mu_draws)
+            out |= summary(self.mu_draws, "1")
         if self.slip is not None:
             out["slip"] = {
                 "seen": self.slip.seen,
@@ -58,7 +60,7 @@ class FrictionPosterior:
                 "log_bayes_factor": self.slip.log_bayes_factor,
             }
         if self.ground is not None:
-            out["ground"] = {"unit": "1", "support": self.ground.support, **_summary(self.ground.mu_draws)}
+            out["ground"] = summary(self.ground.mu_draws, "1") | {"support": self.ground.support}
         return out
 
 
@@ -83,7 +85,7 @@ class _Held:
 
 def friction_posteriors(
     aligned: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
-    rng: np.random.Generator, num_draws: int = 2000,
+    rng: np.random.Generator,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
     """Friction of every object of the task, all trials pooled, alignments marginalised.
 
@@ -95,16 +97,16 @@ def friction_posteriors(
     resting = {obj: _stretches(aligned, fingers, steps, obj, rig) for obj in task.objects}
     out = {}
     for obj in task.objects:
-        ground = ground_friction(aligned, task, steps, obj, rig, sd_force, rng, num_draws)
+        ground = ground_friction(aligned, task, steps, obj, rig, sd_force, rng, DRAWS)
         samples = held[obj]
         if samples.ratio.size == 0:
             reason = f"the recording never shows {obj} held firmly"
             out[obj] = FrictionPosterior(None, reason=reason, ground=ground)
             continue
-        draws = largest_ratio(samples.ratio, samples.sd, samples.held, rng, num_draws)
+        draws = largest_ratio(samples.ratio, samples.sd, samples.held, rng, DRAWS)
         others = [s for other in task.objects if other != obj for s in resting[other]]
         slip = slip_evidence(resting[obj], others, draws)
-        draws = draws * _gain_factor(rig, rng, num_draws)
+        draws = draws * _gain_factor(rig, rng)
         reason = None if slip.seen else f"no finger was seen to slip on {obj}: a bound is all it tells"
         out[obj] = FrictionPosterior(
             float(np.quantile(draws, 0.05)), draws, draws if slip.seen else None, slip, reason, ground
@@ -204,15 +206,8 @@ def _height_noise(signals: Signals, height: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(signals.sd_y), signals.sd_y, max(learned, 1e-7))
 
 
-def _gain_factor(rig: Rig, rng: np.random.Generator, num_draws: int) -> np.ndarray:
-    """Factors (num_draws,) by which uncertain force gains stretch every ratio."""
+def _gain_factor(rig: Rig, rng: np.random.Generator) -> np.ndarray:
+    """Factors (DRAWS,) by which uncertain force gains stretch every ratio."""
     gain = np.asarray(rig.systematic.force_gain)
     worst = max(np.hypot(gain[0], gain[1]), np.hypot(gain[2], gain[3]))
-    return np.exp(worst * rng.standard_normal(num_draws))
-
-
-def _summary(draws: np.ndarray) -> dict:
-    return {
-        "mean": float(draws.mean()), "sd": float(draws.std(ddof=1)), "median": float(np.median(draws)),
-        "interval_68": np.percentile(draws, (16.0, 84.0)), "interval_95": np.percentile(draws, (2.5, 97.5)),
-    }  # fmt: skip
+    return np.exp(worst * rng.standard_normal(DRAWS))

@@ -51,6 +51,7 @@ class Durations(Protocol):
         ...
 
 
+LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
 E = TypeVar("E", bound=Emission)
 D = TypeVar("D", bound=Durations)
 
@@ -89,7 +90,6 @@ def em(
     durations: D,
     num_trials: int,
     max_iterations: int = 40,
-    min_iterations: int = 6,
     tolerance: float = 1e-3,
 ) -> Learned[E, D]:
     """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
@@ -100,7 +100,7 @@ def em(
     before = -np.inf
     for iteration in range(1, max_iterations + 1):
         fit = Learned(emission, durations, expectation(emission, durations, num_trials), iteration, False)
-        if iteration > min_iterations and abs(fit.log_evidence - before) < tolerance:
+        if iteration > LEAST_ITERATIONS and abs(fit.log_evidence - before) < tolerance:
             return Learned(emission, durations, fit.alignments, iteration, True)
         if iteration < max_iterations:
             before, responsibilities = fit.log_evidence, fit.responsibilities

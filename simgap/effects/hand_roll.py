@@ -9,6 +9,7 @@ import numpy as np
 from hmmseg.contact.equations import rolled_offset
 from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance
 from simgap.gap.trial_arrays import CHANNELS
+from simgap.phases import Phase
 
 SLOW = 2.0  # prior: Hz; a hand with a block in it turns no faster (an arm's own modes lie above)
 VARIED = 0.5  # prior: log sd of a carry's roll about that of all: a second of it is one swing or two
@@ -28,7 +29,7 @@ def _scatter(given, residual: np.ndarray):
 
     rows, arrays, there = rows_of(given), given.frame.arrays, given.whitening.weight > 0
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
-    lever = rolled_offset(width * arrays.phase[..., 2], 1.0)[..., None] * given.whitening.weight
+    lever = rolled_offset(width * arrays.phase[..., Phase.CARRY], 1.0)[..., None] * given.whitening.weight
     lever[..., [c for c, name in enumerate(CHANNELS) if name != "offset"]] = 0.0
     lever = lever[there]
     unit, square = np.zeros(lever.size), np.zeros(lever.size)

@@ -17,7 +17,8 @@ from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
 from simgap.gap.scatter import Scatter
 from simgap.gap.tolerance import tolerated
-from simgap.gap.trial_arrays import CHANNELS, PHASES
+from simgap.gap.trial_arrays import CHANNELS
+from simgap.phases import Phase
 
 
 def rows_of(given: Problem) -> Rows:
@@ -126,7 +127,7 @@ def _turning(given: Problem, angle: float) -> np.ndarray:
     rows, weight, arrays = rows_of(given), given.whitening.weight, given.frame.arrays
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
     size, there = weight * (angle * width)[..., None], weight > 0
-    stands = arrays.phase[..., [PHASES.index("pickup"), PHASES.index("place")]].sum(-1) > 0
+    stands = arrays.phase[..., [Phase.PICKUP, Phase.PLACE]].sum(-1) > 0
     stands = np.repeat(stands[..., None], len(CHANNELS), -1)[there]
     mean = np.zeros(stands.size, bool)
     mean[np.unique(rows.cell, return_index=True)[1]] = True

@@ -11,7 +11,7 @@ from hmmseg.io.rig import Rig
 from simgap.bounded import least
 from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
 from simgap.gap.evaluation import evaluated
-from simgap.gap.fit import STEPS, Fitted, Start, fit
+from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.problem import Problem, columns_of, limits, slots
 
 SCREEN = 2  # numerics: steps before the best start of a form is chosen
@@ -47,7 +47,7 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
     return out
 
 
-def best_fit(given: Problem, key: str, healthy: Fitted, steps: int = STEPS) -> Fitted:
+def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     """The best fit of one form of an effect, properties refitted; not refined where that promises nothing.
 
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
@@ -61,7 +61,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted, steps: int = STEPS) -> F
     if len(leading) > 1:
         screened = sorted((fit(given, s, SCREEN) for s in leading), key=lambda f: f.cost)
         leading = [Start((key,), screened[0].u)]
-    return fit(given, leading[0], steps)
+    return fit(given, leading[0])
 
 
 def _ranked(given: Problem, start: Start) -> tuple[float, Start]:

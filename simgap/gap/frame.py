@@ -14,6 +14,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.align import AlignedTrials
 from simgap.effects.base import World
 from simgap.gap.trial_arrays import MAX_RATE, boundary_quantiles, trial_arrays
+from simgap.phases import Phase
 
 TRIALS = 4  # numerics: arrays are padded to multiples of it, so that few programs are compiled
 
@@ -137,7 +138,7 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
         base = np.array([*rig.finger(1).base, *rig.finger(2).base])
         length = np.array([*rig.finger(1).links, *rig.finger(2).links])
     phase = stack["phase"]
-    carry = phase[..., 2]
+    carry = phase[..., Phase.CARRY]
     return World(
         t=stack["t"],
         joints=stack["joints"],
@@ -165,8 +166,8 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
         doubt_joints=np.zeros_like(stack["joints"]),
         slip=np.zeros_like(carry),
         modes=np.zeros(6),
-        free=phase[..., 0],
-        ground=phase[..., 1] + phase[..., 3] + phase[..., 4],
+        free=phase[..., Phase.FREE],
+        ground=phase[..., Phase.PICKUP] + phase[..., Phase.PLACE] + phase[..., Phase.SLIDE],
         carry=carry,
         events=events,
     )

@@ -17,8 +17,9 @@ import numpy as np
 from simgap.attribution.background import STATED
 from simgap.attribution.problem import Rows, cosines
 from simgap.gap.problem import Problem
-from simgap.gap.trial_arrays import CHANNELS, PHASES
+from simgap.gap.trial_arrays import CHANNELS
 from simgap.gap.unresolved import MEDIAN
+from simgap.phases import Phase
 
 KINDS = (("x", "y", "distance", "offset"), ("vx", "vy"), ("fx", "fy", "grip", "shear"))
 LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; beyond that it is an effect
@@ -41,7 +42,7 @@ def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
     doubt = np.square(arrays.sd[there] / arrays.plain[there])
     sure = (np.bincount(rows.cell, doubt) < CLEAN * np.bincount(rows.cell))[rows.cell]
     phase = arrays.phase.argmax(-1)[..., None].repeat(len(CHANNELS), -1)[there]
-    quiet = (None, (PHASES.index("pickup"), PHASES.index("place")), (PHASES.index("free"),))
+    quiet = (None, (Phase.PICKUP, Phase.PLACE), (Phase.FREE,))
     variance = shape.copy()
     for names, at in zip(KINDS, quiet, strict=True):
         mine = np.isin(rows.channel, [CHANNELS.index(n) for n in names])

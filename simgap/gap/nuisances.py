@@ -17,6 +17,7 @@ from simgap.gap.evaluation import derivatives
 from simgap.gap.marginal import Nuisances
 from simgap.gap.problem import Problem, free_of, neutral, slots
 from simgap.gap.trial_arrays import CHANNELS
+from simgap.phases import Phase
 
 PAD = 5e-3  # prior: m; half a pad's length: how hard it turns follows from that and its stiffness
 STANCES = (0.6, 1.0)  # prior: shares of a block's width between its feet; what lies between is a mixture
@@ -123,9 +124,9 @@ def _settling(given: Problem) -> list[np.ndarray]:
         for m in range(arrays.onehot.shape[2]):
             mine = np.zeros_like(width)
             mine[t] = arrays.onehot[t, :, m]
-            out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., 2]}))
+            out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
             for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)):
-                out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., 3]}))
+                out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., Phase.PLACE]}))
     return [z for z in out if z.any()]
 
 

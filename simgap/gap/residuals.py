@@ -28,6 +28,7 @@ from simgap.gap.frame import Arrays
 from simgap.gap.grips import firmness, in_grip, less_mean, recorded
 from simgap.gap.memory import driven, relaxed, sunk
 from simgap.gap.trial_arrays import CHANNELS
+from simgap.phases import Phase
 
 TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # chosen: sds of the distance by which fingers must be nearer than the block is wide to touch it
@@ -66,7 +67,7 @@ def residuals(
     firm = firmness(0.5 * (force[..., 0] - force[..., 2]), held, jnp.asarray(arrays.onehot))
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
-    place = jnp.asarray(arrays.phase[..., 3])
+    place = jnp.asarray(arrays.phase[..., Phase.PLACE])
     offset = block_offset(y2 - y1, fy1, fy2, pads_give)
     x = block_x((x1 + x2) / 2, fx1, fx2, pads_give)
     load = support_load(weight, force[..., 1] + force[..., 3])
@@ -76,7 +77,7 @@ def residuals(
     lesser = jnp.minimum(force[..., 0], -force[..., 2])
     both = firmness(lesser, held, jnp.asarray(arrays.onehot), CLOSED)
     closed = firm * both
-    still = closed * (arrays.phase[..., 1] + place)
+    still = closed * (arrays.phase[..., Phase.PICKUP] + place)
     offset, loose_offset = in_grip(offset, closed * held, "offset", arrays, noise, world)
     x = less_mean(x, arrays, still * recorded(arrays, "x"), place)
     y, loose_y = in_grip(y, closed * world.ground, "y", arrays, noise, world)

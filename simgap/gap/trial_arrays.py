@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask
+from hmmseg.contact.decompose import FREE, Subtask
 from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.kinematics import forward, joint_velocity, tip_velocity
 from hmmseg.hand.signals import Signals, task_space
@@ -26,10 +26,11 @@ from simgap.gap.sensor_noise import (
 )
 from simgap.gap.unresolved import kinks, of_a_kink
 from simgap.gap.wrist_gap import absent
+from simgap.phases import Phase, phase_of
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
+OFFSET, NET, FORCES = 3, slice(6, 8), slice(6, 10)  # physics: places among CHANNELS
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
-PHASES = ("free", "pickup", "carry", "place", "slide")
 LOST = 0.05  # chosen: share of the grip on either side below which all forces of a sample are nothing
 MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
 # chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
@@ -107,7 +108,8 @@ def trial_arrays(
     signals = task_space(trial, rig)
     t, step = trial.t, np.median(np.diff(trial.t))
     subtask = np.searchsorted(boundaries, t, side="right")
-    phase = np.array([_phase(s) for s in steps])[subtask]
+    phase = np.array([phase_of(s) for s in steps])[subtask]
+    free, carry = phase == Phase.FREE, phase == Phase.CARRY
     edge = np.abs(t[:, None] - boundaries).min(axis=1) < step
     force = np.stack([signals.__dict__[c] for c in FORCE_CHANNELS], 1)
     names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
@@ -121,17 +123,17 @@ def trial_arrays(
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
     sd = np.hypot(plain, motion_doubt(signals, sample, step, group, rig.fingertip))
-    sd[:, 6:] = np.hypot(sd[:, 6:], between_samples(t, force, phase == 0, edge & (phase == 2), boundaries))
-    shaken = _shaken(signals, sample, force, phase == 2, subtask, step, group) / rig.gravity
-    sd[:, 6:8] = np.hypot(sd[:, 6:8], shaken[:, None])
-    sd[:, 3] = np.hypot(sd[:, 3], shaken / rig.fingertip.shear_stiffness)
+    sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
+    shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity
+    sd[:, NET] = np.hypot(sd[:, NET], shaken[:, None])
+    sd[:, OFFSET] = np.hypot(sd[:, OFFSET], shaken / rig.fingertip.shear_stiffness)
     if trial.inertia is not None:
-        sd[:, 6:8] = np.hypot(sd[:, 6:8], trial.inertia)
+        sd[:, NET] = np.hypot(sd[:, NET], trial.inertia)
     there[:, np.isin(CHANNELS, absent(trial))] = 0.0
     there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
-    lone = _one_finger(t, force, subtask, phase == 0, boundaries, sample["force"])
-    there[lone, CHANNELS.index("fx") :] = 0.0
-    carried = np.array([_phase(s) == 2 for s in steps])
+    lone = _one_finger(t, force, subtask, free, boundaries, sample["force"])
+    there[lone, FORCES] = 0.0
+    carried = np.array([phase_of(s) == Phase.CARRY for s in steps])
     lifts = carried[1:] != carried[:-1]  # a block leaves its support or meets one
     either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
     there[np.ix_(either, np.isin(CHANNELS, BORNE))] = 0.0
@@ -151,7 +153,7 @@ def trial_arrays(
         "kind": (2 * phase + edge).astype(float),
         "subtask": subtask.astype(float),
         "move": _moves(t, boundaries, steps, subtask).astype(float),
-        "phase": np.eye(len(PHASES))[phase],
+        "phase": np.eye(len(Phase))[phase],
     }
 
 
@@ -201,14 +203,6 @@ def _one_finger(
     return out
 
 
-def _phase(step: Subtask) -> int:
-    if step.state == FREE:
-        return 0
-    if step.state == ABOVE_GROUND:
-        return 2
-    return PHASES.index(step.name)
-
-
 def _moves(
     t: np.ndarray, boundaries: np.ndarray, steps: tuple[Subtask, ...], subtask: np.ndarray
 ) -> np.ndarray:
@@ -233,8 +227,8 @@ def _there(
     t: np.ndarray, phase: np.ndarray, force: np.ndarray, place: np.ndarray, speed: np.ndarray
 ) -> np.ndarray:
     """Where each channel's equation is defined and every signal in it was recorded (N, C)."""
-    free, carry, held = phase == 0, phase == 2, phase > 0
-    still = held & ~carry & (phase != 4)
+    free, carry = phase == Phase.FREE, phase == Phase.CARRY
+    held, still = ~free, (phase == Phase.PICKUP) | (phase == Phase.PLACE)
     step = np.diff(t)
     even = np.zeros(t.size, bool)
     even[1:-1] = np.abs(step[1:] / step[:-1] - 1) < 0.2
@@ -245,7 +239,7 @@ def _there(
     inertial = force & near
     columns = {
         "x": still & force & place,
-        "y": (still | (phase == 4)) & force & place,
+        "y": (still | (phase == Phase.SLIDE)) & force & place,
         "distance": held & force & place,
         "offset": held & force & place,
         "vx": both,

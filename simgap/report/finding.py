@@ -29,6 +29,7 @@ WHEN = {
     "place": "while you press {0} down",
     "release": "after you let go of {0}",
 }
+SAID = 3  # look: places of a gap that a sentence has
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
 TINY = 1e-16  # numerics: what double precision tells from zero beside one
@@ -145,9 +146,9 @@ def remains(body: Body) -> list[str]:
     ]
 
 
-def moving(body: Body, most: int = 3, of: str = "the gap") -> list[str]:
+def moving(body: Body, of: str = "the gap") -> list[str]:
     """The largest parts of `where` as sentences; shares are those `of` the gap, or of what remains."""
-    return [_said(place, cells, of) for place, cells in list(by_place(body).items())[:most]]
+    return [_said(place, cells, of) for place, cells in list(by_place(body).items())[:SAID]]
 
 
 def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]], of: str) -> str:
