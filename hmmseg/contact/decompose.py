@@ -1,6 +1,6 @@
 """Task decomposition: from objects and moves to subtasks and the properties each can reveal.
 
-The task is cut at each anticipated change of the active constraint set (constraints.py); the
+The task is cut at each anticipated change of the active constraint set (states.py); the
 quasistatic balance of each contact state then says what that subtask, alone or with another of
 the same move, determines (identifiability.py). What no pair determines is sought in all moves
 together, as the heights in a tower of three are.
