@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmmseg.both_err import amid
 from hmmseg.contact.equations import Pads, block_width, block_y, pads_of
+from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import TAIL
@@ -125,7 +125,7 @@ def _between(
     count = float(trust.sum()) * max(1 - fitted / max(np.count_nonzero(trust), 1), 0.0)
     both = float(trust @ (give * place))
     square_give, square_place = float(trust @ give**2), float(trust @ place**2)
-    middle, apart = amid(square_give, both, square_place, count, sds)
+    middle, apart = slope_between(square_give, both, square_place, count, sds)
     if middle <= both / square_give or square_place <= middle * both:
         return give, apart
     # Weighed by give + k place the slope is (both + k square_place) / (square_give + k both).

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimation.actual import Actual
 from estimation.design import Design
-from estimation.either import designs, sample_either
+from estimation.doubtful_pads import designs, sample_either
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
 from estimation.observations import Noise, WeighedTrial, aligned_weights
 from estimation.predictive import PredictiveCheck, check

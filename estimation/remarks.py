@@ -8,7 +8,7 @@ import numpy as np
 
 from estimation.compliance import unit_pads
 from estimation.design import Design
-from estimation.either import CERTAIN
+from estimation.doubtful_pads import CERTAIN
 from estimation.observations import CHANNELS
 from hmmseg.io.plausibility import Finding, all_changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from estimation.either import designs, sample_either
+from estimation.doubtful_pads import designs, sample_either
 from estimation.mode import find_mode
 from estimation.observations import aligned_weights
 from estimation.posterior import posterior

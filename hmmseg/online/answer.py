@@ -35,7 +35,7 @@ class Answer:
     (object, property, mean, sd). Read it before the next row.
     """
 
-    note: str | None  # what was odd about the row, in words
+    note: str | None  # what was irregular about the row, in words
 
     def __init__(self, watcher: Filter, t: float, now: np.ndarray, smoothed: np.ndarray,
                  means: np.ndarray, best: np.ndarray, final: bool) -> None:  # fmt: skip

@@ -83,7 +83,7 @@ class Watcher:
         """One row: time [s] and the channels in SI units, NaN where missing.
 
         Missing velocities of a Cartesian hand, NaN throughout, are derived from positions. The answer is of
-        the newest row; its `note` says what was odd about this one.
+        the newest row; its `note` says what was irregular about this one.
         """
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]
@@ -110,7 +110,7 @@ class Watcher:
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
 
     def _followed(self, t: float, row: np.ndarray) -> str | None:
-        """Take a row, in its place; what was odd about it."""
+        """Take a row, in its place; what was irregular about it."""
         f, note = self.filter, None
         rows = f.rows
         if rows and t <= rows[-1][0]:
@@ -126,7 +126,7 @@ class Watcher:
         return note
 
     def _felt(self, wrist: Wrist, t: float, row: np.ndarray) -> str | None:
-        """Take a row of a wrist's sensor; what was odd about it."""
+        """Take a row of a wrist's sensor; what was irregular about it."""
         checked(self.filter.rig, t, row)
         newest = wrist.newest
         stray = wrist.place(t, row)

@@ -81,7 +81,7 @@ class Wrist:
         return self._window or WINDOW
 
     def place(self, t: float, row: np.ndarray) -> str | None:
-        """Put a row in its place; what is odd about that, in a word."""
+        """Put a row in its place; what is irregular about that, in a word."""
         if self._rows and t <= self._rows[-1][0]:
             same = next((old for at, old in reversed(self._rows) if at == t), None)
             if same is not None:

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.both_err import amid
 from hmmseg.contact.decompose import FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, pads_of
+from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import CONTRADICTS, TAIL
@@ -285,14 +285,14 @@ def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tu
     """Compliance [m/N] of one stretch, its information, and what it is off by as others are.
 
     Loads that ring, by `ringing` [N] and maybe more, while nothing moves flatten the line of places over
-    loads, to none at the worst (`amid`).
+    loads, to none at the worst (`slope_between`).
     """
     slope, weight, _ = fitted(load, place, sd)
     if weight == 0:
         return float(slope), 0.0, 0.0
     x, y = load - load.mean(), place.mean() - place
     square, free = float(x @ x), load.size - 2.0
-    middle, apart = amid(square, float(x @ y), float(y @ y), free, (ringing, sd))
+    middle, apart = slope_between(square, float(x @ y), float(y @ y), free, (ringing, sd))
     if not np.isfinite(apart):
         return middle, 0.0, 0.0
     value = middle if apart else float(slope)

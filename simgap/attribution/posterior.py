@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit, gammaln
 
 from simgap.attribution.background import Background
-from simgap.attribution.carried import of_noise, products
+from simgap.attribution.noise_products import of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Spectrum, spectrum
 from simgap.bounded import least
 

@@ -47,7 +47,7 @@ def _phrase(means, rig):
 
 def _patched(document, found):
     """The pads' own numbers, each with what it was and what rig.toml says of it."""
-    from simgap.patch.fields import number, table, told
+    from simgap.patch.fields import interval_comment, number, table
 
     pads = table(document, "fingertip")
     names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]
@@ -56,7 +56,9 @@ def _patched(document, found):
         if name in pads:
             said = pads[name].trivia.comment.lstrip("# ")
         pads[name] = number(found[name]["mean"])
-        pads[name].comment(f"was {float(before):g}; {told(found[name])}" + (f"; {said}" if said else ""))
+        pads[name].comment(
+            f"was {float(before):g}; {interval_comment(found[name])}" + (f"; {said}" if said else "")
+        )
     return {name: f"fingertip.{name}" for name in names}
 
 

@@ -17,7 +17,7 @@ def _longer(values, xp):
 
 def _patched(document, found):
     """Links longer by `scale`, all of them, or each by its own: link11 is finger 1's first."""
-    from simgap.patch.fields import number, told
+    from simgap.patch.fields import interval_comment, number
 
     if "fingers" not in document:
         return None
@@ -27,7 +27,7 @@ def _patched(document, found):
         own = [found.get(f"link{name}{k}") for k in (1, 2)]
         factors = [1 + common + (p["mean"] if p else 0.0) for p in own]
         finger["links"] = [number(v * f) for v, f in zip(before, factors, strict=True)]
-        said = [told(p) for p in (found.get("scale"), *own) if p]
+        said = [interval_comment(p) for p in (found.get("scale"), *own) if p]
         finger["links"].comment(f"was {before}; share longer: {'; '.join(said)}")
     return {k: f"fingers.links.{k}" for k in found}
 

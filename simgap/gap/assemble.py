@@ -10,11 +10,11 @@ import numpy as np
 from hmmseg.io.rig import Tolerance
 from simgap.attribution.problem import BANDS, Candidate, Gap, Rows
 from simgap.effects import catalogue, decoys, fitted, name_of
-from simgap.gap.carried import again, carried
 from simgap.gap.evaluation import residual_at
 from simgap.gap.fit import Fitted
 from simgap.gap.noise_model import with_noise
 from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
+from simgap.gap.redrawn_noise import carried, on_other
 from simgap.gap.scatter import Scatter
 from simgap.gap.tolerance import tolerated
 from simgap.gap.trial_arrays import CHANNELS
@@ -60,7 +60,7 @@ def gap_of(
     noise = carried(
         gap.raw_columns,
         redrawn,
-        lambda other: at(other, again(other, healthy), [again(other, f) for f in fits]).raw_columns,
+        lambda other: at(other, on_other(other, healthy), [on_other(other, f) for f in fits]).raw_columns,
     )
     return replace(gap, carried=noise)
 
@@ -89,7 +89,7 @@ def together(
     kept = gap.carried.shape[2]
 
     def on(other: Problem) -> np.ndarray:
-        shaken = _joint(other, again(other, healthy), again(other, joint))
+        shaken = _joint(other, on_other(other, healthy), on_other(other, joint))
         return replace(more, candidates=(*gap.candidates, *shaken)).raw_columns[:, kept:]
 
     noise = carried(more.raw_columns[:, kept:], redrawn, on)

@@ -115,7 +115,7 @@ def problem(
     return _bare(frame, centre, sd, measured)
 
 
-def on(frame: Frame, given: Problem) -> Problem:
+def rebased(frame: Frame, given: Problem) -> Problem:
     """The problem of the same blocks in another frame, without nuisances."""
     return _bare(frame, given.centre, given.sd, given.measured)
 

@@ -3,7 +3,8 @@
 Every sample gives as many equations between its four positions and four forces as unknowns leave
 (docs/gap.md): in free motion all forces are zero; held, the fingers' distance and offset follow the
 pads' forces; on the ground the block rests; in the air its net force is mass times
-acceleration and weight. Velocities are checked against positions. None of them multiplies position noise by a stiffness.
+acceleration and weight. Velocities are checked against
+positions. None of them multiplies position noise by a stiffness.
 """
 
 from __future__ import annotations

@@ -16,12 +16,12 @@ from simgap.attribution.problem import Gap
 from simgap.effects import decoys, name_of
 from simgap.gap.assemble import gap_of
 from simgap.gap.candidates import best_fit, candidate_names, shifting
-from simgap.gap.carried import noise_gained, redrawn
 from simgap.gap.fit import Fitted, Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import Problem, neutral, on, problem
+from simgap.gap.problem import Problem, neutral, problem, rebased
 from simgap.gap.realign import moved, realigned
+from simgap.gap.redrawn_noise import noise_gained, redrawn
 from simgap.gap.scatter import Scatter, scatters
 from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
 
@@ -132,7 +132,7 @@ def _anew(
     again = realigned(aligned, given, best)
     if not SHIFT < moved(aligned, again) < np.inf:
         return None
-    other = with_nuisances(on(build(again), given))
+    other = with_nuisances(rebased(build(again), given))
     if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
         return None
     plain = fit(other, Start((), healthy.u))

@@ -18,7 +18,7 @@ from simgap.effects import catalogue, fitted, forms_of, free_parameters
 
 MADE_UP = ("offset", "shear", "vx", "vy")
 GRIP = ("distance", "grip")  # without a grip force what the pads give is read off the opening itself
-TOLD = (
+NOT_COMPARED = (
     "a wrist sensor feels the sum of both fingers: net forces and positions are compared, {absent} are not, "
     "and effects on one finger or inside the grip are not thought of"
 )
@@ -39,7 +39,7 @@ def absent(trial: Trial) -> tuple[str, ...]:
 def not_compared(trials: Sequence[Trial]) -> str:
     """One line of what a diagnosis leaves out."""
     missing = dict.fromkeys(name for trial in trials for name in absent(trial))
-    return TOLD.format(absent=", ".join(missing))
+    return NOT_COMPARED.format(absent=", ".join(missing))
 
 
 def shown(names: Sequence[str]) -> list[str]:

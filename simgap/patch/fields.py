@@ -22,7 +22,7 @@ def number(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def told(p: Mapping[str, Any]) -> str:
+def interval_comment(p: Mapping[str, Any]) -> str:
     """A parameter's interval, for a comment."""
     low, high = p["interval_90"]
     unit = "" if p["unit"] == "1" else f" {p['unit']}"

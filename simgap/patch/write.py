@@ -10,7 +10,7 @@ import tomlkit
 
 from hmmseg.errors import InputError
 from simgap.effects import catalogue
-from simgap.patch.fields import number, table, told
+from simgap.patch.fields import interval_comment, number, table
 
 Body = Mapping[str, Any]
 FORMAT = "hmmseg.ranges/1"
@@ -61,7 +61,7 @@ def _correct(document: tomlkit.TOMLDocument, effect: str, found: Mapping[str, An
     for parameter, p in found.items():
         if p["mean"] is not None:
             mine.add(parameter, number(p["mean"]))
-            mine[parameter].comment(told(p))
+            mine[parameter].comment(interval_comment(p))
     effects[effect] = mine
     return {parameter: f"effects.{effect}.{parameter}" for parameter in found}
 

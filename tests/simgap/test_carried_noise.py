@@ -12,14 +12,14 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import Trial, read_trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
-from simgap.attribution.carried import of_noise, products
+from simgap.attribution.noise_products import of_noise, products
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, spectrum
-from simgap.gap.carried import SIZES, again, carried, noise_gained, redrawn
 from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import neutral, problem
+from simgap.gap.redrawn_noise import SIZES, carried, on_other, noise_gained, redrawn
 from simgap.gap.trial_arrays import without_dropouts
 
 GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
@@ -114,7 +114,9 @@ def given(shared):
 def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
     healthy = fit(given, Start((), neutral(given)))
     noise = carried(
-        healthy.residual[:, None], redrawn(given), lambda other: again(other, healthy).residual[:, None]
+        healthy.residual[:, None],
+        redrawn(given),
+        lambda other: on_other(other, healthy).residual[:, None],
     )
     there, arrays = given.whitening.weight > 0, given.frame.arrays
     channel, doubted = np.nonzero(there)[2], (arrays.sd / arrays.plain)[there]

@@ -21,7 +21,7 @@ from numba import types
 from numba.core.caching import FunctionCache
 
 _config: Any = numba.core.config
-_TRIED = "0.68."  # numerics: of numba
+_KNOWN = "0.68."  # numerics: of numba
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
@@ -63,7 +63,7 @@ def compiled(function: Callable) -> Any:
     _config.CACHE_DIR = cache_folder(Path(inspect.getfile(function)).parent)
     try:
         made: Any = numba.njit(function, cache=True, **_OPTIONS)
-        if numba.__version__.startswith(_TRIED):
+        if numba.__version__.startswith(_KNOWN):
             made._cache = _Cache(made.py_func)
             made.compile = _undisturbed(made.compile)
     except (RuntimeError, OSError):  # no folder that could be written to
@@ -91,7 +91,7 @@ def part(function: Callable) -> Any:
 
 def _with_plain_arguments(kernel: Any) -> Any:
     """The kernel with one version for whatever constants others call it with, not one for each."""
-    if numba.__version__.startswith(_TRIED):
+    if numba.__version__.startswith(_KNOWN):
         typed = kernel.get_call_template
 
         def plain(args: tuple, kws: dict) -> Any:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def amid(
+def slope_between(
     square_x: float, both: float, square_y: float, count: float, sds: tuple[float, float]
 ) -> tuple[float, float]:
     """The slope amid those that errors allow, and how far they lie from it (root mean square).

@@ -1,6 +1,6 @@
 """What sensors' noise makes of fitted candidates: the same ones on recordings with a little more noise.
 
-`simgap.attribution.carried` takes it off the products of their columns.
+`simgap.attribution.noise_products` takes it off the products of their columns.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
     return np.stack(out)
 
 
-def again(other: Problem, f: Fitted) -> Fitted:
+def on_other(other: Problem, f: Fitted) -> Fitted:
     """A fit's residual and derivatives at the same coordinates on another recording."""
     now = evaluated(other, f.effects, f.u, f.columns, [])
     return replace(f, residual=now.residual, push=now.push)
@@ -70,7 +70,9 @@ def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float
     """What a fit gains [nats] over the one without effects by leaving less of the sensors' noise."""
     columns = np.stack([healthy.residual, f.residual], 1)
     noise = carried(
-        columns, others, lambda other: np.stack([again(other, healthy).residual, again(other, f).residual], 1)
+        columns,
+        others,
+        lambda other: np.stack([on_other(other, healthy).residual, on_other(other, f).residual], 1),
     )
     without, left = np.square(noise.astype(float)).sum(1).mean(0)
     return 0.5 * float(without - left)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.either import mixed
+from estimation.doubtful_pads import mixed
 from estimation.nuisance import PadDoubt
 from estimation.sampler import Draws
 
