@@ -24,10 +24,17 @@ def white_sd(values: np.ndarray, order: int = 2) -> float:
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    """The value at which half of the weight is reached."""
-    order = np.argsort(values)
-    cumulative = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+    """The value, of those that are there, at which half of the weight is reached."""
+    keep = np.isfinite(values) & (weights > 0)
+    order = np.argsort(values[keep])
+    cumulative = np.cumsum(weights[keep][order])
+    return float(values[keep][order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+def median_of_known(values: np.ndarray, otherwise: float = np.nan) -> float:
+    """Median of the values that are there."""
+    there = values[np.isfinite(values)]
+    return float(np.median(there)) if there.size else otherwise
 
 
 def bridged(values: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:

@@ -11,6 +11,7 @@ from hmmseg.contact.equations import Pads, block_y, hanging
 from hmmseg.hand.rates import one_sided
 from hmmseg.hand.signals import Signals, central_differences
 from hmmseg.levels import SURE
+from hmmseg.robust import median_of_known
 from hmmseg.segmentation.changes import Change, Prior, cut
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.features import WINDOW, noise_sd
@@ -82,9 +83,9 @@ class Contacts:
             inward, rate, sd_inward = inward + moved, rate + moving, np.sqrt(2.0) * sd_inward
         else:
             inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
-        face = _median(inward[held] - self.compression[i, held])
+        face = median_of_known(inward[held] - self.compression[i, held])
         # A pad of another stiffness would put the face elsewhere.
-        pressed = np.nan_to_num(_median(self.compression[i, held]))
+        pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
         sd_inward = float(np.hypot(sd_inward, self.sensing.normal.doubt * pressed))
         sd = self.sd["compression"]
         return self._timely(Penetration(
@@ -97,7 +98,7 @@ class Contacts:
         """Compression [m] at which finger i slides off a block that it has `held`: friction bears no more."""
         if self.sensing.friction <= 0:
             return 0.0
-        needed = np.abs(_median(self.tangential[i, held])) / self.sensing.friction
+        needed = np.abs(median_of_known(self.tangential[i, held])) / self.sensing.friction
         return float(np.nan_to_num(_compression(np.array([needed]), self.sensing)[0]))
 
     def _pushed(self, i: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +108,7 @@ class Contacts:
         position less its pad's compression is where the block is.
         """
         pressed = self.compression[i]
-        face = _median(self.inward[i, held] - pressed[held])
+        face = median_of_known(self.inward[i, held] - pressed[held])
         moved = self.inward[i] - pressed - face
         doubt = np.hypot(self.sd["inward"], self.sensing.normal.form * pressed)
         pushes = (pressed > SURE * self.sd["compression"]) & (np.abs(moved) > PUSHED * doubt)
@@ -117,7 +118,7 @@ class Contacts:
     def _load(self, before: Subtask, held: np.ndarray, making: bool) -> Penetration:
         """The fingers below the height at which the pads' shear just carries the weight."""
         y = self.signals.y
-        level = _median(y[held] - self.deflection[held])
+        level = median_of_known(y[held] - self.deflection[held])
         carrying = hanging(self.weight[str(before.object)], shown(self.sensing.pads))
         sd_y = float(np.hypot(self.sd["y"], self.sensing.shear.doubt * carrying))
         return self._timely(Penetration(
@@ -141,12 +142,6 @@ class Contacts:
         meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(self.sensing.delay))
         sure = (c.pressed > SURE * c.sd_apart) & ~(c.free_place < -SURE * c.sd_place - meanwhile)
         return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
-
-
-def _median(values: np.ndarray) -> float:
-    """Median of the values that are there, NaN of none."""
-    there = values[np.isfinite(values)]
-    return float(np.median(there)) if there.size else np.nan
 
 
 def _compression(force: np.ndarray, sensing: Sensing) -> np.ndarray:

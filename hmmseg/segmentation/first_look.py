@@ -8,6 +8,7 @@ import numpy as np
 
 from hmmseg.contact.equations import block_width
 from hmmseg.levels import SURE
+from hmmseg.robust import NORMAL, median_of_known
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.features import noise_sd
 from hmmseg.segmentation.fit import otsu
@@ -43,7 +44,7 @@ def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
     apart in terms of noise; where the lower one carries force as well, all is gripped.
     """
     found = np.array([noise_sd(f.force[:, c]) for c in range(4)])
-    noise = max(median(found, 0.0), 1e-3 * f.span["force"])
+    noise = max(median_of_known(found, 0.0), 1e-3 * f.span["force"])
     grip = f.grip
     there = np.isfinite(grip)
     every = np.ones(grip.size, bool)
@@ -53,21 +54,15 @@ def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
     low, high = grip[there & (grip <= split)], grip[there & (grip > split)]
     apart = high.size > 0 and np.median(high) - np.median(low) > SURE * noise
     # Where one group alone is there, opposed forces far above the noise are a grip, others a bias.
-    opposed = abs(median(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
+    opposed = abs(median_of_known(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
     if np.median(low) > (0.3 * np.median(high) if apart else PRESSED * noise) and opposed:
         return np.zeros(4), noise, every
     threshold = np.median(low) + 0.25 * (np.median(high) - np.median(low)) if apart else np.inf
     held = filled(grip) > threshold
     free = f.force[~held]
-    bias = np.array([median(free[:, c], 0.0) for c in range(4)])
-    spread = np.array([1.4826 * median(np.abs(free[:, c] - bias[c]), np.nan) for c in range(4)])
-    return bias, max(median(spread, 0.0), noise), held
-
-
-def median(values: np.ndarray, otherwise: float) -> float:
-    """Median of what is there."""
-    there = values[np.isfinite(values)]
-    return float(np.median(there)) if there.size else otherwise
+    bias = np.array([median_of_known(free[:, c], 0.0) for c in range(4)])
+    spread = np.array([NORMAL * median_of_known(np.abs(free[:, c] - bias[c]), np.nan) for c in range(4)])
+    return bias, max(median_of_known(spread, 0.0), noise), held
 
 
 def filled(values: np.ndarray) -> np.ndarray:
@@ -89,7 +84,7 @@ def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = 
     found: list[Block] = []
     for start, stop in runs(held):
         span = slice(start, stop)
-        width = median(widths[span], np.nan)
+        width = median_of_known(widths[span], np.nan)
         if stop - start < 2 or not np.isfinite(width):
             continue
         lifted = (fy / f.carrying)[span][_lifted(f, span, guessing)]

@@ -16,6 +16,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.hmm.alignment import AlignmentPosterior, Bands
 from hmmseg.hmm.em import em
 from hmmseg.levels import TAIL
+from hmmseg.robust import NORMAL, weighted_median
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
 
 
@@ -45,7 +46,7 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     held = grip > otsu(grip)
     free = force[~held]
     bias = np.nan_to_num(np.nanmedian(free, axis=0))
-    noise = float(np.nanmedian(1.4826 * np.nanmedian(np.abs(free - bias), axis=0)))
+    noise = float(np.nanmedian(NORMAL * np.nanmedian(np.abs(free - bias), axis=0)))
     fy = force[:, 1] + force[:, 3] - bias[1] - bias[3]
     known = held & np.isfinite(speed)
     moving = known & (speed > np.median(speed[known])) if known.any() else held
@@ -163,7 +164,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
             continue  # never held where the distance is known
         start = old.width.get(name, None)
         if start is None:
-            start = _weighted_median(unsqueezed, gamma)
+            start = weighted_median(unsqueezed, gamma)
         width[name] = _location(unsqueezed, gamma, spread, start)
         residuals.append(unsqueezed - width[name])
         weights.append(gamma)
@@ -187,7 +188,7 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
             if not (np.isfinite(resting) & (gamma[:, k] > 0)).any():
                 continue  # nothing tells where the block rests
             start = old.levels[i].get(k) if old.levels else None
-            start = _weighted_median(resting, gamma[:, k]) if start is None else start
+            start = weighted_median(resting, gamma[:, k]) if start is None else start
             found[k] = _location(resting, gamma[:, k], spread, start)
             velocity.append(f.vy)
             level.append(resting - found[k])
@@ -203,13 +204,6 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
         _scale(np.concatenate(level), gamma, max(old.scale["level"], least_y), least_y),
         tuple(levels),
     )
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    keep = np.isfinite(values) & (weights > 0)
-    order = np.argsort(values[keep])
-    cumulative = np.cumsum(weights[keep][order])
-    return float(values[keep][order][np.searchsorted(cumulative, cumulative[-1] / 2)])
 
 
 def _location(values: np.ndarray, weights: np.ndarray, scale: float, start: float) -> float:

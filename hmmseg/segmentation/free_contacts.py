@@ -18,8 +18,9 @@ from scipy.special import log_ndtr
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.hmm import dense as ergodic
+from hmmseg.robust import median_of_known
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
-from hmmseg.segmentation.first_look import Block, blocks_of, filled, median, runs, ungripped
+from hmmseg.segmentation.first_look import Block, blocks_of, filled, runs, ungripped
 from hmmseg.segmentation.fit import maximisation
 from hmmseg.segmentation.standing import standing
 
@@ -172,7 +173,7 @@ def _opened(
     least = np.full(f.t.size, -np.inf)
     for start, stop in runs(held):
         known = slice(start, stop)
-        least[start:] = median(f.d[known], -np.inf) + median(given[known], 0.0) / 2
+        least[start:] = median_of_known(f.d[known], -np.inf) + median_of_known(given[known], 0.0) / 2
     chance = log_ndtr(np.where(np.isfinite(f.d), (f.d - least) / f.sd_d, np.inf))
     return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED))
 

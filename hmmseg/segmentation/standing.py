@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmmseg.levels import MOVED, SURE
+from hmmseg.robust import robust_sd
 
 FRICTION = 1.5  # cited: rubber on dry solids reaches about 1 to 1.4 (Persson, J. Chem. Phys. 115, 2001)
 CLEAR = 6.0  # numerics: standard deviations, so that no noise of an hour at 1 kHz is taken for a touch
@@ -26,7 +27,7 @@ def standing(t: np.ndarray, force: np.ndarray, sd_force: float, free: np.ndarray
     for across, along in (force[:, :2].T, force[:, 2:].T):
         rest = along[free & np.isfinite(along)]
         centre = float(np.median(rest)) if rest.size else 0.0
-        spread = 1.4826 * float(np.median(np.abs(rest - centre))) if rest.size else 0.0
+        spread = robust_sd(rest - centre) if rest.size else 0.0
         limit = FRICTION * np.abs(np.nan_to_num(across)) + CLEAR * max(spread, float(np.nan_to_num(sd_force)))
         out |= _lasting(centre - np.nan_to_num(along, nan=np.inf) > limit, t)
     return out

@@ -15,7 +15,6 @@ from hmmseg.segmentation.fit import (
     MeanShares,
     _location,
     _scale,
-    _weighted_median,
     fit,
     initial_parameters,
     otsu,
@@ -62,11 +61,6 @@ def test_pieces_without_data_keep_what_they_had():
     assert _location(nothing, np.ones(3), 1.0, 0.7) == 0.7
     assert _scale(nothing, np.ones(3), 0.3, 0.1) == 0.3
     assert _scale(np.zeros(100), np.ones(100), 0.3, 0.1) == 0.1  # never below its floor
-
-
-def test_weighted_median():
-    assert _weighted_median(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 5.0])) == 2.0
-    assert _weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0
 
 
 def test_transitions_are_probabilities_with_the_mean_duration():

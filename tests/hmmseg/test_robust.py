@@ -34,3 +34,7 @@ def test_gaps_are_bridged_in_time():
     assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ValueError, match="empty"):
         bridged(np.full(3, np.nan))
+
+
+def test_a_weighted_median_is_of_what_is_there():
+    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0

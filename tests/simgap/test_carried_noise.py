@@ -19,7 +19,7 @@ from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import neutral, problem
-from simgap.gap.redrawn_noise import SIZES, carried, on_other, noise_gained, redrawn
+from simgap.gap.redrawn_noise import SIZES, carried, noise_gained, on_other, redrawn
 from simgap.gap.trial_arrays import without_dropouts
 
 GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
