@@ -160,7 +160,7 @@ untidy: $(INSTALLED)  ## misfits found and false alarms in worlds that differ; u
 	$(BIN)/python -m experiments.untidy_contacts
 	$(BIN)/python -m experiments.write_tables
 
-then-and-now: $(INSTALLED)  ## what was reported of release 0.1.0 beside what holds now; RECORDINGS: folder with towers, 1 kHz and misfits
+then-and-now: $(INSTALLED)  ## what was reported of earlier code beside what holds now; RECORDINGS: folder with towers, 1 kHz and misfits
 	$(BIN)/python -m experiments.then_and_now $(RECORDINGS)
 	$(BIN)/python -m experiments.write_tables
 
@@ -193,7 +193,7 @@ fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, i
 	PYTHONPATH=tests $(BIN)/python -m experiments.fuzz --cases 100000 --keep build/fuzz
 
 identified: $(INSTALLED)  ## properties and boundaries in labs drawn anew (build/drawn) and in folders of RECORDINGS
-	$(BIN)/python -m experiments.blind_check open --cases 60 --seed 1124771 --fastest 200 --out build/drawn
+	$(BIN)/python -m experiments.blind_check open --cases 40 --seed 1187001 --fastest 200 --out build/drawn
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --keep
 	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --pooled 1 --keep
 	$(BIN)/python -m experiments.write_tables
