@@ -266,3 +266,12 @@ def test_hopeless_recordings_are_reported_not_raised(trial):
     assert aligned.segmentation.failed is not None
     assert len(aligned.boundaries) == 8
     json.dumps(aligned.segmentation.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize("number", [62006, 62027, 62037])
+def test_a_grip_that_loses_its_block_for_a_moment_is_no_drop(number):
+    """Nobody grips anew within some hundredths of a second; falls and regrasps of above take longer."""
+    world, (_, task) = World("slipping", Cell(rate=100.0), untidy="slipping"), scene()
+    (judged,) = trials_of(world, [number])
+    (found,) = segmentation.segment([judged.trial], task, judged.rig)
+    assert found.complete, found.failed
