@@ -43,22 +43,23 @@ def tail_of(trial: Trial, starts: np.ndarray) -> float:
     return float(trial.t[-1] - starts[-1])
 
 
-def cut_off(trials: Labelled, tail: float) -> Labelled:
-    """Trials without what comes later than `tail` after the last start; shorter ones are left out."""
+def cut_off(trials: Labelled, tail: float, shown: float | None = None) -> Labelled:
+    """Trials without what comes later than `tail` (or, if given, `shown`) after the last start; those shorter
+    than `tail` are left out."""
     out = []
     for trial, starts in trials:
         if tail_of(trial, starts) < tail:
             continue
-        keep = trial.t <= starts[-1] + tail
+        keep = trial.t <= starts[-1] + (shown or tail)
         channels = {name: trial.channels[name][keep] for name in WRENCH}
         out.append((Trial(trial.file, trial.t[keep], channels), starts))
     return out
 
 
 def compared(real: Labelled, sim: Labelled, tail: float, seed: int = 0) -> GenericDiagnosis:
-    """The generic diagnosis of all trials cut off at one tail."""
-    first, second = cut_off(real, tail), cut_off(sim, tail)
-    boundaries = {t.file: starts for t, starts in (*first, *second)}
+    """The generic diagnosis of all trials up to one tail; real ones go on, which shows their ring."""
+    first, second = cut_off(real, tail, RINGING), cut_off(sim, tail)
+    boundaries = {t.file: np.append(starts, starts[-1] + tail) for t, starts in (*first, *second)}
     task = SequenceTask(KINDS[REAL].sequence, WRENCH)
     return diagnose([t for t, _ in first], [t for t, _ in second], task, boundaries=boundaries, seed=seed)
 
@@ -94,7 +95,8 @@ def summary(found: GenericDiagnosis) -> dict:
         share[key] = share.get(key, 0.0) + row["share"]
     return {
         "trials": {"real": len(lay.ensembles.real), "sim": len(lay.ensembles.sim)},
-        **{k: body[k] for k in ("verdict", "causes", "probabilities", "detection")},
+        **{k: body[k] for k in ("verdict", "causes", "probabilities", "detection", "attribution")},
+        "remainder": body["remainder"]["share"],
         "significant_cells": int((found.located.z > found.located.threshold).sum()),
         "cells": len(lay.cells), "largest_shares": dict(sorted(share.items(), key=lambda i: -i[1])[:12]),
         "best_explanation": body["best_explanation"], "parameters": body["effects"][best]["parameters"],

@@ -19,7 +19,7 @@ SPREAD = (0.05, 0.95)  # chosen: quantiles whose distance is a channel's scale
 
 @dataclass(frozen=True)
 class Cut:
-    """A trial and the edges (K + 1,) [s] of its K subtasks."""
+    """A trial and the edges (K + 1,) [s] of its K subtasks. It may go on after the last one."""
 
     trial: Trial
     edges: np.ndarray
@@ -76,7 +76,8 @@ def _shown_by_all(found, task: SequenceTask, k: int) -> bool:
 
 
 def _edges(trial: Trial, inner: np.ndarray, task: SequenceTask) -> np.ndarray:
-    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), trial.t[-1:]])
+    whole = len(inner) == len(task.sequence)  # with the end of what is compared
+    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), [] if whole else trial.t[-1:]])
     if edges.size != len(task.sequence) + 1 or not (np.diff(edges) > 0).all():
         raise InputError(f"boundaries of {trial.file}", f"found {np.asarray(inner).tolist()}",
                          f"{len(task.sequence) - 1} increasing times within the trial")  # fmt: skip

@@ -21,8 +21,9 @@ from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, kno
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles
 from simgap.generic.effects import EFFECTS, Scene, scene
-from simgap.generic.features import layout, rows, windowed
+from simgap.generic.features import layout, resampled, rows, windowed
 from simgap.generic.fit import Block, EnsembleFit, blocks, fit
+from simgap.generic.judged import judge
 from simgap.generic.locate import Located, locate
 from simgap.generic.report import effect_entry, listed_cells
 from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
@@ -66,8 +67,9 @@ def diagnose(
 ) -> GenericDiagnosis:
     """Diagnose real trials against simulated ones of the same plain ordered task.
 
-    `boundaries` [s] by file (one fewer than subtasks) take the place of the HMM; `forced` names effects
-    to be taken instead of choosing. InputError where a kind has no trial that shows the whole task.
+    `boundaries` [s] by file (one fewer than subtasks, or as many with the end of what is compared) take the
+    place of the HMM; `forced` names effects to be taken instead of choosing. InputError where a kind has no
+    trial that shows the whole task.
     """
     tell = progress or (lambda text: None)
     _check(forced)
@@ -158,7 +160,8 @@ def _together(singles: list[EnsembleFit], names: list[str], fitted, gap: bool) -
 
 
 def _ring(given: Scene) -> Ring | None:
-    """The strongest oscillation after an event in the real trials, where they hold more power."""
+    """The strongest oscillation after an event in the real trials, where they hold more power; after the last
+    from as long as all of them go on, for what is compared may end sooner."""
     lay, best, windows = given.layout, 0.0, None
     for k in range(1, len(lay.ensembles.subtasks)):
         for c in range(len(lay.ensembles.channels)):
@@ -168,12 +171,28 @@ def _ring(given: Scene) -> Ring | None:
                 continue
             rest = recorded - simulated.mean(0)  # what the simulation has is no ring
             here = from_swing(list(rest if rest.var(1).mean() < recorded.var(1).mean() else recorded))
+            if k + 1 == len(lay.ensembles.subtasks) and (longer := _going_on(given, c)):
+                here = from_swing(longer)
             _, _, share, square = screen(here, lay.rate)
             strength = square * here.shape[1] / lay.scale[c] ** 2
             if share > RINGS and strength > best:
                 best, windows = strength, here
     found = None if windows is None else fit_ring(windows, lay.rate)
     return found if found is not None and found.resolved else None
+
+
+def _going_on(given: Scene, channel: int) -> list[np.ndarray]:
+    """Samples of a channel from the last event on, as long as every real trial lasts; none where what is
+    compared ends as late."""
+    lay, out = given.layout, []
+    if any(cut.trial.t[-1] <= cut.edges[-1] for cut in lay.ensembles.real):
+        return out
+    name = lay.ensembles.channels[channel]
+    length = min(float(cut.trial.t[-1] - cut.edges[-2]) for cut in lay.ensembles.real)
+    since = (np.arange(int(length * lay.rate)) + 0.5) / lay.rate
+    for cut in lay.ensembles.real:
+        out.append(resampled(cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since, lay.rate))
+    return out
 
 
 def _conclude(
@@ -186,18 +205,26 @@ def _conclude(
     counts = np.bincount(lay.cell)
     held = {f.effects: heldout(given, parts, real, sim, f) for f in found[:LISTED]}
     # Judged where there is a gap: elsewhere a small excess would drown in the floor's own scatter.
-    apart = counts * (located.z > min(located.threshold, located.z.max() - 1e-9))
-    before, after, _, floor = sizes(held[best.effects], apart)
+    apart = located.z > min(located.threshold, located.z.max() - 1e-9)
+    before, after, _, floor = sizes(held[best.effects], counts * apart)
     left = 1 - fraction(before, after, floor)
     left = float(np.clip(left, 0, 1)) if np.isfinite(left) else 0.0
     rest = locate(lay, real - best.shift, sim, seed)
+    kept, sure = best.effects, 1.0
     # What noise leaves as often as a healthy comparison shows a gap is not left by the effects.
-    sure = known(left if rest.p_value < ALARM else 0.0, 1.0)
+    if rest.p_value < ALARM:
+        numbers = len(real), len(sim)
+        judged = judge(given, parts, best, numbers, held[best.effects], counts * apart, temperature)
+        kept = tuple(n for n in best.effects if judged[n].cause)
+        sure = known(max((judged[n].left for n in kept), default=1.0), 1.0)
     score = np.array([0.0, *(f.evidence(temperature) + PRIOR for f in found)])
     weights = np.exp(score - np.logaddexp.reduce(score)).tolist()
     sets = [Explanation((), weights[0])]
-    sets += [Explanation(f.effects, w, f.effects, sure) for f, w in zip(found, weights[1:], strict=True)]
-    verdict = conclude(sets, located.p_value, forced=best.effects if forced else ())
+    for f, w in zip(found, weights[1:], strict=True):
+        holds = bool(kept) and {*kept} <= {*f.effects}
+        causes = kept if holds else tuple(n for n in f.effects if n not in best.effects or n in kept)
+        sets.append(Explanation(f.effects, w, causes, sure if kept else 0.0))
+    verdict = conclude(sets, located.p_value, forced=best.effects if forced else (), chosen=kept)
     chosen = best if verdict.causes else None
     gap, chance = located.p_value < ALARM, acting(sets, located.p_value)
     detection = Detection(float(located.z.max()), located.p_value, located.resolution)

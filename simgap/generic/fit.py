@@ -29,6 +29,8 @@ STEP = 1e-3  # numerics: prior standard deviations, for derivatives by differenc
 EVALUATIONS = 30  # numerics: of the residual, in one descent
 FURTHER = 4.0  # prior: nats, as one effect is less likely than none
 FAR = 8.0  # numerics: prior standard deviations that no parameter leaves
+AT_END = 0.02  # numerics: share of a range within which a descent that stays inside has run to its end
+NEUTRAL = 1e-9  # numerics: a coordinate that has not moved
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,16 @@ class Slot:
 
 @dataclass(frozen=True)
 class EnsembleFit:
-    """A candidate fitted in every block: coordinates `u`, `jacobian` (n, p) of the whitened residual and
-    `raw` (n, p) of the prediction, `shift` of all features (F,), chi-squares after and before."""
+    """A candidate fitted in every block to a `difference` (F,): coordinates `u`, `jacobian` (n, p) of the
+    whitened residual and `raw` (n, p) of the prediction, `shift` of all features (F,), chi-squares after and
+    before."""
 
     effects: tuple[str, ...]
     slots: tuple[tuple[Slot, ...], ...]
     u: tuple[np.ndarray, ...]
     jacobian: tuple[np.ndarray, ...]
     raw: tuple[np.ndarray, ...]
+    difference: np.ndarray
     shift: np.ndarray
     square: float
     before: float
@@ -212,7 +216,7 @@ def fit(
         z = np.linalg.solve(root, difference[block.index])
         before += float(z @ z)
     mine, u, jacobian, raw = (tuple(f[j] for f in found) for j in range(4))
-    return EnsembleFit(effects, mine, u, jacobian, raw, shift, square, before)
+    return EnsembleFit(effects, mine, u, jacobian, raw, difference, shift, square, before)
 
 
 def _block(given: Scene, block: Block, root: np.ndarray, difference: np.ndarray, mine: Sequence[Slot], known):
@@ -233,7 +237,22 @@ def _block(given: Scene, block: Block, root: np.ndarray, difference: np.ndarray,
         ])  # fmt: skip
         results.append(_descend(given, block, root, difference, mine, zero, u, low, high))
     u, z, jacobian = min(results, key=lambda r: float(r[1] @ r[1] + r[0] @ r[0]))
+    out = {x.effect for x, v, end in zip(mine, u, np.where(u < 0, low, high), strict=True) if _ends(v, end)}
+    if out:
+        kept = np.array([x.effect not in out for x in mine])
+        rest = [x for x in mine if x.effect not in out]
+        base = {(x.effect, x.kind.name, x.place): v for x, v in zip(rest, u[kept], strict=True)}
+        part, slopes, shift, square = _block(given, block, root, difference, rest, base)
+        u, jacobian = np.zeros(len(mine)), np.zeros((difference.size, len(mine)))
+        u[kept], jacobian[:, kept] = part, slopes
+        return u, jacobian, shift, square
     return u, jacobian, at(given, block, mine, u) - zero, float(z @ z)
+
+
+def _ends(value: float, end: float) -> bool:
+    """Whether a coordinate ran to the end of its range: a filter of half a second stands for a course that
+    differs in another way, and is none of this channel's."""
+    return bool(abs(value) > NEUTRAL and abs(value - end) < AT_END * abs(end))
 
 
 def _descend(given, block, root, difference, mine, zero, u, low, high):

@@ -99,6 +99,10 @@ def test_a_step_of_torque_is_held_as_the_steps_have_it():
         (MAP.replace('joint = "pivot"', 'kind = "position"'), "columns.q: names no thing of the model"),
         (MAP.replace("1e-4", "-1"), "noise: -1; expected above 0"),
         (MAP.replace('"Nm"', '"furlong"'), "'furlong' is no known unit"),
+        (
+            MAP.replace('joint = "pivot"', 'joint = "pivot"\nunit = "kg"'),
+            r"columns\.q\.unit: 'kg' of a position that is read in rad; expected a unit of angle",
+        ),
         (MAP.replace('[columns.u]\nactuator = "m"\nunit = "Nm"', "[colums.u]"), "colums: unknown key"),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
+from hmmseg.io.units import UNITS, known_unit
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.map import Map, Mapped, read_map
 from simgap.simulators.protocol import Channel
@@ -140,7 +141,9 @@ def _simulator(mujoco: Any, model: Any, described: Map, address: Mapping[str, tu
     objects = mujoco.mjtObj
     channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
     for column in described.columns.values():
-        channels[column.column] = Channel(_unit(mujoco, model, column), column.kind, column.noise)
+        unit = _unit(mujoco, model, column)
+        _check_unit(described, column, unit)
+        channels[column.column] = Channel(unit, column.kind, column.noise)
         if column.kind == "command":
             driven[column.column] = identity(objects.mjOBJ_ACTUATOR, column.name)
             continue
@@ -217,6 +220,20 @@ def _unit(mujoco: Any, model: Any, column: Mapped) -> str:
     if column.thing in ("body", "site"):
         return "1" if column.axis.startswith("q") else "m"
     return {"position": "m", "velocity": "m/s", "force": "N", "torque": "N m"}[column.kind]
+
+
+def _check_unit(described: Map, column: Mapped, si: str) -> None:
+    """InputError where a joint's, body's or site's column has the unit of something else."""
+    given = None if not isinstance(column.unit, str) else known_unit(column.unit)
+    if given is None or column.thing not in ("joint", "body", "site"):
+        return
+    wanted = UNITS[known_unit(si) or si][0]
+    if UNITS[given][0] != wanted:
+        raise InputError(
+            f"{described.file}: columns.{column.column}.unit",
+            f"{column.unit!r} of a {column.kind} that is read in {si}",
+            f"a unit of {wanted}",
+        )
 
 
 LATITUDE = 0.2  # limit: share of a joint's range by which a log may exceed it
