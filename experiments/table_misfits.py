@@ -65,7 +65,7 @@ def by_world() -> str | None:
     of = {k: sum(row[e][k] for row in every for e in edits) for k in ("found", "right", "trials")}
     note = (
         f"In all: {alarms} of {trials} healthy trials are rejected; of {of['trials']} that do not fit "
-        f"{of['found']} are found, {of['right']} at the subtask that fails. Commit {found['made_by']}, "
+        f"{of['found']} are found, {of['right']} at the subtask that fails.\nCommit {found['made_by']}, "
         f"trials from number {found['first']} on."
     )
     return f"{markdown(['world', 'false alarms', *(NAMES[e] for e in edits)], rows)}\n\n{note}"
