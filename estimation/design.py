@@ -44,9 +44,8 @@ from estimation.observations import (
 from estimation.unknowns import FORCE, PROPERTIES, RISE, Unknown, coefficients_of, determined
 from hmmseg.contact.decompose import height_equations
 from hmmseg.hand.signals import Signals
-from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import Trial
+from hmmseg.io.rig import FORCE_CHANNELS
+from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.features import thin
 
 
@@ -97,20 +96,20 @@ class Design:
 
 
 def build(
-    trials: Sequence[Trial], aligned: Sequence[WeighedTrial], noise: Noise, task: BlockTask, rig: Rig,
-    doubted: bool | None = None,
-) -> Design:  # fmt: skip
-    """Design of the given aligned trials.
+    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise, doubted: bool | None = None
+) -> Design:
+    """Design of aligned trials, `weighed` by `estimation.observations`.
 
     `doubted`: whether the rig's pads are in doubt by what slopes say against them; None: if that is likelier.
     """
+    task, rig, trials = aligned.task, aligned.rig, [one.trial for one in aligned.trials]
     moves = list(range(len(task.performed)))
     objects = [task.performed[m].object for m in moves]
     rises = dict(height_equations(task))
-    raw = np.stack([observe(a.signals, a, rig, moves) for a in aligned])  # T, S, M, 3
-    variance = np.stack([sampling_variance(a, noise, moves) for a in aligned])
+    raw = np.stack([observe(a.signals, a, rig, moves) for a in weighed])  # T, S, M, 3
+    variance = np.stack([sampling_variance(a, noise, moves) for a in weighed])
     factor = np.stack(
-        [[a.weights.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in aligned]
+        [[a.weights.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
     )
     valid = np.isfinite(raw) & np.isfinite(variance)
     there = valid.mean(axis=1) > 0.5  # of the alignments
@@ -120,15 +119,15 @@ def build(
     columns = coefficients_of(unknowns, objects, rises)  # M, 3, Q
     coefficients = np.repeat(np.repeat(columns[None, None], raw.shape[1], axis=1), len(trials), axis=0)
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
-    free_mean, free_variance = free_means(aligned, noise)
+    free_mean, free_variance = free_means(weighed, noise)
     surprise = unexpected_bias(free_mean, free_variance, rig)
-    slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in aligned])  # T, M, K
+    slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
     slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that tell no unknown
     slope_variance, alike = (
-        np.stack(each) for each in zip(*(slope_variances(a, moves) for a in aligned), strict=True)
+        np.stack(each) for each in zip(*(slope_variances(a, moves) for a in weighed), strict=True)
     )
-    doubt = pad_doubt(slopes, slope_variance, alike, aligned, rig)
+    doubt = pad_doubt(slopes, slope_variance, alike, weighed, rig)
     doubt = replace(doubt, doubted=max(doubt.odds) > 0.5 if doubted is None else doubted)
     slope_variance += doubt.slope_sd()[sloped] ** 2
     deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
@@ -137,7 +136,7 @@ def build(
     slope_shifts = np.zeros((*slopes.shape, len(deviations)))
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))
     for j, deviation in enumerate(deviations):
-        for i, (trial, a) in enumerate(zip(trials, aligned, strict=True)):
+        for i, (trial, a) in enumerate(zip(trials, weighed, strict=True)):
             read, size = thin(deviation.read(trial, rig, deviation.step), _rate(a.signals)), deviation.sd
             change = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) / deviation.step
             shifts[i, ..., j] = change * size
@@ -153,7 +152,7 @@ def build(
         unknowns=unknowns, nuisances=deviations, mean=np.concatenate([mean, slopes[steep]]),
         variance=np.concatenate([spread, slope_variance[steep]]), coefficients=rows, shifts=shifts,
         channel=np.concatenate([where[2], sloped[steep[2]]]),
-        unit=np.concatenate([units(aligned, raw, rig)[where], np.ones(steep[0].size)]),
+        unit=np.concatenate([units(weighed, raw, rig)[where], np.ones(steep[0].size)]),
         trial=np.concatenate([where[0], steep[0]]), move=np.concatenate([where[1], steep[1]]),
         slope=np.repeat([False, True], [where[0].size, steep[0].size]),
         free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,

@@ -19,21 +19,19 @@ from estimation.observations import Noise, WeighedTrial
 from estimation.posterior import Posterior, posterior
 from estimation.sampler import Draws, sample
 from estimation.unknowns import DISTANCE, RISE
-from hmmseg.io.rig import Rig
-from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import Trial
+from hmmseg.segmentation.align import AlignedTrials
 
 CERTAIN = 0.99  # chosen: probability from which it is said, and taken for true, that the rig's pads are wrong
 
 
 def designs(
-    trials: Sequence[Trial], aligned: Sequence[WeighedTrial], noise: Noise, task: BlockTask, rig: Rig
+    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise
 ) -> tuple[Design, Design | None]:
     """The likelier design, and the other one where it is open whether the rig's pads are right."""
-    found = build(trials, aligned, noise, task, rig)
+    found = build(aligned, weighed, noise)
     if not found.unknowns or not any(0 < odds < CERTAIN for odds in found.doubt.odds):
         return found, None
-    return found, build(trials, aligned, noise, task, rig, not found.doubt.doubted)
+    return found, build(aligned, weighed, noise, not found.doubt.doubted)
 
 
 def sample_either(

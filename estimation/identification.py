@@ -167,7 +167,7 @@ def identify_aligned(
     weighed, noise = aligned_weights(level, rng)
     weighed = with_slides(weighed, noise, aligned.rig)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
-    design, other = designs(trials, weighed, noise, aligned.task, rig)
+    design, other = designs(level, weighed, noise)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
     hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
     if "friction" in hidden:

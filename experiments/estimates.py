@@ -49,7 +49,7 @@ def estimate(case: Case, trials: slice = slice(None), sampled: bool = True, seed
     pairs = list(zip(segmentations, truth, strict=True))
     rng = np.random.default_rng(seed)
     weighed, noise = aligned_weights(aligned, rng)
-    design, other = designs(chosen, weighed, noise, case.task, case.rig)
+    design, other = designs(aligned, weighed, noise)
     post = posterior(design)
     mode = find_mode(post)
     single = [i for i, u in enumerate(design.unknowns) if u.single]

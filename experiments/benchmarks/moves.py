@@ -41,10 +41,9 @@ STEPS = 600
 
 def posterior_of(case: Case, num_trials: int) -> tuple[Posterior, Mode]:
     """Posterior of a case's first trials, and its mode."""
-    trials = list(case.trials[:num_trials])
-    aligned = align(trials, case.task, case.rig)
+    aligned = align(list(case.trials[:num_trials]), case.task, case.rig)
     weighed, noise = aligned_weights(aligned, np.random.default_rng(0))
-    post = posterior(build(trials, weighed, noise, case.task, case.rig))
+    post = posterior(build(aligned, weighed, noise))
     return post, find_mode(post)
 
 

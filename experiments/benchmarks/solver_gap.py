@@ -19,7 +19,7 @@ def gap_problem(folder: Path):
     from simgap.gap.frame import build
     from simgap.gap.problem import neutral, problem
 
-    given = problem(build(aligned_trials(folder)[1]))
+    given = problem(build(aligned_trials(folder)))
     return given, [Start(effects, neutral(given)) for effects in SETS]
 
 

@@ -13,7 +13,7 @@ Solve = Callable[[], tuple[list[float], list[np.ndarray]]]
 
 
 def aligned_trials(folder: Path):
-    """Trials, their alignment and their rig."""
+    """The trials of a folder, aligned."""
     from hmmseg.io.rig import read_rig
     from hmmseg.io.task import read_task
     from hmmseg.io.trial import read_trial
@@ -21,7 +21,7 @@ def aligned_trials(folder: Path):
 
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     trials = [read_trial(path, rig) for path in sorted(folder.glob("trial_*.csv"))]
-    return trials, align(trials, task, rig), rig
+    return align(trials, task, rig)
 
 
 def scales_problem(folder: Path):
@@ -30,9 +30,9 @@ def scales_problem(folder: Path):
     from estimation.observations import aligned_weights
     from estimation.posterior import posterior
 
-    trials, aligned, rig = aligned_trials(folder)
+    aligned = aligned_trials(folder)
     weighed, noise = aligned_weights(aligned, np.random.default_rng(0))
-    return posterior(build(trials, weighed, noise, aligned.task, rig))
+    return posterior(build(aligned, weighed, noise))
 
 
 def scales_optimistix(folder: Path) -> Solve:

@@ -101,7 +101,7 @@ def _ours(recorded: Recorded, signals: Signals, told: Scene, seed: int | None) -
         return {"residual": lost, "inside_90": lost, "accuracy": 0.0, "property": none, "inside_95": none}
     scores = _scores(aligned.trials[0].segmentation, recorded, signals, told)
     weighed, noise = aligned_weights(aligned, np.random.default_rng(recorded.number))
-    design = build([recorded.trial], weighed, noise, told.task, told.rig)
+    design = build(aligned, weighed, noise)
     columns = [(name, key) for name in told.task.objects for key in PROPERTIES]
     truth = np.array([getattr(recorded.blocks[name], key) for name, key in columns])
     where = [columns.index(u.name) for u in design.unknowns if u.single]  # these come first

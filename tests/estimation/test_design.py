@@ -34,8 +34,8 @@ def aligned(case):
 
 def design_of(case, aligned, systematic):
     rig = case.rig.model_copy(update={"systematic": systematic})
-    weighed, noise, _ = aligned
-    return build(list(case.trials), weighed, noise, case.task, rig)
+    weighed, noise, found = aligned
+    return build(replace(found, rig=rig), weighed, noise)
 
 
 @pytest.fixture(scope="module")
@@ -168,14 +168,14 @@ def test_a_bias_that_free_motion_sees_hardly_widens_weight(case, aligned):
 
 def test_what_a_failed_trial_does_not_show_is_left_out(case, aligned):
     """Trials that end before the second move: only the first block's own properties are determined."""
-    weighed, noise, _ = aligned
+    weighed, noise, found = aligned
     cut = []
     for a in weighed:
         grips, counts = dict(a.weights.grips), dict(a.weights.counts)
         grips[1] = {k: np.zeros_like(v) for k, v in grips[1].items()}
         counts[1] = {k: np.zeros_like(v) for k, v in counts[1].items()}
         cut.append(replace(a, weights=replace(a.weights, grips=grips, counts=counts)))
-    design = build(list(case.trials), cut, noise, case.task, case.rig)
+    design = build(found, cut, noise)
     # Block 1 moved down from block 2 onto the ground: its rise tells block 2's height.
     assert set(design.names) == {("block1", "weight"), ("block1", "width"), ("block2", "height")}
     assert np.isfinite(design.mean).all() and np.isfinite(design.variance).all()
@@ -195,7 +195,7 @@ def test_rigid_pads_that_give_are_told_and_allowed_for(case, aligned):
     rig = case.rig.model_copy(update={"systematic": EVERY, "fingertip": Fingertip()})
     found = align(case.trials, case.task, rig)
     weighed, noise = aligned_weights(found, np.random.default_rng(0))
-    design = build(list(case.trials), weighed, noise, case.task, rig)
+    design = build(found, weighed, noise)
     assert design.doubt.normal == pytest.approx(1.0, abs=0.2)  # in units of pads of 4000 N/m
     names = {n.name for n in design.nuisances if n.name.startswith("pad")}
     assert names >= {"pad_normal.1", "pad_normal.2", "pad_normal_exponent"}
