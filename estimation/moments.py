@@ -30,37 +30,37 @@ from hmmseg.io.rig import FORCE_CHANNELS, Rig
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
 
-def observe(signals: Signals, aligned: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
     values = channel_values(signals, rig)
     out = []
     for move in moves:
-        weights, counts = aligned.weights.grips[move], aligned.weights.counts[move]
+        weights, counts = weighed.weights.grips[move], weighed.weights.counts[move]
         means = {k: _mean(w, values[k], counts[k]) for k, w in weights.items()}
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
 
 
-def observe_slopes(signals: Signals, aligned: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where none."""
     values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
         for k, (name, (_, reading)) in enumerate(SLOPES.items()):
-            found = aligned.weights.slopes.get(move, {}).get(name)
+            found = weighed.weights.slopes.get(move, {}).get(name)
             if found is not None:
                 out[i, k] = found.weights @ np.nan_to_num(values[reading])
     return out
 
 
-def slope_variances(aligned: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Variances (num_moves, len(SLOPES)) of slopes, infinite of none, and what they may be off by alike."""
-    found = [[aligned.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
+    found = [[weighed.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
     variance = [[np.inf if s is None else s.variance for s in row] for row in found]
     return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in found])
 
 
 def pad_doubt(
-    slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, aligned: Sequence[WeighedTrial], rig: Rig
+    slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
 ) -> PadDoubt:
     """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, and usual forces.
 
@@ -87,7 +87,7 @@ def pad_doubt(
         if not stated:
             possible[channel] = possible_share(mine[0], mine[1])
     normal, shear = (
-        float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, aligned), strict=True)
+        float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, weighed), strict=True)
     )
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
     return PadDoubt(
@@ -96,9 +96,9 @@ def pad_doubt(
     )  # fmt: skip
 
 
-def _usual(aligned: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:
+def _usual(weighed: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:
     """Mean forces of one finger (num_moves,) along the grip, and in shear where the block is put down [N]."""
-    s, grips = aligned.signals, aligned.weights.grips.values()
+    s, grips = weighed.signals, weighed.weights.grips.values()
     along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
     return np.array([np.mean(w["distance"] @ along) for w in grips]), np.array(
         [abs(np.mean(w["place"] @ up)) for w in grips]
@@ -109,17 +109,17 @@ def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.nda
     return np.where(counts > 0, weights @ np.nan_to_num(values), np.nan)
 
 
-def sampling_variance(aligned: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
+def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
     """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
     out = []
     with np.errstate(divide="ignore"):
         for move in moves:
-            part = {k: noise.variance[k] / n for k, n in aligned.weights.counts[move].items()}
+            part = {k: noise.variance[k] / n for k, n in weighed.weights.counts[move].items()}
             out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
     return np.moveaxis(np.array(out), 2, 0)
 
 
-def units(aligned: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
+def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
     """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
 
     Of a rise at least the give under the weight, and what it changed by in landing: what a pad does on
@@ -128,7 +128,7 @@ def units(aligned: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
     grip, lever, landed = [], [], []
-    for a in aligned:
+    for a in weighed:
         squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
         grips = a.weights.grips.values()
         grip.append([np.mean(w["distance"] @ squeeze) for w in grips])
@@ -142,10 +142,10 @@ def units(aligned: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
 
 
-def free_means(aligned: Sequence[WeighedTrial], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+def free_means(weighed: Sequence[WeighedTrial], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """Mean forces in free motion (num_trials, 4) and their variances."""
-    mean = np.stack([free_forces(a.signals, a) for a in aligned])
-    count = np.array([max(a.weights.free_count, 1.0) for a in aligned])
+    mean = np.stack([free_forces(a.signals, a) for a in weighed])
+    count = np.array([max(a.weights.free_count, 1.0) for a in weighed])
     variance = np.array([noise.variance[name] for name in FORCE_CHANNELS])
     return mean, variance[None, :] / count[:, None]
 

@@ -22,28 +22,28 @@ SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide
 WITNESSES = ("rise", "landing")
 
 
-def with_slides(aligned: Sequence[WeighedTrial], noise: Noise, rig: Rig) -> list[WeighedTrial]:
+def with_slides(weighed: Sequence[WeighedTrial], noise: Noise, rig: Rig) -> list[WeighedTrial]:
     """The trials with places counting for less where their blocks slid; others as they are.
 
     A landing in which a block slid is no witness of the pads any more.
     """
-    readings = [np.nan_to_num(channel_values(a.signals, rig)["place"]) for a in aligned]
+    readings = [np.nan_to_num(channel_values(a.signals, rig)["place"]) for a in weighed]
     slopes = [
         (float(found.weights @ reading), found.variance)
-        for a, reading in zip(aligned, readings, strict=True)
+        for a, reading in zip(weighed, readings, strict=True)
         for of_move in a.weights.slopes.values()
         for name, found in of_move.items()
         if name in WITNESSES
     ]
     if not slopes:
-        return list(aligned)
+        return list(weighed)
     stated = np.isfinite(rig.fingertip.shear_stiffness)
     believed = max(rig.systematic.pad_stiffness) if stated else UNSTATED
     shares, variances = np.array([(0.0, believed**2), *slopes]).T
     common, _ = middle_share(shares, variances, SLOPE_SD)
     return [
         _doubted(a, reading, common, noise.variance["place"])
-        for a, reading in zip(aligned, readings, strict=True)
+        for a, reading in zip(weighed, readings, strict=True)
     ]
 
 

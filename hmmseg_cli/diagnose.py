@@ -80,7 +80,7 @@ TaskFile = Annotated[
 LISTS = ("--against", "--healthy")  # options that take several files
 
 
-def spread_against(args: list[str]) -> list[str]:
+def with_options_repeated(args: list[str]) -> list[str]:
     """Arguments with `--against A B` written `--against A --against B`, as the parser takes one a time; the
     same of `--healthy`."""
     out: list[str] = []

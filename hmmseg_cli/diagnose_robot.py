@@ -104,7 +104,7 @@ def diagnose_robot(
         from simgap.simulators.user import load_simulator
 
         simulator = load_simulator(own.simulator)
-        wanted = [n for n, c in simulator.channels.items()]
+        wanted = list(simulator.channels)
         recordings = [read_recording(path, wanted) for path in paths]
         at_risk = simulator
         inputs = [own.simulator.encode(), *modules_beside(Path(own.simulator.rpartition(":")[0]))]
@@ -161,7 +161,7 @@ def diagnose_robot(
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
-    from hmmseg_cli.diagnose import tables as usual
+    from simgap.report.tables import tables as usual
 
     out = []
     unseen = document["identifiability"]["unseen"]

@@ -82,7 +82,7 @@ def main(args: Sequence[str] | None = None) -> int:
     keep_freed_memory()
     configure()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
-    args = diagnose.spread_against(args)
+    args = diagnose.with_options_repeated(args)
     command = typer.main.get_command(app)
     try:
         with heard():

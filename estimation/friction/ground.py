@@ -36,7 +36,7 @@ class GroundFriction:
 
 
 def ground_friction(
-    aligned: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
+    weighed: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
     sd_force: float, rng: np.random.Generator, num_draws: int,
 ) -> GroundFriction | None:  # fmt: skip
     """Friction of a block on what it is slid on; None where it is not, or where that tells too little.
@@ -47,13 +47,13 @@ def ground_friction(
     if not slid:
         return None
     support = task.performed[slid[-1].move or 0].to
-    rows = [_rows(a, s, rig) for a in aligned for s in slid if task.performed[s.move or 0].to == support]
+    rows = [_rows(a, s, rig) for a in weighed for s in slid if task.performed[s.move or 0].to == support]
     table = np.concatenate(rows)
     if len(table) < FEWEST:
         return None
-    stated = aligned[0].signals.sd_force
+    stated = weighed[0].signals.sd_force
     noise = 2 * (stated if np.isfinite(stated) else sd_force) ** 2
-    log_posterior = _log_posterior(table, noise, _carried(aligned, steps, obj, rig, noise))
+    log_posterior = _log_posterior(table, noise, _carried(weighed, steps, obj, rig, noise))
     probability = np.exp(log_posterior - log_posterior.max())
     cdf = np.cumsum(probability * np.gradient(COEFFICIENTS))
     draws = np.interp(rng.uniform(size=num_draws) * cdf[-1], cdf, COEFFICIENTS)
@@ -75,12 +75,12 @@ def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
 
 
 def _carried(
-    aligned: Sequence[WeighedTrial], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
+    weighed: Sequence[WeighedTrial], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
 ) -> tuple[float, float] | None:
     """Weight and its sd [N] as carries of the same block tell it; None where it is not carried."""
     moves = [s.move for s in steps if s.object == obj and s.state == ABOVE_GROUND and s.move is not None]
     means, counts = [], []
-    for a in aligned:
+    for a in weighed:
         factor, s = gravity_factor(a.signals, rig), a.signals
         bias = float(a.weights.free @ np.nan_to_num(s.fy))
         for move in moves:

@@ -84,7 +84,7 @@ class _Held:
 
 
 def friction_posteriors(
-    aligned: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
+    weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
     rng: np.random.Generator,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
     """Friction of every object of the task, all trials pooled, alignments marginalised.
@@ -92,12 +92,12 @@ def friction_posteriors(
     `sd_force`: noise of one force sample [N] where the signals do not state it.
     """
     steps = subtasks(task)
-    fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in aligned]
-    held = {obj: _held(aligned, fingers, steps, obj) for obj in task.objects}
-    resting = {obj: _stretches(aligned, fingers, steps, obj, rig) for obj in task.objects}
+    fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
+    held = {obj: _held(weighed, fingers, steps, obj) for obj in task.objects}
+    resting = {obj: _stretches(weighed, fingers, steps, obj, rig) for obj in task.objects}
     out = {}
     for obj in task.objects:
-        ground = ground_friction(aligned, task, steps, obj, rig, sd_force, rng, DRAWS)
+        ground = ground_friction(weighed, task, steps, obj, rig, sd_force, rng, DRAWS)
         samples = held[obj]
         if samples.ratio.size == 0:
             reason = f"the recording never shows {obj} held firmly"
@@ -154,11 +154,11 @@ def _ratio(forces: _Forces, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _held(
-    aligned: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str
+    weighed: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str
 ) -> _Held:
     moves = sorted({s.move for s in steps if s.object == obj and s.move is not None})
     ratios, sds, masks = [np.zeros(0)], [np.zeros(0)], []
-    for a, pair in zip(aligned, fingers, strict=True):
+    for a, pair in zip(weighed, fingers, strict=True):
         for move in moves:
             members = [s.index for s in steps if s.move == move and s.state != FREE]
             holding = np.any(a.masks[:, members], axis=1)
@@ -173,7 +173,7 @@ def _held(
 
 
 def _stretches(
-    aligned: Sequence[WeighedTrial],
+    weighed: Sequence[WeighedTrial],
     fingers: list[list[_Forces]],
     steps: tuple[Subtask, ...],
     obj: str,
@@ -182,7 +182,7 @@ def _stretches(
     """Each finger on the resting block, samples that every alignment has there."""
     compliance = 1 / rig.fingertip.shear_stiffness
     out = []
-    for a, pair in zip(aligned, fingers, strict=True):
+    for a, pair in zip(weighed, fingers, strict=True):
         for step in steps:
             if step.object != obj or step.state != ON_GROUND:
                 continue

@@ -32,12 +32,12 @@ from simgap.gap.search import Identified, Search, search
 from simgap.gap.tolerance import properties_tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.gap.wrist_gap import check_forced, of_wrist
+from simgap.progress import Progress, silent
 from simgap.report.finding import sentence
 from simgap.report.tables import tables
 
 STAGES = 12  # look: that `progress` is told of, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,7 +124,7 @@ def diagnose(
     of the same trials, where that is known already. InputError where no trial fits its task, or no effect has
     a forced name or could act on these recordings.
     """
-    tell = progress or (lambda text: None)
+    tell = progress or silent
     forced = tuple(effect_named(name).name for name in dict.fromkeys(forced))
     if of_wrist([one.trial for one in aligned.trials]):
         check_forced(forced)

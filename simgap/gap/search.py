@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,13 +24,13 @@ from simgap.gap.realign import moved, realigned
 from simgap.gap.redrawn_noise import noise_gained, redrawn
 from simgap.gap.scatter import Scatter, scatters
 from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
+from simgap.progress import Progress, silent
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
 ROUNDS = 2  # numerics: times at most
 ATTEMPTS = 3  # numerics: leading candidates that are taken out in turn where no trial fits its task
 HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
 WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
-Progress = Callable[[str], None]
 Identified = Mapping[tuple[str, str], float]
 
 
@@ -74,7 +74,7 @@ def search(
     actual: dict | None = None,
     excluded: Sequence[str] = (),
     forced: Sequence[str] = (),
-    tell: Progress = lambda text: None,
+    tell: Progress = silent,
     identified: Identified | None = None,
 ) -> Search:
     """Fit the catalogue, and what is `forced`, to aligned trials; InputError where none fits its task.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from simgap.attribution.search import sought
 from simgap.gap.search import Identified, Search, search
 from simgap.gap.synthetic import performed, recorded
 from simgap.gap.wrist_gap import as_from_wrist, of_wrist
+from simgap.progress import Progress, silent
 from simgap.source_digest import source_digest
 from simgap.world.operator import OperatorSettings, Plan
 from simgap.world.properties import Block
@@ -41,14 +42,13 @@ MOST = 8  # numerics: twins at most
 BATCH = 4  # numerics: twins that are simulated at once
 LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
 QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
-Progress = Callable[[str], None]
 
 
 def twin_statistics(
     found: Search,
     actual: dict | None,
     seed: int,
-    tell: Progress = lambda text: None,
+    tell: Progress = silent,
 ) -> Iterator[float]:
     """Statistics of healthy twins of a search, one by one, from the cache where they are known.
 

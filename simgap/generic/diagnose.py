@@ -28,6 +28,7 @@ from simgap.generic.locate import Located, locate
 from simgap.generic.report import effect_entry, listed_cells
 from simgap.generic.ringing import Ring, fit_ring, from_swing, screen
 from simgap.generic.shrinkage import fraction, heldout, shrinkage, sizes
+from simgap.progress import Progress, silent
 
 GAIN = 5.0  # chosen: nats that a further effect must add
 WORTH = 0.98  # chosen: it must leave no more than this share of the excess square
@@ -36,7 +37,6 @@ PRIOR = -4.0  # prior: log prior of a candidate against none
 RINGS = 0.2  # chosen: share of the square after an event that an oscillation must explain
 LISTED = 8  # look: explanations that are described
 SHORTEST = 16  # numerics: samples of a window in which an oscillation is looked for
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def diagnose(
     place of the HMM; `forced` names effects to be taken instead of choosing. InputError where a kind has no
     trial that shows the whole task.
     """
-    tell = progress or (lambda text: None)
+    tell = progress or silent
     _check(forced)
     tell("aligning trials")
     return diagnosed(align(real, sim, task, model, boundaries), forced, seed, tell)
@@ -87,7 +87,7 @@ def diagnose_blocks(
     progress: Progress | None = None,
 ) -> GenericDiagnosis:
     """The same of a block task, its channels the task-space ones."""
-    tell = progress or (lambda text: None)
+    tell = progress or silent
     _check(forced)
     tell("aligning trials")
     return diagnosed(block_ensembles(real, sim, task, rig), forced, seed, tell)

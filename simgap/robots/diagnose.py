@@ -6,7 +6,7 @@ gap that healthy twins show too, verdict, how far, next experiment; `describe` m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from hmmseg.errors import InputError, nearest
 from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import Forms, fitted, forms
+from simgap.progress import Progress, silent
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.robots.borne_out import folds_of
@@ -40,8 +41,6 @@ from simgap.simulators.recording import Recording
 
 REFITS = 3  # numerics: linearisations on the way to the least squares, discrepancies learned anew at each
 STAGES = 14  # look: what a progress bar counts at most
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,8 @@ def diagnose(
     forced: Sequence[str] = (),
     seed: int = 0,
     phases: Phases | None = None,
-    tell: Tell = lambda text: None,
-    warn: Tell = lambda text: None,
+    tell: Progress = silent,
+    warn: Progress = silent,
     more: Sequence[RobotEffect] = (),
     length: float | None = None,
     kept: Kept = NOWHERE,
@@ -105,8 +104,8 @@ def _diagnosed(
     forced: Sequence[str],
     seed: int,
     phases: Phases | None,
-    tell: Tell,
-    warn: Tell,
+    tell: Progress,
+    warn: Progress,
     kept: Kept,
 ) -> RobotDiagnosis:
     """The diagnosis of a part of the windows; `whole` has all, and in all of them what is left is told."""
@@ -158,7 +157,7 @@ def _diagnosed(
     )
 
 
-def _told_by_logs(composed: Composed, said: Tell, kept: Kept) -> tuple[Composed, Linear, Identifiability]:
+def _told_by_logs(composed: Composed, said: Progress, kept: Kept) -> tuple[Composed, Linear, Identifiability]:
     """The gap as the simulator comes with all sensitivities, what the logs can tell by them, and the same
     windows with what contacts make of them; what is left out, and what no such log tells apart, is said."""
     along = fitted_along(composed)

@@ -6,12 +6,13 @@ rolled out at their own best fit, so that what kinks at its neutral value is see
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.progress import Progress
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
@@ -24,8 +25,6 @@ from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with
 SETTLED = 2.0  # numerics: nats that a further round must gain
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def search(
     composed: Composed,
     phases: Phases,
     candidates: Sequence[str],
-    tell: Tell,
+    tell: Progress,
     forced: Sequence[str] = (),
     factor: np.ndarray | None = None,
     kept: Kept = NOWHERE,
@@ -101,7 +100,7 @@ class _Ask:
         return covariances(self.composed, linear, self.factor)
 
 
-def _searched(ask: _Ask, step: Step, tell: Tell, kept: Kept) -> Found:
+def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> Found:
     """Rounds until the best set stays. A round that was kept is made again only if it is the last."""
     found: Found | None = None
 

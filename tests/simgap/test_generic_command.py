@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from experiments.generic_ensembles import ensemble
-from hmmseg_cli.diagnose import spread_against
+from hmmseg_cli.diagnose import with_options_repeated
 from hmmseg_cli.main import main
 
 
@@ -34,11 +34,11 @@ def arguments(folder, *more, count=5):
 
 def test_values_of_against_reach_up_to_the_next_option():
     given = ["diagnose", "a", "--against", "b", "c", "--task", "d", "e"]
-    assert spread_against(given) == [
+    assert with_options_repeated(given) == [
         "diagnose", "a", "--against", "b", "--against", "c", "--task", "d", "e",
     ]  # fmt: skip
     again = ["diagnose", "--against", "b", "--against", "c"]
-    assert spread_against(again) == again
+    assert with_options_repeated(again) == again
 
 
 def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):
