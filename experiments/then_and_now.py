@@ -79,7 +79,7 @@ def table() -> str | None:
         ["at three times the pace; contacts that ring by 1 N", "75; 61 %",
          f"{percent(cover['pace 3'], 0)}; {percent(cover['ringing 1 N'], 0)}"],
         ["with an effect that identify is not told of", "71 %",
-         f"{percent(np.mean(untold), 0)} ({percent(min(untold), 0)} to {percent(max(untold), 0)})"],
+         f"{percent(float(np.mean(untold)), 0)} ({percent(min(untold), 0)} to {percent(max(untold), 0)})"],
         ["robot arm: weights (now with untold gain and bias among them)", "0.2 % rms, 8 of 8 inside 95 %",
          _of(arm, "weight")],
         ["robot arm: widths, pads as known (likewise)", "2 of 8 inside 95 %", _of(pads, "width")],

@@ -55,8 +55,8 @@ def summary(pairs: Pairs, rate: float) -> dict:
     fitting = [(s, truth) for s, truth in pairs if s.complete]
     out: dict = {"trials": len(pairs), "misfits": [str(s.failed) for s, _ in pairs if not s.complete]}
     if fitting:
-        off = np.abs(np.concatenate([boundary_residuals(s, truth) for s, truth in fitting]))
-        held = np.concatenate([boundaries_covered(s, truth) for s, truth in fitting])
+        off = np.abs(np.concatenate([boundary_residuals(s, truth.tolist()) for s, truth in fitting]))
+        held = np.concatenate([boundaries_covered(s, truth.tolist()) for s, truth in fitting])
         out |= {
             "boundaries": int(off.size), "median": 1e3 * float(np.median(off)),
             "percentile_95": 1e3 * float(np.percentile(off, 95)), "farthest": 1e3 * float(off.max()),
