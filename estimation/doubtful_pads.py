@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import priors
+from estimation.channel_noise import Noise
 from estimation.design import Design, build
 from estimation.nuisance import PadDoubt
-from estimation.observations import Noise, WeighedTrial
+from estimation.observations import WeighedTrial
 from estimation.posterior import Posterior, posterior
 from estimation.sampler import Draws, sample
 from estimation.unknowns import DISTANCE, RISE

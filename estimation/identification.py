@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from estimation.actual import Actual
+from estimation.channel_noise import Noise
 from estimation.design import Design
 from estimation.doubtful_pads import designs, sample_either
 from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.observations import Noise, WeighedTrial, aligned_weights
+from estimation.observations import WeighedTrial, aligned_weights
 from estimation.predictive import PredictiveCheck, check
 from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
 from estimation.rolling import without_roll

@@ -19,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from estimation.channel_noise import Noise, channel_sds, learned
 from estimation.compliance import Slope
 from estimation.pad_slopes import slope_of_landing, slopes_within
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
@@ -32,10 +33,7 @@ from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.features import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
-FARTHEST_LAG = 11  # numerics: samples; autocorrelations beyond are noise
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
-MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
-LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior
 APART = 0.1  # chosen: s by which one finger touches or lets go after the other, at most
 MIN_FREE = 8  # numerics: samples of free motion that tell the scale of the forces there
 
@@ -58,18 +56,6 @@ class Weights:
     free_robust: np.ndarray
     free_count: float
     slopes: dict[int, dict[str, Slope]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Variance of one effective sample and the number it was learned from.
-
-    Of each kind of mean of a grip ("force", "distance", "pickup", "place"), and of each force in
-    free motion by its name.
-    """
-
-    variance: dict[str, float]
-    count: dict[str, float]
 
 
 def draw_boundaries(trial: TrialAlignment, rng: np.random.Generator, num: int) -> np.ndarray:
@@ -209,7 +195,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
             slopes = {m: {k: v for k, v in of.items() if k != "distance"} for m, of in slopes.items()}
         weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()), slopes)
         out.append(WeighedTrial(thinned, masks, weights))
-    return out, _noise(pooled, scales)
+    return out, learned(pooled, scales, channel_sds([p[0] for p in prepared], aligned))
 
 
 def free_forces(signals: Signals, aligned: WeighedTrial) -> np.ndarray:
@@ -240,60 +226,3 @@ def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: st
     if not residuals:
         return 1.0
     return max(robust_sd(np.concatenate(residuals)), 1e-9)
-
-
-def _noise(pooled: dict[str, list], scales: dict[str, float]) -> Noise:
-    variance, count = {}, {}
-    for key, pairs in pooled.items():
-        pairs = [(r[np.isfinite(r)], w[np.isfinite(r)]) for r, w in pairs]
-        pairs = [(r, w) for r, w in pairs if r.size > 1]
-        if not pairs:
-            variance[key], count[key] = scales[key] ** 2, 1.0
-            continue
-        psi = np.concatenate([w * r for r, w in pairs])
-        z2 = np.concatenate([(r / scales[key]) ** 2 for r, _ in pairs])
-        slope = np.mean((TAIL + 1) * (TAIL - z2) / (TAIL + z2) ** 2)
-        # One location a grip was fitted: correct for the lost degrees of freedom.
-        lost = psi.size / max(psi.size - len(pairs), 1)
-        stretch = autocorrelation_time([w * r for r, w in pairs])
-        found = float(np.mean(psi**2) / slope**2 * lost * stretch)
-        variance[key] = max(found, LEAST**2)
-        count[key] = float(max(psi.size - len(pairs), 1) / stretch)
-    return Noise(variance, count)
-
-
-def autocorrelation_time(series: list[np.ndarray]) -> float:
-    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
-
-    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of
-    lags (0, 1), (2, 3), ... up to the first pair that is not positive. Below 1 where successive
-    residuals cancel, as differentiated noise does. Series about their own mean are biased by
-    -1 / length, which is put back.
-    """
-    bias = len(series) / max(sum(r.size for r in series), 1)
-    power = sum(float(r @ r) for r in series)
-    size = sum(r.size for r in series)
-
-    def rho(lag: int) -> float:
-        if lag == 0:
-            return 1.0
-        pairs = sum(max(r.size - lag, 0) for r in series)
-        if pairs < 8 or power <= 0:
-            return 0.0
-        products = sum(float(r[lag:] @ r[: r.size - lag]) for r in series if r.size > lag)
-        return products / power * size / pairs + bias
-
-    total, lags = -1.0, 1
-    for lag in range(0, FARTHEST_LAG, 2):
-        pair = rho(lag) + rho(lag + 1)
-        # A pair counts only where it stands out of its own sampling noise.
-        if lag > 0 and pair <= 2 / np.sqrt(size):
-            break
-        total += 2 * pair
-        lags = lag + 1
-    # Estimated from few samples, the excess over white noise is mostly noise itself: its variance is
-    # about 4 / size a lag, and it is shrunk by that (positive-part James and Stein 1961).
-    excess = total - 1
-    if excess != 0 and size:
-        total = 1 + excess * max(0.0, 1 - 4 * lags / size / excess**2)
-    return max(total, MIN_STRETCH)

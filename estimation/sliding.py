@@ -14,8 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimation.channel_noise import Noise
 from estimation.compliance import SLOPE_SD, UNSTATED, Slope, middle_share
-from estimation.observations import Noise, WeighedTrial, channel_values
+from estimation.observations import WeighedTrial, channel_values
 from hmmseg.io.rig import Rig
 
 SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
+from estimation.channel_noise import MIN_STRETCH, STATED, autocorrelation_time, learned
 from estimation.observations import (
-    MIN_STRETCH,
-    _noise,
-    autocorrelation_time,
     channel_values,
     draw_boundaries,
     gravity_factor,
@@ -60,12 +58,12 @@ def test_sampling_variance_of_the_mean_against_monte_carlo(noise):
         weights, residual, centre = robust_weights(v, np.ones(per_grip, bool), scale)
         centres.append(centre)
         pairs.append((residual, weights))
-    predicted = _noise({"force": pairs}, {"force": scale}).variance["force"] / per_grip
+    predicted = learned({"force": pairs}, {"force": scale}, {}).variance["force"] / per_grip
     assert predicted == pytest.approx(np.var(centres), rel=0.1)
 
 
 def test_noise_of_a_channel_without_residuals_is_its_scale():
-    noise = _noise({"force": [(np.array([np.nan]), np.array([1.0]))]}, {"force": 0.3})
+    noise = learned({"force": [(np.array([np.nan]), np.array([1.0]))]}, {"force": 0.3}, {})
     assert noise.variance["force"] == pytest.approx(0.09) and noise.count["force"] == 1.0
 
 
@@ -81,6 +79,21 @@ def test_autocorrelation_time_of_a_known_process(rho, expected):
     """(1 + rho) / (1 - rho) for an AR(1); the sum is cut where it drowns in noise."""
     series = ar1(60, 200, rho, np.random.default_rng(2))
     assert autocorrelation_time(series) == pytest.approx(expected, rel=0.12)
+
+
+def test_few_residuals_are_no_less_noisy_than_the_rig_states_but_by_chance():
+    quiet, loud = ([(size * np.array([-1.0, 1.0, 0.0]), np.ones(3))] for size in (0.01, 3.0))
+    shy = learned({"force": quiet}, {"force": 1.0}, {"force": 1.0})
+    alone = learned({"force": quiet}, {"force": 1.0}, {})
+    own = alone.count["force"]
+    expected = (STATED + own * alone.variance["force"]) / (STATED + own)
+    assert shy.variance["force"] == pytest.approx(expected) and shy.count["force"] == STATED + own
+    # What is recorded may be noisier than its sensors.
+    assert learned({"force": loud}, {"force": 3.0}, {"force": 1.0}) == learned(
+        {"force": loud}, {"force": 3.0}, {}
+    )
+    none = learned({"force": [(np.array([0.1]), np.ones(1))]}, {"force": 1.0}, {"force": 0.2})
+    assert none.variance["force"] == pytest.approx(0.04) and none.count["force"] == STATED
 
 
 def test_means_of_differentiated_noise_are_better_than_of_white_noise():
