@@ -3,12 +3,13 @@
     python -m experiments.real.robot_gap KIND FOLDER [--seconds S] [--output FILE.json] [--figures DIR]
 
 KIND is xl330 or so101, FOLDER that of the logs (see experiments/real/xl330.py, so101.py). With --seconds, the
-middle S s of every log are taken.
+middle S s of every log are taken. Logs that name a gain (kp100) are held out gain by gain.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,9 @@ def run(kind: str, folder: Path, only: Sequence[str] = (), seconds: float | None
     simulator = load_simulator(f"{HERE / spec}")
     paths = [p for p in sorted(folder.glob(pattern)) if not only or p.stem in only]
     logs = [middle(read_recording(p, simulator.channels), seconds) for p in paths]
-    return diagnose(simulator, logs, tell=print)
+    gains = [re.search(r"_kp(\d+)_", p.stem) for p in paths]
+    groups = [int(g.group(1)) for g in gains if g] if all(gains) else None
+    return diagnose(simulator, logs, tell=print, groups=groups)
 
 
 def middle(log: Recording, seconds: float | None) -> Recording:

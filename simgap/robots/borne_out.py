@@ -15,8 +15,11 @@ FOLDS = 6  # numerics: parts that are held out in turn; each fit keeps five sixt
 BORNE_OUT = 0.05  # chosen: chance of held-out gains as good without any
 
 
-def folds_of(linear: Linear, num_logs: int) -> np.ndarray:
-    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches."""
+def folds_of(linear: Linear, num_logs: int, groups: Sequence[int] | None = None) -> np.ndarray:
+    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches. With
+    `groups` (num_logs,), logs of one number are held out together."""
+    if groups is not None:
+        return np.unique(np.asarray(groups)[linear.rows.log], return_inverse=True)[1]
     if num_logs >= 3:
         return linear.rows.log % min(num_logs, FOLDS)
     stretches = max(2, FOLDS // num_logs)

@@ -31,6 +31,7 @@ from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import pruned
+from simgap.robots.scatter import over_rivals
 from simgap.robots.search import Found, point_of, search
 from simgap.robots.stand_ins import stand_ins
 from simgap.robots.twins import Twins, healthy_twins
@@ -75,10 +76,12 @@ def diagnose(
     more: Sequence[RobotEffect] = (),
     length: float | None = None,
     kept: Kept = NOWHERE,
+    groups: Sequence[int] | None = None,
 ) -> RobotDiagnosis:
     """Diagnose logs against a simulator. `forced` names effects instead of choosing; `more` are further
     candidates; `warn` is told at once what cannot be told apart; what an earlier run of the same inputs has
-    `kept` is not worked out again. InputError for input at fault."""
+    `kept` is not worked out again; logs of one number in `groups` (one a log) are held out together.
+    InputError for input at fault."""
     noise = noises(simulator, recordings)
     effects = candidates_of(Setting(simulator, recordings)) | {e.name: e for e in more}
     for name in forced:
@@ -91,11 +94,11 @@ def diagnose(
     # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.
     if not forced and (calm := whole.calm()) is not whole:
-        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn, kept.of("calm"))
+        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn, kept.of("calm"), groups)
         if found.verdict.causes:
             return found
         tell("where bodies move in contact")
-    return _diagnosed(whole, whole, forced, seed, phases, tell, warn, kept)
+    return _diagnosed(whole, whole, forced, seed, phases, tell, warn, kept, groups)
 
 
 def _diagnosed(
@@ -107,6 +110,7 @@ def _diagnosed(
     tell: Progress,
     warn: Progress,
     kept: Kept,
+    groups: Sequence[int] | None,
 ) -> RobotDiagnosis:
     """The diagnosis of a part of the windows; `whole` has all, and in all of them what is left is told."""
     parts = phases_of(composed.simulator, composed.recordings) if phases is None else phases
@@ -122,7 +126,7 @@ def _diagnosed(
     tell("healthy twins")
     twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
     found = search(composed, parts, wanted, tell, forced, twins.factor, kept.of("search"))
-    fold = folds_of(found.linear, len(composed.recordings))
+    fold = folds_of(found.linear, len(composed.recordings), groups)
     if forced:
         borne = tuple(found.names[j] for j in found.models[0].effects)
         point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
@@ -215,7 +219,8 @@ def _concluded(
     if not (verdict.causes and off) or forced:
         return verdict
     others = stand_ins(composed, phases, ended, wanted, verdict.causes, fold, twins.factor)
-    return replace(verdict.beside(one.name for one in others), stand_ins=others)
+    wider = over_rivals(ended.forms, verdict.model, [(one.forms, one.model) for one in others])
+    return replace(verdict.beside(one.name for one in others), stand_ins=others, model=wider)
 
 
 def _every(whole: Composed, point: Point, causes: Sequence[str], phases: Phases) -> Forms:

@@ -1,8 +1,11 @@
-"""How far the model is off by itself: discrepancies' sizes by maximum likelihood, multipliers by window."""
+"""How far the model is off by itself: discrepancies' sizes by maximum likelihood.
+
+One size for all windows of a regime. A size of each window's own, or heavy tails, would be found from the
+residual that it then discounts: windows that happen to be met would decide by the sensors' noise, those in
+which a cause shows would count for little, and where a search ends would hang on where it began.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 from scipy.optimize import minimize
@@ -10,11 +13,7 @@ from scipy.optimize import minimize
 from simgap.robots.tied import Solved, Tied
 from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy
 
-# prior: sd of a window's log multiplier: the model is off by e (sd) from window to window
-SPREAD = 1.0
-GRID = tuple(range(-6, 17, 2))  # numerics: log multipliers
 WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
-FREEDOM = 4.0  # prior: of Student's t: heavy tails, finite variance
 ENOUGH = 40  # learned: windows from which discrepancies are learned
 
 
@@ -46,31 +45,9 @@ def learned(cov: Covariances, residual: np.ndarray) -> Discrepancy:
         least = int(np.argmin(costs))
         if costs[least] >= WORTH:
             scale = {names[k]: float(np.exp(v / 2)) for k, v in zip(kept, done.x, strict=True)}
-            return Discrepancy(scale, _multipliers(cov, residual, scale))
+            return Discrepancy(scale)
         kept, x = kept[:least] + kept[least + 1 :], np.delete(done.x, least)
     return NONE
-
-
-def _multipliers(cov: Covariances, residual: np.ndarray, scale: Mapping[str, float]) -> dict[int, float]:
-    """Each window's multiplier, the mode on a grid.
-
-    Their spread is not learned: a multiplier is found from the residual that it then discounts, so with a
-    spread to match, windows in which a cause shows most would count least and the fit would follow those in
-    which nothing happens.
-    """
-    cost: dict[int, np.ndarray] = {}
-    variance = np.square(list(scale.values()))
-    for block in cov.blocks:
-        own = cost.setdefault(block.window, 0.5 * (np.array(GRID) / SPREAD) ** 2)
-        tied = Tied.of(block, residual[block.rows], tuple(scale))
-        for i, g in enumerate(GRID):
-            try:
-                found = tied.solved(np.exp(g) * variance)
-            except np.linalg.LinAlgError:  # so large that the noise is lost in rounding
-                own[i] = np.inf
-                continue
-            own[i] += found.half + 0.5 * found.square
-    return {number: float(np.exp(GRID[int(own.argmin())])) for number, own in cost.items()}
 
 
 def _first_guess(terms: list[Tied], k: int) -> float:
@@ -80,9 +57,8 @@ def _first_guess(terms: list[Tied], k: int) -> float:
 
 
 def _value(x: np.ndarray, terms: list[Tied], kept: list[int]) -> float:
-    """Minus log likelihood of the log variances; a window's rows together are Student's t, so that few in
-    which the model is far off do not decide."""
-    return sum(_student(term.solved(_variance(term, x, kept))) for term in terms)
+    """Minus log likelihood of the log variances."""
+    return sum(_cost_of(term.solved(_variance(term, x, kept))) for term in terms)
 
 
 def _variance(term: Tied, x: np.ndarray, kept: list[int]) -> np.ndarray:
@@ -92,8 +68,8 @@ def _variance(term: Tied, x: np.ndarray, kept: list[int]) -> np.ndarray:
     return out
 
 
-def _student(found: Solved) -> float:
-    return found.half + 0.5 * (FREEDOM + found.tied.size) * float(np.log1p(found.square / FREEDOM))
+def _cost_of(found: Solved) -> float:
+    return found.half + 0.5 * found.square
 
 
 def _cost(x: np.ndarray, terms: list[Tied], kept: list[int]) -> tuple[float, np.ndarray]:
@@ -102,8 +78,7 @@ def _cost(x: np.ndarray, terms: list[Tied], kept: list[int]) -> tuple[float, np.
     for term in terms:
         variance = _variance(term, x, kept)
         found = term.solved(variance)
-        value += _student(found)
+        value += _cost_of(found)
         trace, pull = found.slopes()
-        weight = (FREEDOM + term.size) / (FREEDOM + found.square)
-        slope += 0.5 * (variance * (trace - weight * pull))[kept]
+        slope += 0.5 * (variance * (trace - pull))[kept]
     return value, slope

@@ -136,9 +136,4 @@ def _refitted(
     part = composed.along(logs)
     linear = linearise(part, point, list(point))
     cov = covariances(part, linear)
-    numbers = {
-        i: found.discrepancy.multiplier.get(composed.windows.index(w), 1.0)
-        for i, w in enumerate(part.windows)
-    }
-    off = type(found.discrepancy)(found.discrepancy.scale, numbers)
-    return moved_to(part, linear, cov.whitener(off), point, only)
+    return moved_to(part, linear, cov.whitener(found.discrepancy), point, only)

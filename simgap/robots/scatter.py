@@ -1,12 +1,38 @@
-"""How far a set's parameters scatter between logs, which their intervals are to hold."""
+"""What intervals of a set's parameters are to hold beside the noise.
+
+How far they scatter between logs, what the solver's own numerics could make of them, and what the effects
+do that held-out logs do not tell from one of the set.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
+
+
+def over_numerics(f: Forms, causes: tuple[int, ...], numerics: Sequence[int]) -> Model:
+    """The set's model with the solver's own `numerics` averaged over: no robot has a step, so whatever
+    another one would make of the simulator is in the parameters' uncertainty."""
+    model, free = fitted(f, causes), [j for j in numerics if j not in causes]
+    if not free or not causes:
+        return model
+    every = tuple(sorted((*causes, *free)))
+    whole = fitted(f, every)
+    kept, at = list(range(f.gap.nuisance.shape[1])), f.gap.nuisance.shape[1]
+    for j in every:
+        size = f.gap.candidates[j].at.size
+        kept += range(at, at + size) if j in causes else ()
+        at += size
+    return replace(
+        model,
+        x=whole.x[kept],
+        covariance=whole.covariance[np.ix_(kept, kept)],
+        at_bound=whole.at_bound[kept],
+    )
 
 
 def scattering(f: Forms, model: Model, fold: np.ndarray) -> Model:
@@ -26,3 +52,28 @@ def scattering(f: Forms, model: Model, fold: np.ndarray) -> Model:
     usual = np.sqrt(np.maximum(np.diag(model.covariance), 0.0))
     wider = np.where(usual > 0, np.maximum(spread / np.where(usual > 0, usual, 1.0), 1.0), 1.0)
     return replace(model, covariance=model.covariance * np.outer(wider, wider))
+
+
+def of_causes(f: Forms, model: Model) -> dict[str, np.ndarray]:
+    """Each effect of a model -> its parameters (k,)."""
+    out, at = {}, f.gap.nuisance.shape[1]
+    for j in model.effects:
+        c = f.gap.candidates[j]
+        out[c.name] = c.neutral + c.scale * model.x[at : at + c.at.size]
+        at += c.at.size
+    return out
+
+
+def over_rivals(f: Forms, model: Model, rivals: Sequence[tuple[Forms, Model]]) -> Model:
+    """The set's model with what its parameters are in the sets that are not told from it, each as likely."""
+    told = [of_causes(*one) for one in rivals]
+    z = at = f.gap.nuisance.shape[1]
+    more = np.zeros(model.x.size)
+    for j in model.effects:
+        c = f.gap.candidates[j]
+        mine = slice(at, at + c.at.size)
+        at += c.at.size
+        here = c.neutral + c.scale * model.x[mine]
+        apart = [(other[c.name] - here) / c.scale for other in told if c.name in other]
+        more[mine] = np.sum(np.square(apart), 0) / (1 + len(apart)) if apart else 0.0
+    return replace(model, covariance=model.covariance + np.diag(more)) if model.x.size > z else model

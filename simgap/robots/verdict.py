@@ -17,7 +17,7 @@ from simgap.attribution.search import weights
 from simgap.attribution.shares import Shares
 from simgap.attribution.verdict import LEAST, MOST, Explanation, Verdict, acting, conclude, known
 from simgap.robots.explained import Explained
-from simgap.robots.scatter import scattering
+from simgap.robots.scatter import over_numerics, scattering
 from simgap.robots.stand_ins import StandIn
 
 
@@ -96,7 +96,7 @@ def verdict_on(
         shares=replace(parts, each=parts.each[:, [causes.index(j) for j in kept]]),
         left=dict(zip(explains.regimes, explains.left.tolist(), strict=True)) if named else {},
         shared=tuple(names[j] for j in kept),
-        model=scattering(f, fitted(f, causes), fold),
+        model=scattering(f, over_numerics(f, causes, numerics), fold),
         chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
     )
 

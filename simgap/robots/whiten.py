@@ -3,7 +3,7 @@
 With sensitivities D to the start, its variances P, and unmodelled accelerations a_c of each channel the rows
 of a window have covariance
 
-    N + D P D' + m sum over channels s_c^2 L_c A L_c',   A[u, v] = exp(-|u - v| / TAU),
+    N + D P D' + sum over channels s_c^2 L_c A L_c',   A[u, v] = exp(-|u - v| / TAU),
 
 N the sensors' noise, L_c two integrals over time for a position, one for a velocity, none for a force or
 where the simulator cannot be restarted: what is not modelled moves a joint even where the model has it
@@ -14,9 +14,8 @@ which adds s^2 times the squared rate. No impact is like another: which corner s
 is rough. In the source `contacts` every effect may be off by s of its usual sizes, anew in each window in
 which bodies move in contact, so that few impacts that a model misses decide nothing. Nor does a body come to
 lie twice alike: by s of the sources `lying` it is elsewhere in each window of rest, and all that pushes it
-there is in that. The s_c are found by maximum likelihood (type II) and are zero where that gains nothing; the
-multiplier m of each window (log-normal: the model is off in some places more than in others) by its posterior
-mode. The Cholesky factor turns rows into innovations: what each says beyond those before it in its window.
+there is in that. The s_c are found by maximum likelihood (type II) and are zero where that gains nothing. The
+Cholesky factor turns rows into innovations: what each says beyond those before it in its window.
 """
 
 from __future__ import annotations
@@ -38,16 +37,15 @@ BLOCK = 100  # numerics: samples of a channel that are whitened together, where 
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """`scale`: s by channel [unit / s^2, unit / s or unit]; `multiplier` m by window, 1 by default."""
+    """`scale`: s by channel [unit / s^2, unit / s or unit]."""
 
     scale: Mapping[str, float]
-    multiplier: Mapping[int, float]
 
     def __bool__(self) -> bool:
         return bool(self.scale)
 
 
-NONE = Discrepancy({}, {})
+NONE = Discrepancy({})
 
 
 @dataclass(frozen=True)
@@ -111,10 +109,9 @@ class Block:
     def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
         """The rows' covariance (n, n)."""
         out = np.diag(self.variance) + self.start @ self.start.T
-        multiplier = discrepancy.multiplier.get(self.window, 1.0)
         for name, s in discrepancy.scale.items():
             if name in self.sources:
-                self.sources[name].add(out, multiplier * s**2)
+                self.sources[name].add(out, s**2)
         return out
 
 

@@ -148,7 +148,7 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     composed = wobbling(composed, linearise(composed, {}, [scale.name]))
     linear = linearise(composed, {}, [scale.name])
     usual = {CONTACTS: 1.0, "z, lying": 2e-2 * 0.05}
-    whiten = covariances(composed, linear).whitener(Discrepancy(usual, {}))
+    whiten = covariances(composed, linear).whitener(Discrepancy(usual))
     slope = whiten(linear.moved[scale.name].jacobian)[:, 0]
     residual = whiten(linear.residual)
     free = ~composed.rows.touching

@@ -35,7 +35,7 @@ def test_parts_make_the_whole(states, across):
     variance = np.array([0.7, 0.2, 1.5, 0.4, 9.0])
     tied = Tied.of(one, residual, NAMES)
     assert len(tied.parts) == (1 if across else 2) and tied.square == pytest.approx(residual @ residual)
-    whole = one.covariance(Discrepancy(dict(zip(NAMES, np.sqrt(variance / 2), strict=True)), {3: 2.0}))
+    whole = one.covariance(Discrepancy(dict(zip(NAMES, np.sqrt(variance), strict=True))))
     found = tied.solved(variance)
     assert found.square == pytest.approx(residual @ np.linalg.solve(whole, residual), rel=1e-10)
     assert found.half == pytest.approx(0.5 * np.linalg.slogdet(whole)[1], rel=1e-10)
