@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows
-from simgap.robots.scatter import scattering
+from simgap.robots.borne_out import folds_of
+from simgap.robots.linear import Linear
+from simgap.robots.scatter import over_numerics, over_rivals, scattering
 from simgap.robots.verdict import _beside_numerics
 
 LOGS, N = 6, 60
@@ -53,3 +58,31 @@ def test_what_a_solver_s_step_explains_is_no_gap():
     assert _beside_numerics(f, (0,), (1,)) > 50
     assert _beside_numerics(f, (), (0,)) < 3
     assert _beside_numerics(f, (0,), (0, 1)) < 3
+
+
+def test_what_a_solver_makes_of_it_and_what_a_set_leaves_open_widen_intervals():
+    made, _ = gap(np.full(LOGS, 4.0))
+    # A solver's step that moves the rows almost as the effect does.
+    twin = replace(
+        made.candidates[1], jacobian=made.candidates[0].jacobian + 0.3 * made.candidates[1].jacobian
+    )
+    f = forms(replace(made, candidates=(made.candidates[0], twin)))
+    alone, averaged = fitted(f, (0,)), over_numerics(f, (0,), (1,))
+    assert averaged.x.size == alone.x.size and averaged.score == alone.score
+    assert averaged.covariance[0, 0] > 2 * alone.covariance[0, 0]
+    assert over_numerics(f, (0,), ()).x == pytest.approx(alone.x)
+
+    both = fitted(forms(made), (0, 1))
+    rival = (forms(made), replace(both, x=both.x + np.array([0.6, 0.0])))
+    wide = over_rivals(forms(made), both, [rival])
+    assert wide.covariance[0, 0] == pytest.approx(both.covariance[0, 0] + 0.6**2 / 2)
+    assert wide.covariance[1, 1] == both.covariance[1, 1]
+    assert over_rivals(forms(made), both, []).covariance == pytest.approx(both.covariance)
+
+
+def test_logs_of_one_group_are_held_out_together():
+    rows = SimpleNamespace(log=np.repeat(np.arange(4), 3))
+    linear = object.__new__(Linear)
+    object.__setattr__(linear, "rows", rows)  # all that folds are made of
+    fold = folds_of(linear, 4, groups=[100, 200, 100, 200])
+    assert fold.tolist() == [0] * 3 + [1] * 3 + [0] * 3 + [1] * 3
