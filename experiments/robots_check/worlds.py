@@ -91,7 +91,8 @@ def run(
     steps = round(1 / rate / model.opt.timestep)
     before = round((HELD + SETTLED) * rate) if robot.carried else 0
     rows = round(robot.seconds * rate)
-    t, log, commands = np.arange(-before, rows) / rate, np.zeros((rows, len(read))), []
+    t, log = np.arange(-before, rows) / rate, np.zeros((rows, len(read)))
+    commands = np.zeros((t.size, len(actuators)))
     shown = {j: ([], [], []) for j, _ in robot.driven.values()}
     limits = np.where(model.actuator_ctrllimited[actuators], model.actuator_ctrlrange[actuators, 1], np.inf)
     gear = model.actuator_gear[actuators, 0]
@@ -101,10 +102,13 @@ def run(
         mass = np.maximum(np.diag(inertia)[dofs], 1e-6)
         off, pace = wanted(max(i, 0) / rate) - data.qpos[places], 2 * np.pi * PACE
         pull = mass * (pace**2 * off - 2 * pace * data.qvel[dofs]) + model.dof_damping[dofs] * pace * off
-        commands.append(np.clip((pull + data.qfrc_bias[dofs]) / gear, -limits, limits))
-        past = np.array(commands)
+        now = before + i
+        commands[now] = np.clip((pull + data.qfrc_bias[dofs]) / gear, -limits, limits)
+        past = commands[now : now + 1]
+        if world.command:
+            past = commands[: now + 1].copy()
         for act in world.command:
-            past = act(t[: len(past)], past)
+            past = act(t[: now + 1], past)
         data.ctrl[actuators] = past[-1]
         for _ in range(steps):
             if i < -round(SETTLED * rate):
@@ -118,7 +122,7 @@ def run(
                 shown[joint][0].append(past[-1][k] * gear[k])
                 shown[joint][1].append(data.qvel[d])
                 shown[joint][2].append(data.qacc[d])
-    t, given = t[before:], np.array(commands)[before:]
+    t, given = t[before:], commands[before:]
     out: dict[str, Any] = {"t": t}
     out |= {f"u_{a}": given[:, k] for k, a in enumerate(robot.driven)}
     out |= {f"u_{a}": np.full(rows, command) for a, command in robot.grip.items()}
