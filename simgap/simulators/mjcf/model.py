@@ -13,14 +13,17 @@ import numpy as np
 from hmmseg.robust import bridged
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.latest import latest
 from simgap.simulators.mjcf.map import Map
 from simgap.simulators.mjcf.setting import Setting
-from simgap.simulators.mjcf.signals import Held, aligned, body_rate, cubic
-from simgap.simulators.mjcf.touching import contact_labels
-from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values, finite
+from simgap.simulators.mjcf.signals import Held, Side, aligned, body_rate
+from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
+from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
 APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+FAR = 1e9  # numerics: what reads beyond it has diverged
 BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
 
 
@@ -48,11 +51,15 @@ class MjcfSimulator:
     restarts: bool = True
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
     _runs: dict[str, np.ndarray] = field(default_factory=dict)
+    _sides: dict = field(default_factory=dict, repr=False)
+    _touched: dict = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         self._spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         self._size = mujoco.mj_stateSize(self.model, self._spec)
+        places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
+        self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
         self._nominal = {n: s.get(self.model) for n, s in self.settings.items()}
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
@@ -98,55 +105,83 @@ class MjcfSimulator:
         h = float(self.model.opt.timestep)
         spans = [float(j.recording.t[-1] - j.recording.t[0]) for j in jobs]
         steps = int(np.ceil(max(spans) / h - 1e-9)) + 2
-        first = np.array([self._state(j) for j in jobs])
-        width = self.model.nu + (self.model.nv if any(self._applied(j.recording) for j in jobs) else 0)
-        control = np.zeros((len(jobs), steps, max(width, 1)))
         times = np.arange(steps) * h
+        alike: dict[tuple, list[int]] = defaultdict(list)
         for i, job in enumerate(jobs):
-            log = job.recording
-            held = Held(log.t - log.t[0], times)
-            for column, actuator in self.driven.items():
-                control[i, :, actuator] = held(log[column])
-            for column in self._applied(log):
+            alike[len(job.recording), *self._applied(job.recording)].append(i)
+        logs = [[jobs[i].recording for i in mine] for mine in alike.values()]
+        sides = [self._side(own, times) for own in logs]
+        width = self.model.nu + (self.model.nv if any(len(key) > 1 for key in alike) else 0)
+        control = np.zeros((len(jobs), steps, max(width, 1)))
+        for (key, mine), own, side in zip(alike.items(), logs, sides, strict=True):
+            places = dict(self.driven)
+            for column in key[1:]:
                 dof = int(self.model.jnt_dofadr[_joint(self.model, column.removeprefix(APPLIED))])
-                control[i, :, self.model.nu + dof] = held(log[column])
+                places[column] = self.model.nu + dof
+            for column, place in places.items():
+                control[mine, :, place] = side.held(np.array([log[column] for log in own]))
         spec = int(mujoco.mjtState.mjSTATE_CTRL)
         if width > self.model.nu:
             spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
         if width == 0:
             control, spec = None, int(mujoco.mjtState.mjSTATE_CTRL)
         _, sensed = rollout.rollout(
-            self.model, self._data, first, control, control_spec=spec, nstep=steps, persistent_pool=True
-        )
-        return [self._read(job.recording, sensed[i], times) for i, job in enumerate(jobs)]
+            self.model, self._data, self._states(jobs), control,
+            control_spec=spec, nstep=steps, persistent_pool=True,
+        )  # fmt: skip
+        out: list[Channels | None] = [None] * len(jobs)
+        for mine, own, side in zip(alike.values(), logs, sides, strict=True):
+            for i, channels in zip(mine, self._read(own, sensed[mine], side, times), strict=True):
+                out[i] = channels
+        return out
+
+    def _side(self, logs: Sequence[Recording], times: np.ndarray) -> Side:
+        """How windows of one length lie on the steps: the same windows are run hundreds of times."""
+        since = np.array([log.t - log.t[0] for log in logs])
+        key = (since.shape, since.tobytes(), times.size, float(times[1]))
+        return latest(self._sides, key, lambda: Side.of(since, times))
 
     def _applied(self, log: Recording) -> list[str]:
         return [n for n in log.columns if n.startswith(APPLIED)]
 
-    def _read(self, log: Recording, sensed: np.ndarray, times: np.ndarray) -> Channels | None:
-        """Sensors at the log's times: on the grid as they are, between by cubics (positions, velocities)."""
-        since = log.t - log.t[0]
+    def _read(
+        self, logs: Sequence[Recording], sensed: np.ndarray, side: Side, times: np.ndarray
+    ) -> list[Channels | None]:
+        """Sensors (B, steps, sensors) at the logs' times: between steps by cubics where they are smooth."""
         smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
-        between = cubic(since, times, sensed[:, [self.sensor[n] for n in smooth]]) if smooth else sensed
-        out = {n: between[:, k] for k, n in enumerate(smooth)}
-        out |= {n: np.interp(since, times, sensed[:, a]) for n, a in self.sensor.items() if n not in out}
-        for columns in self.free.values():
-            aligned(log, out, columns)
-        return finite(out) if all(np.abs(v).max() < 1e9 for v in out.values()) else None
+        between = side.between(sensed[:, :, [self.sensor[n] for n in smooth]])
+        whole: list[Channels | None] = []
+        for b, log in enumerate(logs):
+            out = {n: between[b, :, k] for k, n in enumerate(smooth)}
+            since = side.held.since[b]
+            out |= {
+                n: np.interp(since, times, sensed[b, :, a]) for n, a in self.sensor.items() if n not in out
+            }
+            for columns in self.free.values():
+                aligned(log, out, columns)
+            whole.append(out if all(np.abs(v).max() < FAR for v in out.values()) else None)
+        return whole
 
-    def _state(self, job: Job) -> np.ndarray:
-        """Full physics state at the window's start."""
-        state = np.array(self._own_state(job.recording, job.start is None))
+    def _states(self, jobs: Sequence[Job]) -> np.ndarray:
+        """Full physics states (jobs, size) at the windows' starts."""
+        bare = None if self._partial else self._reset()
+        return np.array([self._state(job, bare) for job in jobs])
+
+    def _state(self, job: Job, bare: np.ndarray | None = None) -> np.ndarray:
+        """Full physics state at the window's start; `bare`: what it is where columns do not tell it."""
+        if job.start is None or bare is None:
+            state = np.array(self._own_state(job.recording, job.start is None))
+        else:
+            state = bare.copy()
         if job.start is None:
             return state
         nq = self.model.nq
-        for column, joint in self.joints.items():
-            state[1 + self.model.jnt_qposadr[joint]] = job.start[column]
-            state[1 + nq + self.model.jnt_dofadr[joint]] = job.start[column + RATE]
+        for column, (q, v) in self._places.items():
+            state[1 + q] = job.start[column]
+            state[1 + nq + v] = job.start[column + RATE]
         for joint, columns in self.free.items():
             q, v = 1 + int(self.model.jnt_qposadr[joint]), 1 + nq + int(self.model.jnt_dofadr[joint])
-            place = [columns[a] for a in ("x", "y", "z")]
-            turn = [columns[a] for a in ("qw", "qx", "qy", "qz")]
+            place, turn = [columns[a] for a in POSE[:3]], [columns[a] for a in POSE[3:]]
             state[q : q + 3] = [job.start[n] for n in place]
             state[v : v + 3] = [job.start[n + RATE] for n in place]
             quat = np.array([job.start[n] for n in turn])
@@ -161,17 +196,19 @@ class MjcfSimulator:
         """What the model itself starts from; for a window, where its run of the whole log is by then."""
         if not whole and self._partial and log.name in self._runs:
             return self._runs[log.name][log.first]
-        data = self._data[0]
+        state = self._reset()
+        for column, (q, _) in self._places.items():
+            seen = log[column][np.isfinite(log[column])]
+            state[1 + q] = seen[0] if seen.size else 0.0
+        return state
+
+    def _reset(self) -> np.ndarray:
+        """The model's own state, or its keyframe's."""
+        data, state = self._data[0], np.empty(self._size)
         if self.map.keyframe is None:
             mujoco.mj_resetData(self.model, data)
         else:
             mujoco.mj_resetDataKeyframe(self.model, data, _key(self.model, self.map.keyframe))
-        for column, actuator in self.driven.items():
-            data.ctrl[actuator] = log[column][0]
-        for column, joint in self.joints.items():
-            seen = log[column][np.isfinite(log[column])]
-            data.qpos[self.model.jnt_qposadr[joint]] = seen[0] if seen.size else 0.0
-        state = np.empty(self._size)
         mujoco.mj_getState(self.model, data, state, int(self._spec))
         state[0] = 0.0
         return state
@@ -233,24 +270,19 @@ class MjcfSimulator:
 
     def touched(self, recording: Recording) -> list[frozenset[tuple[int, int]]]:
         """Pairs of geoms that touch along the recorded motion, at the samples looked at."""
-        data = self._data[0]
-        states = (*self.joints, *(n for m in self.free.values() for n in m.values()))
-        columns = {c: bridged(recording[c]) for c in states}
-        mujoco.mj_setState(self.model, data, self._own_state(recording, True), int(self._spec))
-        out = []
-        for i in self._shown(recording):
-            for column, joint in self.joints.items():
-                data.qpos[self.model.jnt_qposadr[joint]] = columns[column][i]
-            for joint, pose in self.free.items():
-                at = int(self.model.jnt_qposadr[joint])
-                data.qpos[at : at + 7] = [
-                    columns[pose[a]][i] for a in ("x", "y", "z", "qw", "qx", "qy", "qz")
-                ]
-            mujoco.mj_kinematics(self.model, data)
-            mujoco.mj_comPos(self.model, data)
-            mujoco.mj_collision(self.model, data)
-            out.append(frozenset((int(c.geom1), int(c.geom2)) for c in data.contact[: data.ncon]))
-        return out
+        states = (*self.joints, *(m[a] for m in self.free.values() for a in POSE))
+        at = [q for q, _ in self._places.values()]
+        for joint in self.free:
+            at += range(int(self.model.jnt_qposadr[joint]), int(self.model.jnt_qposadr[joint]) + len(POSE))
+        rows = self._shown(recording)
+        poses = np.array([bridged(recording[c])[rows] for c in states]).reshape(-1, rows.size).T
+
+        def made() -> list[frozenset[tuple[int, int]]]:
+            data = self._data[0]
+            mujoco.mj_setState(self.model, data, self._reset(), int(self._spec))
+            return touching_pairs(self.model, data, poses, at)
+
+        return latest(self._touched, (poses.shape, poses.tobytes()), made)
 
 
 def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,41 +11,68 @@ from simgap.simulators.recording import Recording
 
 
 class Held:
-    """Commands held from sample to sample, as each step of the simulator has them on average."""
+    """Commands held from sample to sample, as each step of the simulator has them on average; of one window
+    (n,) or of many with as many samples each (B, n)."""
 
     def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
-        self.since = since
+        self.since, self.times = since, times
         self.edges = np.append(times, 2 * times[-1] - times[-2])
         self.width = np.diff(self.edges)
         self.at = self._at(since)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Means (steps,) of a column (num_timesteps,); missing samples hold the one before."""
+        """Means (..., steps) of a column (..., n); missing samples hold the one before."""
         seen = np.isfinite(values)
         if seen.all():
             t, u, k = self.since, values, self.at
+        elif values.ndim > 1:
+            return np.stack([Held(t, self.times)(v) for t, v in zip(self.since, values, strict=True)])
         else:
             t, u = self.since[seen], values[seen]
             k = self._at(t)
-        area = np.concatenate([[0.0], np.cumsum(u[:-1] * np.diff(t))])
-        return np.diff(area[k] + u[k] * (self.edges - t[k])) / self.width
+        done = np.cumsum(u[..., :-1] * np.diff(t), -1)
+        area = np.concatenate([np.zeros((*done.shape[:-1], 1)), done], -1)
+        here, held, begun = (np.take_along_axis(v, k, -1) for v in (area, u, t))
+        return np.diff(here + held * (self.edges - begun)) / self.width
 
     def _at(self, t: np.ndarray) -> np.ndarray:
         """The sample that is held at each edge."""
+        if t.ndim > 1:
+            return np.stack([self._at(one) for one in t])
         return np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
 
 
-def cubic(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (n, ...) between points of an even grid, (T, ...), by cubics through neighbours (Catmull & Rom
-    1974)."""
-    h = times[1] - times[0]
-    place = np.clip(at / h, 0, times.size - 1)
-    i = np.minimum(place.astype(int), times.size - 2)
-    s = (place - i).reshape(-1, *([1] * (values.ndim - 1)))
-    p0, p1, p2, p3 = (values[np.clip(i + k, 0, times.size - 1)] for k in (-1, 0, 1, 2))
-    inner = ((i > 0) & (i < times.size - 2)).reshape(s.shape)
-    bend = 0.5 * (s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0))
-    return np.where(inner, p1 + bend, p1 + s * (p2 - p1))
+class Between:
+    """Between points of an even grid of `times` (T,), `at` (B, n) in B windows, by cubics through neighbours
+    (Catmull & Rom 1974)."""
+
+    def __init__(self, at: np.ndarray, times: np.ndarray) -> None:
+        place = np.clip(at / (times[1] - times[0]), 0, times.size - 1)
+        i = np.minimum(place.astype(int), times.size - 2)
+        self.s = (place - i)[..., None]
+        self.inner = ((i > 0) & (i < times.size - 2))[..., None]
+        first = times.size * np.arange(len(at))[:, None]
+        self.rows = [np.clip(i + k, 0, times.size - 1) + first for k in (-1, 0, 1, 2)]
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, n, k) of those on the grid (B, T, k)."""
+        flat, s = values.reshape(-1, values.shape[-1]), self.s
+        p0, p1, p2, p3 = (flat[rows] for rows in self.rows)
+        bend = s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0)
+        return np.where(self.inner, p1 + 0.5 * bend, p1 + s * (p2 - p1))
+
+
+@dataclass(frozen=True)
+class Side:
+    """Windows of as many samples, side by side: how their commands are held and their sensors read."""
+
+    held: Held
+    between: Between
+
+    @classmethod
+    def of(cls, since: np.ndarray, times: np.ndarray) -> Side:
+        """Of windows whose samples are at `since` (B, n) [s] of their begin."""
+        return cls(Held(since, times), Between(since, times))
 
 
 def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:

@@ -56,3 +56,18 @@ def _name(model: Any, geom: int) -> str:
     body = int(model.geom_bodyid[geom])
     kind, number = (mujoco.mjtObj.mjOBJ_BODY, body) if body else (mujoco.mjtObj.mjOBJ_GEOM, geom)
     return mujoco.mj_id2name(model, kind, number) or (f"body {body}" if body else GROUND)
+
+
+def touching_pairs(
+    model: Any, data: Any, poses: np.ndarray, at: Sequence[int]
+) -> list[frozenset[tuple[int, int]]]:
+    """Pairs of geoms that touch in each pose (n, k), whose coordinates are `at` these of the model's."""
+    out, none = [], frozenset()
+    for pose in poses:
+        data.qpos[at] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        found = data.contact[: data.ncon] if data.ncon else ()
+        out.append(frozenset((int(c.geom1), int(c.geom2)) for c in found) or none)
+    return out
