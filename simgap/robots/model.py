@@ -153,17 +153,20 @@ class Composed:
         undone = self.unread(point)
         if undone is None:
             return [w.start for w in self.windows]
-        return [
-            None
-            if w.start is None
-            else {
-                n: v
-                for n, (v, _) in start_of(
-                    self.simulator, undone[w.log], w.begin, self.noise, w.forward
-                ).items()
-            }
-            for w in self.windows
+        # A start is read column by column, and what is not undone is read as it was.
+        changed = [
+            {n for n, v in new.columns.items() if v is not old.columns.get(n)}
+            for old, new in zip(self.recordings, undone, strict=True)
         ]
+        out: list[Mapping[str, float] | None] = []
+        for w in self.windows:
+            if w.start is None:
+                out.append(None)
+                continue
+            mine = undone[w.log], w.begin, self.noise, w.forward, changed[w.log]
+            read = start_of(self.simulator, *mine)
+            out.append({n: read[n][0] if n in read else v for n, v in w.start.items()})
+        return out
 
     def unread(self, point: Point) -> list[Recording] | None:
         """The recordings with read-outs' effects undone, None where none acts."""

@@ -7,7 +7,7 @@ the samples around it; its error is no part of the gap but of the noise (`simgap
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,16 +164,19 @@ def _edges(log: Recording, contacts: Sequence[float], length: float) -> list[int
 
 
 def start_of(
-    simulator: Simulator, log: Recording, row: int, noise: Mapping[str, float], forward: bool
-) -> dict[str, tuple[float, float]]:
-    """State name -> (value, standard deviation) at a row of a log; see `smoothed` for `forward`."""
+    simulator: Simulator, log: Recording, row: int, noise: Mapping[str, float], forward: bool,
+    only: Collection[str] | None = None,
+) -> dict[str, tuple[float, float]]:  # fmt: skip
+    """State name -> (value, standard deviation) at a row of a log; see `smoothed` for `forward`. `only`: of
+    which columns the states are asked, where each is read from its own."""
     own = getattr(simulator, "state_at", None)
     if own is not None:
         return {n: (float(v), float(s)) for n, (v, s) in own(log, float(log.t[row])).items()}
     out: dict[str, tuple[float, float]] = {}
     states = getattr(simulator, "states", None)
     for name, channel in simulator.channels.items():
-        if channel.kind == "position" and (states is None or name in states):
+        asked = (states is None or name in states) and (only is None or name in only)
+        if channel.kind == "position" and asked:
             (value, sd), (rate, rate_sd) = smoothed(log.t, log[name], row, noise[name], forward)
             out[name], out[name + RATE] = (value, sd), (rate, rate_sd)
     return out
@@ -188,7 +191,9 @@ def smoothed(
 
     `forward` takes later samples alone: a contact changes rates. What the polynomial misses counts as noise.
     """
-    near = np.flatnonzero(np.isfinite(values) & (np.abs(t - t[row]) <= REACH))
+    first, end = np.searchsorted(t, (t[row] - 2 * REACH, t[row] + 2 * REACH))  # of a long log, a look at few
+    there = np.isfinite(values[first:end]) & (np.abs(t[first:end] - t[row]) <= REACH)
+    near = first + np.flatnonzero(there)
     if near.size < NEIGHBOURS or forward:
         seen = np.flatnonzero(np.isfinite(values))
         seen = seen[seen >= row] if forward and (seen >= row).sum() >= NEIGHBOURS else seen
