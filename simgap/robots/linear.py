@@ -119,8 +119,11 @@ def linearise(composed: Composed, point: Point, effects: Sequence[str]) -> Linea
         composed.wobble,
     )
     moved, diverged = {}, []
+    # The solver's own numbers first: a simulator may have their runs still at hand.
+    first = sorted(effects, key=lambda n: not composed.numeric(n))
+    found_by = {name: vary(composed, base, starts, name) for name in first}
     for name in effects:
-        one = vary(composed, base, starts, name)
+        one = found_by[name]
         if one is None:
             diverged.append(name)
         else:

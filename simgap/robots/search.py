@@ -229,7 +229,7 @@ def leaders(
     first = sorted(gains, key=lambda n: -gains[n])[: max(LEADERS - len(held), 4)]
     base = numeric_at(composed, base_at(composed, linear.point))
     more = {}
-    for name in first:
+    for name in sorted(first, key=lambda n: not composed.numeric(n)):
         if all(
             abs(at[name][n] - p.nominal) < 1e-3 * p.sd for n, p in composed.effects[name].parameters.items()
         ):

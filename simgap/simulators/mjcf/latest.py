@@ -9,11 +9,11 @@ T = TypeVar("T")
 MOST = 8  # numerics: that are kept
 
 
-def latest(store: dict[Hashable, Any], key: Hashable, make: Callable[[], T]) -> T:
+def latest(store: dict[Hashable, Any], key: Hashable, make: Callable[[], T], most: int = MOST) -> T:
     """What `store` has by this key, or made now and kept there in the place of what was asked for longest
-    ago."""
+    ago, where that makes more than so many."""
     found = store.pop(key) if key in store else make()
     store[key] = found
-    if len(store) > MOST:
+    while len(store) > most:
         del store[next(iter(store))]
     return found

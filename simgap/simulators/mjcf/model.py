@@ -15,16 +15,14 @@ from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.latest import latest
 from simgap.simulators.mjcf.map import Map
+from simgap.simulators.mjcf.runs import Runs
 from simgap.simulators.mjcf.setting import Setting
-from simgap.simulators.mjcf.signals import Held, Side, aligned, body_rate
+from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
-APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-FAR = 1e9  # numerics: what reads beyond it has diverged
-BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
 
 
 @dataclass
@@ -51,13 +49,13 @@ class MjcfSimulator:
     restarts: bool = True
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
     _runs: dict[str, np.ndarray] = field(default_factory=dict)
-    _sides: dict = field(default_factory=dict, repr=False)
     _touched: dict = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         self._spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         self._size = mujoco.mj_stateSize(self.model, self._spec)
+        self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
         self._nominal = {n: s.get(self.model) for n, s in self.settings.items()}
@@ -89,78 +87,8 @@ class MjcfSimulator:
 
     def _all(self, jobs: Sequence[Job], changed: tuple[tuple[str, float], ...]) -> list[Channels | None]:
         """Every job's channels with some settings changed."""
-        out: list[Channels | None] = []
         with Changed(self.model, self.settings, changed):
-            for part in self._batches(jobs, list(range(len(jobs)))):
-                out += self._roll([jobs[i] for i in part])
-        return out
-
-    def _batches(self, jobs: Sequence[Job], mine: list[int]) -> list[list[int]]:
-        longest = max(float(jobs[i].recording.t[-1] - jobs[i].recording.t[0]) for i in mine)
-        each = (longest / self.model.opt.timestep + 2) * (self._size + self.model.nsensordata + self.model.nv)
-        size = max(1, int(BATCH / each))
-        return [mine[a : a + size] for a in range(0, len(mine), size)]
-
-    def _roll(self, jobs: Sequence[Job]) -> list[Channels | None]:
-        h = float(self.model.opt.timestep)
-        spans = [float(j.recording.t[-1] - j.recording.t[0]) for j in jobs]
-        steps = int(np.ceil(max(spans) / h - 1e-9)) + 2
-        times = np.arange(steps) * h
-        alike: dict[tuple, list[int]] = defaultdict(list)
-        for i, job in enumerate(jobs):
-            alike[len(job.recording), *self._applied(job.recording)].append(i)
-        logs = [[jobs[i].recording for i in mine] for mine in alike.values()]
-        sides = [self._side(own, times) for own in logs]
-        width = self.model.nu + (self.model.nv if any(len(key) > 1 for key in alike) else 0)
-        control = np.zeros((len(jobs), steps, max(width, 1)))
-        for (key, mine), own, side in zip(alike.items(), logs, sides, strict=True):
-            places = dict(self.driven)
-            for column in key[1:]:
-                dof = int(self.model.jnt_dofadr[_joint(self.model, column.removeprefix(APPLIED))])
-                places[column] = self.model.nu + dof
-            for column, place in places.items():
-                control[mine, :, place] = side.held(np.array([log[column] for log in own]))
-        spec = int(mujoco.mjtState.mjSTATE_CTRL)
-        if width > self.model.nu:
-            spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
-        if width == 0:
-            control, spec = None, int(mujoco.mjtState.mjSTATE_CTRL)
-        _, sensed = rollout.rollout(
-            self.model, self._data, self._states(jobs), control,
-            control_spec=spec, nstep=steps, persistent_pool=True,
-        )  # fmt: skip
-        out: list[Channels | None] = [None] * len(jobs)
-        for mine, own, side in zip(alike.values(), logs, sides, strict=True):
-            for i, channels in zip(mine, self._read(own, sensed[mine], side, times), strict=True):
-                out[i] = channels
-        return out
-
-    def _side(self, logs: Sequence[Recording], times: np.ndarray) -> Side:
-        """How windows of one length lie on the steps: the same windows are run hundreds of times."""
-        since = np.array([log.t - log.t[0] for log in logs])
-        key = (since.shape, since.tobytes(), times.size, float(times[1]))
-        return latest(self._sides, key, lambda: Side.of(since, times))
-
-    def _applied(self, log: Recording) -> list[str]:
-        return [n for n in log.columns if n.startswith(APPLIED)]
-
-    def _read(
-        self, logs: Sequence[Recording], sensed: np.ndarray, side: Side, times: np.ndarray
-    ) -> list[Channels | None]:
-        """Sensors (B, steps, sensors) at the logs' times: between steps by cubics where they are smooth."""
-        smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
-        between = side.between(sensed[:, :, [self.sensor[n] for n in smooth]])
-        whole: list[Channels | None] = []
-        for b, log in enumerate(logs):
-            out = {n: between[b, :, k] for k, n in enumerate(smooth)}
-            since = side.held.since[b]
-            out |= {
-                n: np.interp(since, times, sensed[b, :, a]) for n, a in self.sensor.items() if n not in out
-            }
-            for columns in self.free.values():
-                aligned(log, out, columns)
-            whole.append(out if all(np.abs(v).max() < FAR for v in out.values()) else None)
-        return whole
+            return self._runs_of([j.recording for j in jobs], self._states(jobs), changed)
 
     def _states(self, jobs: Sequence[Job]) -> np.ndarray:
         """Full physics states (jobs, size) at the windows' starts."""
@@ -287,10 +215,6 @@ class MjcfSimulator:
 
 def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | None:
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
-
-
-def _joint(model: Any, name: str) -> int:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
 
 
 def _key(model: Any, name: str) -> int:

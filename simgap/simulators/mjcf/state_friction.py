@@ -8,8 +8,9 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
-from simgap.simulators.mjcf.model import APPLIED, MjcfSimulator
+from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion
+from simgap.simulators.mjcf.runs import APPLIED
 from simgap.simulators.mjcf.setting import name_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording

@@ -1,0 +1,120 @@
+"""Many windows run by MuJoCo at once: commands along them in, channels out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.latest import latest
+from simgap.simulators.mjcf.signals import Side, aligned
+from simgap.simulators.protocol import Channel, Channels
+from simgap.simulators.recording import Recording
+
+APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
+BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
+KEPT = 1e8  # limit: bytes of the latest runs that are kept
+FAR = 1e9  # numerics: what reads beyond it has diverged
+
+
+@dataclass
+class Runs:
+    """Runs of the `model` in threads, one for each of `data`; the rest as in `MjcfSimulator`.
+
+    The same windows are run hundreds of times: how they lie on the steps is kept. So are the latest runs, for
+    many are asked for again: a finite difference in one number of the solver has all others' runs in it.
+    """
+
+    model: Any
+    data: Sequence[Any]
+    channels: Mapping[str, Channel]
+    sensor: Mapping[str, int]
+    driven: Mapping[str, int]
+    free: Mapping[int, Mapping[str, str]]
+    _sides: dict = field(default_factory=dict, repr=False)
+    _ran: dict = field(default_factory=dict, repr=False)
+
+    def __call__(
+        self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[tuple[str, float], ...]
+    ) -> list[Channels | None]:
+        """Channels along logs from states (B, size), None where one diverged. `changed`: the settings in
+        which the model is now another one than as it came."""
+        longest = max(float(log.t[-1] - log.t[0]) for log in logs)
+        numbers = first.shape[1] + self.model.nsensordata + self.model.nv
+        size = max(1, int(BATCH / ((longest / self.model.opt.timestep + 2) * numbers)))
+        out: list[Channels | None] = []
+        for a in range(0, len(logs), size):
+            out += self._roll(logs[a : a + size], first[a : a + size], changed)
+        return out
+
+    def _roll(self, logs: Sequence[Recording], first: np.ndarray, changed: tuple) -> list[Channels | None]:
+        h = float(self.model.opt.timestep)
+        span = max(float(log.t[-1] - log.t[0]) for log in logs)
+        times = np.arange(int(np.ceil(span / h - 1e-9)) + 2) * h
+        alike: dict[tuple, list[int]] = defaultdict(list)
+        for i, log in enumerate(logs):
+            alike[len(log), *(n for n in log.columns if n.startswith(APPLIED))].append(i)
+        parts = [(mine, [logs[i] for i in mine], applied) for (_, *applied), mine in alike.items()]
+        sides = [self._side(own, times) for _, own, _ in parts]
+        width = self.model.nu + (self.model.nv if any(applied for _, _, applied in parts) else 0)
+        control = np.zeros((len(logs), times.size, width))
+        for (mine, own, applied), side in zip(parts, sides, strict=True):
+            for column, place in {**self.driven, **{n: self._pushed(n) for n in applied}}.items():
+                control[mine, :, place] = side.held(np.array([log[column] for log in own]))
+        sensed = self._sensed(first, control, changed)
+        out: list[Channels | None] = [None] * len(logs)
+        for (mine, own, _), side in zip(parts, sides, strict=True):
+            for i, channels in zip(mine, self._read(own, sensed[mine], side, times), strict=True):
+                out[i] = channels
+        return out
+
+    def _pushed(self, column: str) -> int:
+        """Where among controls and applied torques a column of those stands."""
+        joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, column.removeprefix(APPLIED))
+        return self.model.nu + int(self.model.jnt_dofadr[joint])
+
+    def _sensed(self, first: np.ndarray, control: np.ndarray, changed: tuple) -> np.ndarray:
+        """Sensors (B, steps, sensors) of runs from these states."""
+        steps, width = control.shape[1:]
+        spec = int(mujoco.mjtState.mjSTATE_CTRL)
+        if width > self.model.nu:
+            spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+
+        def run() -> np.ndarray:
+            return rollout.rollout(
+                self.model, self.data, first, control if width else None,
+                control_spec=spec, nstep=steps, persistent_pool=True,
+            )[1]  # fmt: skip
+
+        given = hashlib.blake2b(first.tobytes() + control.tobytes()).digest()
+        key = (changed, first.shape, control.shape, given)
+        size = 8 * len(first) * steps * max(self.model.nsensordata, 1)
+        return latest(self._ran, key, run, int(KEPT / size))
+
+    def _side(self, logs: Sequence[Recording], times: np.ndarray) -> Side:
+        """How windows of one length lie on the steps."""
+        since = np.array([log.t - log.t[0] for log in logs])
+        key = (since.shape, since.tobytes(), times.size, float(times[1]))
+        return latest(self._sides, key, lambda: Side.of(since, times))
+
+    def _read(
+        self, logs: Sequence[Recording], sensed: np.ndarray, side: Side, times: np.ndarray
+    ) -> list[Channels | None]:
+        """Sensors (B, steps, sensors) at the logs' times: between steps by cubics where they are smooth."""
+        smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
+        between = side.between(sensed[:, :, [self.sensor[n] for n in smooth]])
+        whole: list[Channels | None] = []
+        for b, log in enumerate(logs):
+            out = {n: between[b, :, k] for k, n in enumerate(smooth)}
+            for name, address in self.sensor.items():
+                if name not in out:
+                    out[name] = np.interp(side.held.since[b], times, sensed[b, :, address])
+            for columns in self.free.values():
+                aligned(log, out, columns)
+            whole.append(out if all(np.abs(v).max() < FAR for v in out.values()) else None)
+        return whole
