@@ -31,8 +31,9 @@ SAYS = {
 }
 
 
-def parameters(moved: Sequence[int]) -> dict[str, dict[str, Any]]:
-    """What may be otherwise than the authors' model has it, of an arm that moves these joints (from 0)."""
+def parameters(geared: Sequence[int]) -> dict[str, dict[str, Any]]:
+    """What may be otherwise than the authors' model has it; of the `geared` joints (from 0) their zeros and
+    ratios too."""
     one = {"unit": "1", "low": 0.0}
     zero = {"nominal": 0.0, "sd": 0.01, "unit": "rad", "effect": "joint_zero"}
     gear = {"nominal": 0.0, "sd": 0.01, "unit": "1", "effect": "gear_ratio"}
@@ -47,8 +48,8 @@ def parameters(moved: Sequence[int]) -> dict[str, dict[str, Any]]:
         "friction": {"nominal": 0.0, "sd": 0.5, "unit": "N m", "low": 0.0},
         "viscous": {"nominal": 0.0, "sd": 1.0, "unit": "N m s/rad", "low": 0.0},
         "payload": {"nominal": 0.0, "sd": 0.1, "unit": "kg", "low": 0.0},
-        **{f"joint_zero.{k + 1}": dict(zero) for k in moved},
-        **{f"gear_ratio.{k + 1}": dict(gear) for k in moved},
+        **{f"joint_zero.{k + 1}": dict(zero) for k in geared},
+        **{f"gear_ratio.{k + 1}": dict(gear) for k in geared},
         "target_clock": {"nominal": 0.0, "sd": 0.01, "unit": "1", "low": -0.5},
         "base.tilt_x": {"nominal": 0.0, "sd": 0.01, "unit": "rad", "effect": "base"},
         "base.tilt_y": {"nominal": 0.0, "sd": 0.01, "unit": "rad", "effect": "base"},
@@ -73,12 +74,18 @@ def solved(mujoco: Any, model: Any) -> Any:
 
 
 def driven(
-    p: Mapping[str, float], lasts: float, moved: Sequence[int], target: Callable[[float], np.ndarray]
+    p: Mapping[str, float],
+    lasts: float,
+    moved: Sequence[int],
+    target: Callable[[float], np.ndarray],
+    step: float = STEP,
 ) -> np.ndarray:
     """Joint angles (n, nq) every SHOWN s for `lasts` s, of the authors' controller and model.
 
-    `target(time)`: angles [rad] that the `moved` joints are sent to, by the clock of `target_clock`."""
+    `target(time)`: angles [rad] that the `moved` joints are sent to, by the clock of `target_clock`;
+    `step` [s]: the solver's."""
     mujoco, model = arm()
+    model.opt.timestep = step
     kept = {
         n: np.array(getattr(model, n))
         for n in ("actuator_gainprm", "actuator_biasprm", "dof_frictionloss", "dof_damping", "body_mass")
@@ -94,7 +101,7 @@ def driven(
         data, out = mujoco.MjData(model), []
         limit = np.deg2rad(p["speed_limit"])
         jump = limit * TICK / max(p["ramp"], TICK)
-        speed, shown = np.zeros(JOINTS), round(SHOWN / STEP)
+        speed, shown = np.zeros(JOINTS), round(SHOWN / step)
         for tick in range(round(lasts / TICK)):
             goal = np.zeros(JOINTS)
             goal[moved] = target(tick * TICK / (1 + p["target_clock"]) + 1e-9)
@@ -118,7 +125,7 @@ def course(p: Mapping[str, float], angles: np.ndarray, moved: Sequence[int]) -> 
     angles, moved = np.array(angles), list(moved)
     angles[:, moved] = swung(angles[:, moved], p["elasticity.period"], p["elasticity.damping"])
     for joint in moved:
-        ratio, zero = p[f"gear_ratio.{joint + 1}"], p[f"joint_zero.{joint + 1}"]
+        ratio, zero = (p.get(f"{name}.{joint + 1}", 0.0) for name in ("gear_ratio", "joint_zero"))
         angles[:, joint] = (1 + ratio) * angles[:, joint] + zero
     mujoco, model = arm()
     data, hand = mujoco.MjData(model), model.body(HAND).id

@@ -9,6 +9,7 @@ import numpy as np
 from simgap.attribution.document import entries, rows
 from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.robots.diagnose import RobotDiagnosis
+from simgap.robots.explained import SEEN
 
 
 def body(found: RobotDiagnosis) -> dict[str, Any]:
@@ -118,4 +119,30 @@ def _shrinkage(found: RobotDiagnosis) -> dict[str, Any] | None:
         "interval_90": list(far.interval_90),
         "flexible_ceiling": None,
         "rms": {n: {"before": a, "after": b, "unit": units[n]} for n, (a, b) in far.rms.items()},
+        "by_phase": _by_phase(found, units),
     }
+
+
+def _by_phase(found: RobotDiagnosis, units: dict[str, str]) -> dict[str, Any]:
+    """Of each phase the share of its gap that is gone on held-out logs (None where there is none to speak
+    of), and by channel the root mean square that is left."""
+    far, rows = found.shrinkage, found.composed.rows
+    if far is None:
+        return {}
+    known, phase = np.isfinite(far.squares).all(0), found.phases.of(rows)
+    out: dict[str, Any] = {}
+    for number, name in enumerate(found.phases.names):
+        mine = known & (phase == number)
+        if not mine.any():
+            continue
+        before, after = far.squares[:, mine].sum(1)
+        gap = before - mine.sum()
+        seen = gap > SEEN * np.sqrt(2 * mine.sum())
+        left = {}
+        for c, channel in enumerate(rows.channels):
+            here = mine & (rows.channel == c)
+            if here.any():
+                was, now = (float(np.sqrt(np.mean(r[here] ** 2))) for r in (far.plain, far.residual))
+                left[channel] = {"before": was, "after": now, "unit": units[channel]}
+        out[name] = {"fraction": float((before - after) / gap) if seen else None, "rms": left}
+    return out

@@ -22,7 +22,8 @@ from simgap.robots.whiten import Whitener, covariances
 class Shrinkage:
     """Mean squares of whitened residuals of held-out stretches `before` and `after` (noise's own: 1), and
     the gap's `fraction` that is gone with its 90 % interval by fold. `rms`: by channel before and after, in
-    its unit; `found` by fold; `plain` (N,), `residual` (N,): what both leave of the rows."""
+    its unit; `found` by fold; `plain`, `residual` (N,): what both leave of the rows, and `squares` (2, N)
+    of these whitened, NaN where one is not known."""
 
     before: float
     after: float
@@ -33,6 +34,7 @@ class Shrinkage:
     found: tuple[tuple[str, ...], ...]
     plain: np.ndarray
     residual: np.ndarray
+    squares: np.ndarray
 
 
 def shrinkage(
@@ -120,6 +122,7 @@ def _measured(
         kept_sets,
         before,
         after,
+        np.where(usable, white, np.nan),
     )
 
 
