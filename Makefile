@@ -110,6 +110,7 @@ real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECOR
 	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
 	$(BIN)/python -m experiments.real.collins $(REAL)/collins
 	$(BIN)/python -m experiments.real.collins_alike $(REAL)/collins
+	$(BIN)/python -m experiments.real.collins_push $(REAL)/collins --figures docs/figures
 	$(BIN)/python -m paper_figs.hiro_gap
 	$(BIN)/python -m paper_figs.way_eeg_gal
 	$(BIN)/python -m experiments.write_tables

@@ -21,7 +21,7 @@ FIGURES = {
     "blind-check": ("gap_reliability",),
     "real": (
         "hiro_gap", "way_eeg_gal", "xl330_signal", "xl330_before_after",
-        "contactnets", "so101_signal", "so101_before_after",
+        "contactnets", "collins_push", "so101_signal", "so101_before_after",
     ),
     "readme-figures": ("demo_segments", "play"),
 }  # fmt: skip

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,16 +34,17 @@ from simgap.simulators.recording import Recording, read_recording
 from simgap.simulators.user import checked
 
 WORK = ROOT / "build" / "collins_push.npz"  # courses of hands, from one part to the next
+ASKED = ("gravity_compensation",)  # what two joints of the same arm were named for (collins_twojoint.json)
 DRAWN = 6  # number of the trial that the figure shows
 CAME = {"table.friction": 1.0, "finger.friction": 1.0}  # as in the authors' model
 
 
-def hand(folder: Path) -> RobotDiagnosis:
-    """The hand's diagnosis, phases by name."""
+def hand(folder: Path, forced: Sequence[str] = ASKED) -> RobotDiagnosis:
+    """The hand's diagnosis, phases by name; `forced`: with these causes, all that act if there are none."""
     simulator = checked(collins_hand.Hand(), "hand")
     with tempfile.TemporaryDirectory() as into:
         logs = [read_recording(p, simulator.channels) for p in collins_hand.prepare(folder, Path(into))]
-    return diagnose(simulator, logs, phases=collins_hand.phases(logs), tell=print)
+    return diagnose(simulator, logs, forced=forced, phases=collins_hand.phases(logs), tell=print)
 
 
 def cube(folder: Path) -> RobotDiagnosis:

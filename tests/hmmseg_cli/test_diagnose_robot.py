@@ -45,6 +45,8 @@ def test_a_cause_is_named_and_patched(logs, tmp_path):
     assert told["interval_90"][0] < 0.004 < told["interval_90"][1]
     assert abs(sum(found["probabilities"].values()) - 1) < 1e-9
     assert found["shrinkage"]["fraction"] > 0.9 and found["remainder"]["share"] < 0.1
+    moving = found["shrinkage"]["by_phase"]["moving"]
+    assert moving["fraction"] > 0.9 and moving["rms"]["angle"]["after"] < moving["rms"]["angle"]["before"]
     ranges = json.loads((patch / "ranges.json").read_text())
     assert ranges["causes"]["viscous"]["parameters"]["viscous"]["range"] == told["interval_90"]
     page = (tmp_path / "page.html").read_text()
