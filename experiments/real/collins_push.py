@@ -3,8 +3,8 @@
     python -m experiments.real.collins_push FOLDER [--figures DIR] [--only hand|cube|together]
     python -m experiments.real.collins_push FOLDER --prepare DIR
 
-FOLDER holds cubepush (Collins, Howard, Leitner). Two diagnoses: of the hand against the authors' arm
-(experiments/real/collins_hand.py), and of the cube in the way of the recorded hand
+FOLDER holds cubepush (Collins, Howard, Leitner). The hand's diagnosis against the authors' arm
+(experiments/real/collins_hand.py), and what held-out trials say of the cube in the way of the recorded hand
 (experiments/real/collins_cube.py). Together, open loop: the cube in the way of the hand that the arm would
 have, each trial by what the others tell. Writes experiments/results/collins_hand.json, collins_cube.json and
 collins_push.json, the last with four engines' recordings beside the real ones.
@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.optimize import least_squares
 
 from experiments.real import collins_cube, collins_hand
 from experiments.real.collins_arm import POSE, prepared
@@ -31,11 +32,14 @@ from experiments.real.robot_gap import RESULTS, summary
 from experiments.saving import ROOT, save
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.recording import Recording, read_recording
-from simgap.simulators.user import checked
+from simgap.simulators.user import UserSimulator, checked
 
 WORK = ROOT / "build" / "collins_push.npz"  # courses of hands, from one part to the next
 ASKED = ("gravity_compensation",)  # what two joints of the same arm were named for (collins_twojoint.json)
 DRAWN = 6  # number of the trial that the figure shows
+BAR = ("finger.along", "finger.up")
+SIZE = np.array([2e-3] * 3 + [5e-3] * 4)  # m and 1: differences of the cube's pose that count alike
+STEP, FITS = 0.05, 10  # of a usual size: a finite difference, for what tips is not smooth; evaluations
 CAME = {"table.friction": 1.0, "finger.friction": 1.0}  # as in the authors' model
 
 
@@ -47,13 +51,69 @@ def hand(folder: Path, forced: Sequence[str] = ASKED) -> RobotDiagnosis:
     return diagnose(simulator, logs, forced=forced, phases=collins_hand.phases(logs), tell=print)
 
 
-def cube(folder: Path) -> RobotDiagnosis:
-    """The cube's diagnosis, its hand as it was recorded."""
+def cube(folder: Path) -> dict[str, Any]:
+    """What held-out trials say of the cube, its hand as it was recorded: each half of the trials by what the
+    other tells, with nothing fitted but where the bar is (`as it came`), the frictions too, and one more.
+
+    Root mean square of its pose by channel and of the end of its way; mean square in units of SIZE."""
     with tempfile.TemporaryDirectory() as into:
         paths, courses = collins_cube.prepare(folder, Path(into))
         simulator = checked(Cube(courses), "cube")
         logs = [read_recording(p, simulator.channels) for p in paths]
-    return diagnose(simulator, logs, tell=print)
+    sets = {"as it came": BAR, "frictions": (*BAR, *CAME)}
+    known = [n for n, p in simulator.parameters.items() if not p.fitted]
+    sets |= {n: (*BAR, *CAME, n) for n in known if "contact" not in n}
+    sets["contact"] = (*BAR, *CAME, *(n for n in known if "contact" in n))
+    out: dict[str, Any] = {}
+    for name, free in sets.items():
+        left: list = [None] * len(logs)
+        for part in (0, 1):
+            found = _fit(simulator, logs[part::2], free)
+            for k in range(1 - part, len(logs), 2):
+                left[k] = _off(simulator, logs[k], found)
+        off = np.array(left)
+        rms = np.sqrt(np.mean(off**2, (0, 2)))
+        out[name] = {
+            "square": float(np.mean((off / SIZE[:, None]) ** 2)),
+            "rms": dict(zip(CUBE.values(), rms.tolist(), strict=True)),
+            "end_mm": (1e3 * np.sqrt(np.mean(off[:, :3, -1] ** 2, 0))).tolist(),
+        }
+        print(name, out[name]["square"], flush=True)
+    last = _fit(simulator, logs, sets["frictions"])
+    done: Any = rounded({"sets": out, "fitted": {n: last[n] for n in sets["frictions"]}})
+    return done
+
+
+def _off(simulator: UserSimulator, log: Recording, values: dict[str, float]) -> np.ndarray:
+    """Simulated less recorded (7, n)."""
+    out = simulator.simulate(values, log)
+    return np.array([out[n] - log[n] for n in CUBE.values()])
+
+
+def _fit(simulator: UserSimulator, logs: Sequence[Recording], free: Sequence[str]) -> dict[str, float]:
+    """Values of all parameters: the `free` ones by least squares with their priors, others as they are."""
+    known = [simulator.parameters[n] for n in free]
+    nominal, sd = (np.array([getattr(p, a) for p in known]) for a in ("nominal", "sd"))
+    base = {n: p.nominal for n, p in simulator.parameters.items()}
+    base |= {} if set(CAME) <= set(free) else CAME
+
+    def values(x: np.ndarray) -> dict[str, float]:
+        return base | dict(zip(free, (nominal + sd * x).tolist(), strict=True))
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        off = [_off(simulator, log, values(x)) / SIZE[:, None] for log in logs]
+        return np.append(np.concatenate([o.ravel() for o in off]), x)
+
+    bounds = [(np.array([getattr(p, a) for p in known]) - nominal) / sd for a in ("low", "high")]
+    lower, upper = np.minimum(bounds[0], -1e-6), np.maximum(bounds[1], 1e-6)
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        here = cost(x)
+        return np.array([(cost(x + STEP * e) - here) / STEP for e in np.eye(x.size)]).T
+
+    derivative: Any = slope
+    found = least_squares(cost, 0.0 * nominal, derivative, bounds=(lower, upper), max_nfev=FITS)
+    return values(found.x)
 
 
 def told(found: RobotDiagnosis) -> dict[str, Any]:
@@ -172,9 +232,8 @@ def draw(hands: Any, cubes: dict[str, np.ndarray], path: Path) -> None:
 def together(folder: Path, figures: Path | None) -> dict[str, Any]:
     """Hand and cube in one, by trial, and the engines; a figure in a folder."""
     courses = np.load(WORK)
-    point = json.loads((RESULTS / "collins_cube.json").read_text(encoding="utf-8"))["point"]
-    names = [n for n, p in Cube.parameters.items() if p.get("fitted")]
-    cubes = pushed(folder, courses, {n: next(iter(point[n].values())) for n in names})
+    fitted = json.loads((RESULTS / "collins_cube.json").read_text(encoding="utf-8"))["fitted"]
+    cubes = pushed(folder, courses, fitted)
     if figures is not None:
         draw(courses, cubes, figures / "collins_push.png")
     return {"ends": ends(cubes), "engines": beside(folder)}
@@ -193,7 +252,7 @@ def main() -> None:
         collins_hand.prepare(given.folder, given.prepare)
         return
     if given.only in (None, "cube"):
-        save(RESULTS / "collins_cube.json", told(cube(given.folder)))
+        save(RESULTS / "collins_cube.json", cube(given.folder))
     if given.only in (None, "hand"):
         found = hand(given.folder)
         save(RESULTS / "collins_hand.json", told(found))
