@@ -1,13 +1,14 @@
 """An arm reaches, lowers and pushes a cube: where a model of it parts from the real one, and why.
 
-    python -m experiments.real.collins_push FOLDER [--figures DIR] [--only hand|cube|together]
+    python -m experiments.real.collins_push FOLDER [--figures DIR] [--only hand|cube|together|free]
     python -m experiments.real.collins_push FOLDER --prepare DIR
 
 FOLDER holds cubepush (Collins, Howard, Leitner). The hand's diagnosis against the authors' arm
 (experiments/real/collins_hand.py), and what held-out trials say of the cube in the way of the recorded hand
 (experiments/real/collins_cube.py). Together, open loop: the cube in the way of the hand that the arm would
 have, each trial by what the others tell. Writes experiments/results/collins_hand.json, collins_cube.json and
-collins_push.json, the last with four engines' recordings beside the real ones.
+collins_push.json, the last with four engines' recordings beside the real ones; `free` asks for the hand's
+cause with all candidates (collins_hand_free.json).
 """
 
 from __future__ import annotations
@@ -244,7 +245,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--prepare", type=Path, metavar="DIR", help="write the hand's logs and stop")
-    parser.add_argument("--only", choices=("hand", "cube", "together"), help="one part of it")
+    parser.add_argument("--only", choices=("hand", "cube", "together", "free"), help="one part of it")
     parser.add_argument("--figures", type=Path, help="folder that the figure goes to, such as docs/figures")
     given = parser.parse_args()
     if given.prepare is not None:
@@ -258,6 +259,8 @@ def main() -> None:
         save(RESULTS / "collins_hand.json", told(found))
         WORK.parent.mkdir(exist_ok=True)
         np.savez(WORK, allow_pickle=False, **predicted(found))
+    if given.only == "free":
+        save(RESULTS / "collins_hand_free.json", told(hand(given.folder, ())))
     if given.only in (None, "together"):
         save(RESULTS / "collins_push.json", together(given.folder, given.figures))
 
