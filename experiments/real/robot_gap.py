@@ -52,14 +52,18 @@ def summary(found: RobotDiagnosis) -> dict:
     if found.shrinkage is not None:
         out["by_fold"] = [list(names) for names in found.shrinkage.found]
         rows, far = found.composed.rows, found.shrinkage
-        out["rms_by_log"] = (
-            {
-                log.name: [float((r[rows.log == k] ** 2).mean() ** 0.5) for r in (far.plain, far.residual)]
-                for k, log in enumerate(found.composed.recordings)
-            }
-            if len(rows.channels) == 1
-            else {}
-        )
+        if len(rows.channels) == 1:
+            names = [log.name for log in found.composed.recordings]
+            both = (far.plain, far.residual)
+
+            def rms(mine: np.ndarray) -> list[float]:
+                return [float(np.mean(r[mine] ** 2) ** 0.5) for r in both]
+
+            out["rms_by_log"] = {name: rms(rows.log == k) for k, name in enumerate(names)}
+            gains = gains_of(names)
+            for gain in sorted(set(gains or ())):
+                mine = np.isin(rows.log, np.flatnonzero(np.array(gains) == gain))
+                out.setdefault("rms_by_gain", {})[str(gain)] = rms(mine)
     done: Any = rounded(out)
     return done
 
@@ -70,9 +74,13 @@ def run(kind: str, folder: Path, only: Sequence[str] = (), seconds: float | None
     simulator = load_simulator(f"{HERE / spec}")
     paths = [p for p in sorted(folder.glob(pattern)) if not only or p.stem in only]
     logs = [middle(read_recording(p, simulator.channels), seconds) for p in paths]
-    gains = [re.search(r"_kp(\d+)_", p.stem) for p in paths]
-    groups = [int(g.group(1)) for g in gains if g] if all(gains) else None
-    return diagnose(simulator, logs, tell=print, groups=groups)
+    return diagnose(simulator, logs, tell=print, groups=gains_of([p.stem for p in paths]))
+
+
+def gains_of(names: Sequence[str]) -> list[int] | None:
+    """The gain that each log's name tells; None where some tell none."""
+    found = [re.search(r"_kp(\d+)_", name) for name in names]
+    return [int(g.group(1)) for g in found if g] if all(found) else None
 
 
 def middle(log: Recording, seconds: float | None) -> Recording:
