@@ -9,8 +9,6 @@ diagnosis against, not a diagnosis.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from scipy.optimize import least_squares
 
