@@ -32,11 +32,13 @@ def test_what_a_servo_lacks_is_named(shared):
 
 @pytest.mark.slow
 def test_tosses_tell_the_scale_on_which_they_are_read(shared):
-    """Gravity and the height of rest both come out 2 % too small; impacts keep a remainder."""
+    """Gravity and the height of rest both come out 2 % too small, falls too fast by the solver's step; impacts
+    keep a remainder."""
     found = robot_gap.summary(contactnets.run(shared / "real/contactnets"))
     assert found["verdict"] in ("named", "set")
     told = {*found["causes"], *found["indistinguishable"]}
-    assert "readout.scale" in told and told <= {"readout.scale", "readout:z.gain"}
+    scales = {"readout.scale", "readout:z.gain", "geom:box.size", "readout:z.bias", "readout:z.drift"}
+    assert "readout.scale" in told and told <= scales | {"option.timestep", "option.rk4"}
     low, high = found["effects"]["readout.scale"]["parameters"]["scale"]["interval_90"]
     assert -0.026 < low < high < -0.017
     assert found["remainder"]["regimes"]["bodies move in contact"] > 0.2
