@@ -32,7 +32,7 @@ def test_what_a_servo_lacks_is_named(shared):
 
 @pytest.mark.slow
 def test_tosses_tell_the_scale_on_which_they_are_read(shared):
-    """Gravity and the height of rest both come out 2 % too small, falls too fast by the solver's step; impacts
+    """Gravity and the height of rest both come out 2 % too small, the solver's step is told; impacts
     keep a remainder."""
     found = robot_gap.summary(contactnets.run(shared / "real/contactnets"))
     assert found["verdict"] in ("named", "set")
