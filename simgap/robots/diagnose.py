@@ -125,7 +125,7 @@ def _diagnosed(
     wanted = [n for n in plain.moved if n not in fitted_along(composed)]
     tell("healthy twins")
     twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
-    found = search(composed, parts, wanted, tell, forced, twins.factor, kept.of("search"))
+    found = search(composed, parts, wanted, tell, forced, twins.factor, kept.of("search"), plain)
     fold = folds_of(found.linear, len(composed.recordings), groups)
     if forced:
         borne = tuple(found.names[j] for j in found.models[0].effects)

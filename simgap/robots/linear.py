@@ -49,6 +49,18 @@ class Linear:
         """With some effects' columns added or replaced."""
         return replace(self, moved={**self.moved, **more}, diverged=(*self.diverged, *diverged))
 
+    def among(self, part: Composed, kept: np.ndarray) -> Linear:
+        """The same in some of the windows alone: those of `part`, whose rows are `kept` (N,)."""
+        return replace(
+            self,
+            rows=part.rows,
+            residual=self.residual[kept],
+            starts={n: v[kept] for n, v in self.starts.items()},
+            moved={n: Moved(m.at, m.shift[kept], m.jacobian[kept]) for n, m in self.moved.items()},
+            rates=self.rates[kept],
+            wobble=part.wobble,
+        )
+
 
 @dataclass(frozen=True)
 class Base:
@@ -97,8 +109,11 @@ def _rolled(composed: Composed, base: Base, point: Point, begun: list) -> list[C
     return [_sum(a, b) for a, b in zip(run, base.numeric, strict=True)]
 
 
-def linearise(composed: Composed, point: Point, effects: Sequence[str]) -> Linear:
-    """Residuals at a point, sensitivities to starts, and to the parameters of these effects.
+def linearise(
+    composed: Composed, point: Point, effects: Sequence[str], starts: Mapping[str, np.ndarray] | None = None
+) -> Linear:
+    """Residuals at a point, sensitivities to `starts` unless they are given, and to the parameters of these
+    effects.
 
     InputError where the simulator diverges in every window.
     """
@@ -106,7 +121,7 @@ def linearise(composed: Composed, point: Point, effects: Sequence[str]) -> Linea
     if all(channels is None for channels in base.read):
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
     residual = composed.rows.observed - base.rows
-    starts = _by_start(composed, base)
+    starts = _by_start(composed, base) if starts is None else starts
     found = Linear(
         point,
         composed.rows,

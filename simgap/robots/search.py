@@ -1,7 +1,9 @@
 """Which effects act: search about a point, move the point to what was found, and search again there.
 
 Each round is exact at its point (all effects found so far at their values) and linear about it. Leaders are
-rolled out at their own best fit, so that what kinks at its neutral value is seen where it acts.
+rolled out at their own best fit, so that what kinks at its neutral value is seen where it acts. Of many
+candidates most are nowhere near: rounds after the first ask those that came near in it, and before a search
+ends all are asked again where it would end.
 """
 
 from __future__ import annotations
@@ -47,12 +49,15 @@ class Found:
 
 @dataclass(frozen=True)
 class Step:
-    """Where a search stands: about which point it goes on, the best set so far, and all that were best."""
+    """Where a search stands: about which point it goes on, the best set so far, and all that were best;
+    `field`: the candidates that came near when all were asked; `whole`: all are asked next."""
 
     point: Point
     best: tuple[str, ...] = ()
     seen: frozenset[tuple[str, ...]] = frozenset()
     settled: bool = False
+    field: tuple[str, ...] = ()
+    whole: bool = True
 
 
 def search(
@@ -63,44 +68,64 @@ def search(
     forced: Sequence[str] = (),
     factor: np.ndarray | None = None,
     kept: Kept = NOWHERE,
+    plain: Linear | None = None,
 ) -> Found:
     """Search until the best set and its parameters stay: where there are many windows in some of them first,
-    from which all are gone on with."""
+    from which all are gone on with. `plain`: all candidates' sensitivities at a point, if they are known."""
     point: Point = {n: composed.effects[n].neutral() for n in fitted_along(composed)}
     begin = Step(point)
     few = composed.thinned()
     if not forced and len(few) < len(composed.windows):
-        noise = None if factor is None else factor[np.isin(composed.rows.window, few)]
-        part = composed.among(few)
-        ask = _Ask(part, phases, tuple(candidates), (), noise)
+        part, mine = composed.among(few), np.isin(composed.rows.window, few)
+        noise = None if factor is None else factor[mine]
+        known = None if plain is None else plain.among(part, mine)
+        ask = _Ask(part, phases, tuple(candidates), (), noise, known)
 
         def ended() -> Step:
-            found = _searched(ask, Step(_along(ask, point)), tell, kept.of("some windows"))
-            return Step(point_of(part, found.forms, found.models[0].effects, found.linear.point), found.best)
+            found, last = _searched(ask, Step(_along(ask, point)), tell, kept.of("some windows"))
+            there = point_of(part, found.forms, found.models[0].effects, found.linear.point)
+            return Step(there, found.best, field=last.field, whole=False)
 
         begin = kept("some windows", ended)
-    ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor)
+    ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor, plain)
     if not begin.best:
         begin = Step(kept("fitted along", lambda: _along(ask, point)))
-    return _searched(ask, begin, tell, kept)
+    return _searched(ask, begin, tell, kept)[0]
 
 
 @dataclass(frozen=True)
 class _Ask:
-    """What a search is asked: in which windows, with which candidates, by which noise."""
+    """What a search is asked: in which windows, with which candidates, by which noise; `plain`: what is known
+    of these windows at one point."""
 
     composed: Composed
     phases: Phases
     candidates: tuple[str, ...]
     forced: tuple[str, ...]
     factor: np.ndarray | None
+    plain: Linear | None = None
+
+    def asked(self, step: Step, number: int) -> tuple[str, ...]:
+        """The candidates that a round asks: all in the last one."""
+        near = {*step.field, *step.best}
+        if step.whole or self.forced or number == ROUNDS - 1:
+            return self.candidates
+        return tuple(n for n in self.candidates if n in near)
+
+    def linearised(self, point: Point, names: Sequence[str]) -> Linear:
+        """All about a point; what is known there is not worked out again."""
+        names = [*fitted_along(self.composed), *names]
+        known = self.plain
+        if known is not None and known.point == point and {*names} <= {*known.moved, *known.diverged}:
+            return known
+        return linearise(self.composed, point, names)
 
     def covariances(self, linear: Linear) -> Covariances:
         """Of the windows about a point."""
         return covariances(self.composed, linear, self.factor)
 
 
-def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> Found:
+def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> tuple[Found, Step]:
     """Rounds until the best set stays. A round that was kept is made again only if it is the last."""
     found: Found | None = None
 
@@ -117,7 +142,7 @@ def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> Found:
         if after.settled:
             break
         step = after
-    return _round(ask, step, number)[0] if found is None else found
+    return _round(ask, step, number)[0] if found is None else found, after
 
 
 def _along(ask: _Ask, point: Point) -> Point:
@@ -131,13 +156,14 @@ def _along(ask: _Ask, point: Point) -> Point:
 
 def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
     """One round: what is best about the step's point, and where to go on."""
-    composed = ask.composed
-    linear = linearise(composed, step.point, [*fitted_along(composed), *ask.candidates])
-    usable = [n for n in ask.candidates if n in linear.moved]
+    composed, asked = ask.composed, ask.asked(step, number)
+    linear = ask.linearised(step.point, asked)
+    usable = [n for n in asked if n in linear.moved]
     cov = ask.covariances(linear)
     off = learned(cov, linear.residual)
     whiten = cov.whitener(off)
-    linear, names = leaders(composed, linear, whiten, ask.phases, usable, step.best)
+    every = forms(gap_of(composed, linear, whiten, ask.phases, usable))
+    linear, names = leaders(composed, linear, whiten, every, step.best)
     f = forms(gap_of(composed, linear, whiten, ask.phases, names))
     if ask.forced:
         chosen = tuple(j for j, n in enumerate(names) if n in ask.forced)
@@ -146,13 +172,25 @@ def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
         models = [one_more(f, [names.index(n) for n in step.best if n in names])]
     now = tuple(sorted(names[j] for j in models[0].effects))
     found = Found(linear, whiten, cov, off, f, tuple(models), now)
+    whole = len(asked) == len(ask.candidates)
+    field = tuple(sorted({*names, *_nearest(every, now)})) if whole else step.field
     first = number == 0 and not step.best and bool(step.point)  # what is fitted along is yet to follow
     settled = now == step.best and not first and _gain(found) < SETTLED
     again = now != step.best and now in step.seen  # sets that take turns are alike, and none will win
     if settled or again or number == ROUNDS - 1:
-        return found, replace(step, best=now, settled=True)
+        if not whole:
+            return found, replace(step, whole=True)
+        return found, replace(step, best=now, settled=True, field=field)
     point = moved_to(composed, linear, whiten, point_of(composed, f, models[0].effects, step.point))
-    return found, Step(point, now, step.seen | {now})
+    return found, Step(point, now, step.seen | {now}, field=field, whole=len(field) == len(ask.candidates))
+
+
+def _nearest(f: Forms, best: Sequence[str]) -> list[str]:
+    """The candidates that gain most beside these."""
+    own = {c.name: j for j, c in enumerate(f.gap.candidates)}
+    beside = [own[n] for n in best]
+    gain = {n: fitted(f, tuple(sorted((*beside, j)))).score for n, j in own.items() if n not in best}
+    return sorted(gain, key=lambda n: -gain[n])[:LEADERS]
 
 
 def one_more(f: Forms, best: Sequence[int]) -> Model:
@@ -201,16 +239,11 @@ def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point)
 
 
 def leaders(
-    composed: Composed,
-    linear: Linear,
-    whiten: Whitener,
-    phases: Phases,
-    usable: list[str],
-    best: tuple[str, ...],
+    composed: Composed, linear: Linear, whiten: Whitener, f: Forms, best: tuple[str, ...]
 ) -> tuple[Linear, list[str]]:
-    """The candidates that gain most beside the best set, rolled out at their own best fits."""
+    """The candidates of `f` that gain most beside the best set, rolled out at their own best fits."""
+    usable = [c.name for c in f.gap.candidates]
     held = [n for n in best if n in usable]
-    f = forms(gap_of(composed, linear, whiten, phases, usable))
     own = {n: j for j, n in enumerate(usable)}
     with_best = tuple(sorted(own[n] for n in held))
     gains, at = {}, {}

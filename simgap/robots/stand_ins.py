@@ -98,7 +98,8 @@ class _Asked:
         here = [n for n in point if n not in along]
         linear = linearise(self.composed, point, [*along, *here, *wanted])
         usable = [n for n in (*here, *wanted) if n in linear.moved]
-        linear, names = leaders(self.composed, linear, self.whiten, self.phases, usable, tuple(here))
+        every = forms(gap_of(self.composed, linear, self.whiten, self.phases, usable))
+        linear, names = leaders(self.composed, linear, self.whiten, every, tuple(here))
         f = forms(gap_of(self.composed, linear, self.whiten, self.phases, names))
         mine = [names.index(n) for n in here if n in names]
         sets = {j: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}

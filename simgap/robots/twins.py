@@ -15,7 +15,7 @@ from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import resolution
 from simgap.robots.whiten import covariances
-from simgap.robots.windows import NEIGHBOURS, REACH, start_of
+from simgap.robots.windows import NEIGHBOURS, REACH, STRIKES, start_of
 from simgap.simulators.protocol import Channels, Job, run_all
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
@@ -42,12 +42,15 @@ def healthy_twins(composed: Composed, plain: Linear, seed: int) -> Twins:
     rng = np.random.default_rng(seed)
     make = along_windows if _begins_anew(composed, plain.point) else along_logs
     steps = {n: max(resolution(r[n]) for r in composed.recordings) for n in composed.noise}
-    found, left = [], []
+    # Twins start alike but for noise, and where nothing strikes that moves no sensitivity to a start.
+    smooth = all(w.regime != STRIKES for w in composed.windows)
+    found, left, starts = [], [], None
     for _ in range(TWINS):
         twin = make(composed, plain.point, steps, rng)
         if twin is None:
             return Twins(np.ones(plain.residual.size), ())
-        linear = linearise(twin, plain.point, [])
+        linear = linearise(twin, plain.point, [], starts)
+        starts = linear.starts if smooth else None
         white = covariances(twin, linear).whitener()
         left.append(np.where(np.isfinite(linear.residual), linear.residual, 0.0))
         found.append(white(left[-1]))
