@@ -93,6 +93,7 @@ def diagnose_robot(
     out: Output, paths: Sequence[Path], own: OwnSimulator, task: Path | None, effect: Sequence[str]
 ) -> None:
     """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
+    from simgap.progress import heard
     from simgap.robots.describe import body
     from simgap.robots.diagnose import STAGES, diagnose
     from simgap.robots.kept import kept_for, modules_beside
@@ -129,7 +130,14 @@ def diagnose_robot(
     kept = kept_for([*inputs, repr((sorted(effect), out.seed)).encode()])
     if kept.begun:
         out.print("going on where an earlier run of this was interrupted")
-    with out.progress("diagnosing", total=STAGES) as advance:
+    stage = "diagnosing"
+
+    def tell(text: str) -> None:
+        nonlocal stage
+        stage = text
+        advance(1, text)
+
+    with out.progress(stage, total=STAGES) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
         try:
             found = diagnose(
                 at_risk,
@@ -139,7 +147,7 @@ def diagnose_robot(
                 more=more,
                 length=length,
                 phases=phases,
-                tell=lambda text: advance(1, text),
+                tell=tell,
                 warn=out.warn,
                 kept=kept,
             )

@@ -72,6 +72,12 @@ def timed(folder: Path, interrupt: float | None = None) -> dict[str, Any]:
     return {"wall": round(wall, 1), "processor": round(processor, 1), "exit": code}
 
 
+def told(which: str, run: dict[str, Any]) -> dict[str, Any]:
+    """A run, printed as soon as it is done."""
+    print(f"{which}: {run['wall']} s, {run['processor']} s of processor, exit {run['exit']}", flush=True)
+    return run
+
+
 def main() -> None:
     """Draw, time, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -83,7 +89,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         faults = drawn_arm(given.models, given.seconds, folder)
-        whole = timed(folder)
+        print(f"{given.seconds:g} s at {RATE:g} Hz: {', '.join(faults)}", flush=True)
+        whole = told("whole", timed(folder))
         found = json.loads((folder / "found.json").read_text(encoding="utf-8"))
         out: dict[str, Any] = {
             "seconds": given.seconds,
@@ -95,8 +102,8 @@ def main() -> None:
             "found": {k: found[k] for k in ("verdict", "causes", "indistinguishable")},
         }
         if given.interrupt:
-            first = timed(folder, 0.5 * whole["wall"])
-            again = timed(folder)
+            first = told("interrupted", timed(folder, 0.5 * whole["wall"]))
+            again = told("resumed", timed(folder))
             same = json.loads((folder / "found.json").read_text(encoding="utf-8")) == found
             out["interrupted"] = {"first": first, "again": again, "same_document": same}
     save(given.output, out)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
+from simgap.progress import say
 from simgap.robots.tied import Solved, Tied
 from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy
 
@@ -74,6 +75,7 @@ def _cost_of(found: Solved) -> float:
 
 def _cost(x: np.ndarray, terms: list[Tied], kept: list[int]) -> tuple[float, np.ndarray]:
     """`_value` and its gradient."""
+    say("how far the model is off by itself")
     value, slope = 0.0, np.zeros(len(kept))
     for term in terms:
         variance = _variance(term, x, kept)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from simgap.progress import say
 from simgap.robots.linear import Base, Linear, base_at, numeric_at, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.whiten import Whitener
@@ -52,6 +53,7 @@ def _moved(
 
     def based(x: np.ndarray) -> Base:
         if x.tobytes() not in last:
+            say(f"fitting {', '.join(point)}")
             last.clear()
             last[x.tobytes()] = base_at(composed, {**held, **at(x)})
         return last[x.tobytes()]

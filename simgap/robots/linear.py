@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.errors import InputError
+from simgap.progress import say
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Rows
 from simgap.robots.windows import REGIMES, STRIKES
@@ -136,7 +137,10 @@ def linearise(
     moved, diverged = {}, []
     # The solver's own numbers first: a simulator may have their runs still at hand.
     first = sorted(effects, key=lambda n: not composed.numeric(n))
-    found_by = {name: vary(composed, base, starts, name) for name in first}
+    found_by = {}
+    for number, name in enumerate(first):
+        say(f"{number + 1} of {len(first)}, {name}")
+        found_by[name] = vary(composed, base, starts, name)
     for name in effects:
         one = found_by[name]
         if one is None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
-from simgap.progress import Progress
+from simgap.progress import Progress, say
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
@@ -263,6 +263,7 @@ def leaders(
     base = numeric_at(composed, base_at(composed, linear.point))
     more = {}
     for name in sorted(first, key=lambda n: not composed.numeric(n)):
+        say(f"{name} at its best")
         if all(
             abs(at[name][n] - p.nominal) < 1e-3 * p.sd for n, p in composed.effects[name].parameters.items()
         ):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from simgap.progress import say
 from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import resolution
@@ -45,7 +46,8 @@ def healthy_twins(composed: Composed, plain: Linear, seed: int) -> Twins:
     # Twins start alike but for noise, and where nothing strikes that moves no sensitivity to a start.
     smooth = all(w.regime != STRIKES for w in composed.windows)
     found, left, starts = [], [], None
-    for _ in range(TWINS):
+    for number in range(TWINS):
+        say(f"{number + 1} of {TWINS}")
         twin = make(composed, plain.point, steps, rng)
         if twin is None:
             return Twins(np.ones(plain.residual.size), ())
