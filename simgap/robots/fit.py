@@ -46,9 +46,6 @@ def _moved(
             out.setdefault(effect, {})[short] = float(value)
         return out
 
-    def prior(x: np.ndarray) -> np.ndarray:
-        return np.where(loose, x, np.sqrt(2 * np.log1p(x**2)))
-
     last: dict[bytes, Base] = {}  # the derivative is asked for where the residual was
 
     def based(x: np.ndarray) -> Base:
@@ -59,10 +56,7 @@ def _moved(
         return last[x.tobytes()]
 
     def residual(x: np.ndarray) -> np.ndarray:
-        found = linear.rows.observed - based(x).rows
-        # A rollout that diverged is as far off as the recording is from its mean.
-        found = np.where(np.isfinite(found), found, linear.rows.observed)
-        return np.concatenate([whiten(np.where(np.isfinite(linear.residual), found, 0.0)), prior(x)])
+        return np.concatenate([_white(linear, whiten, based(x)), _prior(x, loose)])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         here, base = at(x), numeric_at(composed, based(x))
@@ -83,6 +77,29 @@ def _moved(
     derivative: Any = jacobian
     done = least_squares(residual, inside, derivative, bounds=bounds, max_nfev=STEPS, method="trf", ftol=1e-5)
     return dict(at(np.clip(done.x, *bounds)))
+
+
+def cost_at(composed: Composed, linear: Linear, whiten: Whitener, point: Point) -> float:
+    """Half the squares that `moved_to` makes least, at a point [nats]."""
+    white = _white(linear, whiten, base_at(composed, point))
+    out = 0.5 * float(white @ white)
+    for effect, theta in point.items():
+        known = composed.effects[effect]
+        x = np.array([(v - known.parameters[p].nominal) / known.parameters[p].sd for p, v in theta.items()])
+        out += 0.5 * float(np.sum(_prior(x, np.full(x.size, known.fitted)) ** 2))
+    return out
+
+
+def _white(linear: Linear, whiten: Whitener, base: Base) -> np.ndarray:
+    """Whitened residuals (N,) at a base, of the rows that the linear model has."""
+    found = linear.rows.observed - base.rows
+    # A rollout that diverged is as far off as the recording is from its mean.
+    found = np.where(np.isfinite(found), found, linear.rows.observed)
+    return whiten(np.where(np.isfinite(linear.residual), found, 0.0))
+
+
+def _prior(x: np.ndarray, loose: np.ndarray) -> np.ndarray:
+    return np.where(loose, x, np.sqrt(2 * np.log1p(x**2)))
 
 
 def _slope(x: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import moved_to
+from simgap.robots.fit import cost_at, moved_to
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, base_at, linearise, numeric_at, vary
@@ -175,13 +175,21 @@ def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
     whole = len(asked) == len(ask.candidates)
     field = tuple(sorted({*names, *_nearest(every, now)})) if whole else step.field
     first = number == 0 and not step.best and bool(step.point)  # what is fitted along is yet to follow
-    settled = now == step.best and not first and _gain(found) < SETTLED
+    stays = now == step.best and not first
+    settled = stays and _gain(found) < SETTLED
     again = now != step.best and now in step.seen  # sets that take turns are alike, and none will win
-    if settled or again or number == ROUNDS - 1:
+    last = settled or again or number == ROUNDS - 1
+    if not last:
+        there = point_of(composed, f, models[0].effects, step.point)
+        point = moved_to(composed, linear, whiten, there)
+        # The mode, by which the set is chosen, weighs groups by what they leave; the exact fit does not, so
+        # that it may stay where the mode is not. A further round would then be this one again.
+        costs = [cost_at(composed, linear, whiten, p) for p in (step.point, point)] if stays else [np.inf, 0]
+        last = costs[0] - costs[1] < SETTLED
+    if last:
         if not whole:
             return found, replace(step, whole=True)
         return found, replace(step, best=now, settled=True, field=field)
-    point = moved_to(composed, linear, whiten, point_of(composed, f, models[0].effects, step.point))
     return found, Step(point, now, step.seen | {now}, field=field, whole=len(field) == len(ask.candidates))
 
 

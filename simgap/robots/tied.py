@@ -34,14 +34,32 @@ class _Part:
     residual: np.ndarray
     sources: tuple[tuple[int, Source], ...]
 
+    def whitened(self, variance: Sequence[float]) -> tuple:
+        """With its sources of these variances: factor, residual and start whitened by it, the start's
+        products (S, S), half the log determinant."""
+        whole = np.diag(self.variance)
+        for (_, source), one in zip(self.sources, variance, strict=True):
+            if one > 0:
+                source.add(whole, one)
+        factor = _factor(whole)
+        columns = np.column_stack([self.residual, self.start])
+        both = solve_triangular(factor, columns, lower=True, check_finite=False)
+        white, start = both[:, 0], both[:, 1:]
+        return factor, white, start, start.T @ start, float(np.log(np.diag(factor)).sum())
+
+
+LATEST = 2  # numerics: variances of a part whose factors are kept: most differences are in another part's
+
 
 @dataclass(frozen=True)
 class Tied:
-    """A block's parts; `trace` (K,) of every source's covariance at s = 1."""
+    """A block's parts; `trace` (K,) of every source's covariance at s = 1; `latest` of each part what it was
+    at its latest variances."""
 
     parts: tuple[_Part, ...]
     size: int
     trace: np.ndarray
+    latest: tuple[dict, ...]
 
     @classmethod
     def of(cls, block: Block, residual: np.ndarray, names: Sequence[str]) -> Tied:
@@ -63,7 +81,7 @@ class Tied:
                         own.append((k, Source(place[source.rows[here]], covariance)))
             parts.append(_Part(block.variance[mine], block.start[mine], residual[mine], tuple(own)))
         trace = np.array([block.sources[n].trace if n in block.sources else 0.0 for n in names])
-        return cls(tuple(parts), label.size, trace)
+        return cls(tuple(parts), label.size, trace, tuple({} for _ in parts))
 
     @property
     def square(self) -> float:
@@ -76,20 +94,18 @@ class Tied:
         inner, pull = np.eye(states), np.zeros(states)
         square = half = 0.0
         factors, whites, moved = [], [], []
-        for part in self.parts:
-            whole = np.diag(part.variance)
-            for k, source in part.sources:
-                if variance[k] > 0:
-                    source.add(whole, variance[k])
-            factor = _factor(whole)
-            both = solve_triangular(
-                factor, np.column_stack([part.residual, part.start]), lower=True, check_finite=False
-            )
-            white, start = both[:, 0], both[:, 1:]
-            inner += start.T @ start
+        for part, latest in zip(self.parts, self.latest, strict=True):
+            key = tuple(float(variance[k]) for k, _ in part.sources)
+            if key not in latest:
+                done = part.whitened(key)
+                while len(latest) >= LATEST:
+                    del latest[next(iter(latest))]
+                latest[key] = done
+            factor, white, start, product, own = latest[key]
+            inner += product
             pull += start.T @ white
             square += float(white @ white)
-            half += float(np.log(np.diag(factor)).sum())
+            half += own
             factors.append(factor)
             whites.append(white)
             moved.append(start)
@@ -128,16 +144,19 @@ class Solved:
                 lower=True, trans=1, check_finite=False,
             )  # fmt: skip
             alpha, columns = both[:, 0], both[:, 1:]
-            inverse = np.tril(dpotri(factor, lower=1)[0])
-            inverse += np.tril(inverse, -1).T
-            inverse -= columns @ self.inverse @ columns.T
+            # Of B^-1 the lower half alone: covariances are as symmetric as it is. C^-1 is that less what the
+            # start takes, of which a few columns tell all.
+            inverse = dpotri(factor, lower=1)[0]
+            diagonal, less = np.diag(inverse), columns @ self.inverse
             for k, source in part.sources:
                 at, own = source.rows, source.covariance
                 if own.ndim == 1:
-                    trace[k] += float(np.diag(inverse)[at] @ own)
+                    taken = np.einsum("ij,ij->i", less[at], columns[at])
+                    trace[k] += float((diagonal[at] - taken) @ own)
                     pull[k] += float(alpha[at] ** 2 @ own)
                 else:
-                    trace[k] += float(np.sum(source.across(inverse) * own))
+                    both_halves = 2 * np.vdot(source.across(inverse), own) - diagonal[at] @ np.diag(own)
+                    trace[k] += float(both_halves - np.vdot(less[at], own @ columns[at]))
                     pull[k] += float(alpha[at] @ own @ alpha[at])
         return trace, pull
 
