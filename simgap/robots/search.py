@@ -2,8 +2,8 @@
 
 Each round is exact at its point (all effects found so far at their values) and linear about it. Leaders are
 rolled out at their own best fit, so that what kinks at its neutral value is seen where it acts. Of many
-candidates most are nowhere near: rounds after the first ask those that came near in it, and before a search
-ends all are asked again where it would end.
+candidates most are nowhere near: while the best set stays, those are asked that came near it when all were,
+and before a search ends all are asked again where it would end.
 """
 
 from __future__ import annotations
@@ -190,7 +190,9 @@ def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
         if not whole:
             return found, replace(step, whole=True)
         return found, replace(step, best=now, settled=True, field=field)
-    return found, Step(point, now, step.seen | {now}, field=field, whole=len(field) == len(ask.candidates))
+    # Whatever the set has gained or lost changes what comes near beside it; where it stays, that stays too.
+    whole = now != step.best or len(field) == len(ask.candidates)
+    return found, Step(point, now, step.seen | {now}, field=field, whole=whole)
 
 
 def _nearest(f: Forms, best: Sequence[str]) -> list[str]:
