@@ -32,9 +32,7 @@ RATE = 20.0  # Hz of the prepared logs
 class TwoJoint:
     """The hand's pose `ee_*`; nothing is commanded but the four targets, which every trial has alike."""
 
-    channels = {  # noqa: RUF012
-        c: {"unit": "1" if a.startswith("q") else "m", "kind": "position"} for a, c in POSE.items()
-    }
+    channels = arm.CHANNELS
     parameters = arm.parameters(MOVED)
     poses = {"ee": POSE}  # noqa: RUF012
     by_log = {  # noqa: RUF012

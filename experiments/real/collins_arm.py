@@ -16,6 +16,7 @@ import numpy as np
 ARM = Path(__file__).resolve().parent / "collins_arm.xml"
 HAND = "m1n6s300_link_6"
 POSE = {a: f"ee_{a}" for a in ("x", "y", "z", "qw", "qx", "qy", "qz")}
+CHANNELS = {c: {"unit": "1" if a.startswith("q") else "m", "kind": "position"} for a, c in POSE.items()}
 JOINTS = 6
 TICK, STEP, SHOWN = 0.05, 0.002, 0.01  # s: controller, solver, what is kept of the motion
 SAYS = {

@@ -46,9 +46,7 @@ def _parameters() -> dict[str, dict[str, Any]]:
 class Hand:
     """The hand's pose `ee_*`; nothing is commanded but three targets, which every trial has alike."""
 
-    channels = {  # noqa: RUF012
-        c: {"unit": "1" if a.startswith("q") else "m", "kind": "position"} for a, c in POSE.items()
-    }
+    channels = arm.CHANNELS
     parameters = _parameters()
     poses = {"ee": POSE}  # noqa: RUF012
     by_log = {  # noqa: RUF012

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from simgap.attribution.document import entries, rows
-from simgap.attribution.posterior import Forms, Model, fitted
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.explained import SEEN
 
@@ -41,17 +41,13 @@ def parameters(
     found: RobotDiagnosis, f: Forms, model: Model, effects: tuple[str, ...]
 ) -> dict[str, dict[str, Any]]:
     """Of a set's effects: short name, or effect and short name where there are several, to its posterior."""
-    gap, out = f.gap, {}
-    z = gap.nuisance.shape[1]
-    at = z
-    names = [c.name for c in gap.candidates]
-    for j in model.effects:
-        c = gap.candidates[j]
-        mean = c.neutral + c.scale * model.x[at : at + c.at.size]
-        sd = c.scale * np.sqrt(np.maximum(np.diag(model.covariance)[at : at + c.at.size], 0.0))
-        at += c.at.size
-        if names[j] not in effects:
+    out: dict[str, dict[str, Any]] = {}
+    variance = np.maximum(np.diag(model.covariance), 0.0)
+    for j, mine in coordinates(f, model.effects).items():
+        c = f.gap.candidates[j]
+        if c.name not in effects:
             continue
+        mean, sd = c.neutral + c.scale * model.x[mine], c.scale * np.sqrt(variance[mine])
         for k, short in enumerate(c.parameters):
             key = short if len(effects) == 1 else f"{c.name}.{short}"
             unit = found.composed.effects[c.name].parameters[short].unit

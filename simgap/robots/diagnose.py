@@ -82,6 +82,9 @@ def diagnose(
     candidates; `warn` is told at once what cannot be told apart; what an earlier run of the same inputs has
     `kept` is not worked out again; logs of one number in `groups` (one a log) are held out together.
     InputError for input at fault."""
+    if groups is not None and (len(groups) != len(recordings) or len({*groups}) < 2):
+        counted = f"{len(groups)} in {len({*groups})} groups for {len(recordings)} logs"
+        raise InputError("groups", f"are {counted}", "one number a log, of at least two groups")
     noise = noises(simulator, recordings)
     effects = candidates_of(Setting(simulator, recordings)) | {e.name: e for e in more}
     for name in forced:

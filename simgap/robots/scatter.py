@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 
 
 def over_numerics(f: Forms, causes: tuple[int, ...], numerics: Sequence[int]) -> Model:
@@ -22,11 +22,8 @@ def over_numerics(f: Forms, causes: tuple[int, ...], numerics: Sequence[int]) ->
         return model
     every = tuple(sorted((*causes, *free)))
     whole = fitted(f, every)
-    kept, at = list(range(f.gap.nuisance.shape[1])), f.gap.nuisance.shape[1]
-    for j in every:
-        size = f.gap.candidates[j].at.size
-        kept += range(at, at + size) if j in causes else ()
-        at += size
+    at = coordinates(f, every)
+    kept = np.concatenate([np.arange(f.spectrum.num_nuisances), *(at[j] for j in causes)])
     return replace(
         model,
         x=whole.x[kept],
@@ -56,24 +53,19 @@ def scattering(f: Forms, model: Model, fold: np.ndarray) -> Model:
 
 def of_causes(f: Forms, model: Model) -> dict[str, np.ndarray]:
     """Each effect of a model -> its parameters (k,)."""
-    out, at = {}, f.gap.nuisance.shape[1]
-    for j in model.effects:
+    out = {}
+    for j, mine in coordinates(f, model.effects).items():
         c = f.gap.candidates[j]
-        out[c.name] = c.neutral + c.scale * model.x[at : at + c.at.size]
-        at += c.at.size
+        out[c.name] = c.neutral + c.scale * model.x[mine]
     return out
 
 
 def over_rivals(f: Forms, model: Model, rivals: Sequence[tuple[Forms, Model]]) -> Model:
     """The set's model with what its parameters are in the sets that are not told from it, each as likely."""
-    told = [of_causes(*one) for one in rivals]
-    z = at = f.gap.nuisance.shape[1]
+    here, told = of_causes(f, model), [of_causes(*one) for one in rivals]
     more = np.zeros(model.x.size)
-    for j in model.effects:
+    for j, mine in coordinates(f, model.effects).items():
         c = f.gap.candidates[j]
-        mine = slice(at, at + c.at.size)
-        at += c.at.size
-        here = c.neutral + c.scale * model.x[mine]
-        apart = [(other[c.name] - here) / c.scale for other in told if c.name in other]
+        apart = [(other[c.name] - here[c.name]) / c.scale for other in told if c.name in other]
         more[mine] = np.sum(np.square(apart), 0) / (1 + len(apart)) if apart else 0.0
-    return replace(model, covariance=model.covariance + np.diag(more)) if model.x.size > z else model
+    return replace(model, covariance=model.covariance + np.diag(more))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.progress import Progress, say
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import cost_at, moved_to
@@ -237,14 +237,12 @@ def _gain(found: Found) -> float:
 
 def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point) -> Point:
     """Where these effects have their mode, and what is fitted along stays as in `point`."""
-    gap, model = f.gap, fitted(f, tuple(effects))
+    model = fitted(f, tuple(effects))
     out = {n: dict(point[n]) for n in fitted_along(composed)}
-    at = gap.nuisance.shape[1]
-    for j in model.effects:
-        c = gap.candidates[j]
-        values = np.clip(c.neutral + c.scale * model.x[at : at + c.at.size], c.low, c.high)
+    for j, mine in coordinates(f, model.effects).items():
+        c = f.gap.candidates[j]
+        values = np.clip(c.neutral + c.scale * model.x[mine], c.low, c.high)
         out[c.name] = dict(zip(c.parameters, values.tolist(), strict=True))
-        at += c.at.size
     return out
 
 
@@ -264,8 +262,8 @@ def leaders(
         model = fitted(f, effects)
         gains[name] = model.score
         c = f.gap.candidates[own[name]]
-        begin = f.spectrum.num_nuisances + sum(f.gap.candidates[j].at.size for j in effects if j < own[name])
-        values = np.clip(c.neutral + c.scale * model.x[begin : begin + c.at.size], c.low, c.high)
+        values = c.neutral + c.scale * model.x[coordinates(f, effects)[own[name]]]
+        values = np.clip(values, c.low, c.high)
         # Straight lines are trusted to a few usual sizes only.
         values = np.clip(values, c.neutral - 5 * c.scale, c.neutral + 5 * c.scale)
         at[name] = dict(zip(c.parameters, values.tolist(), strict=True))

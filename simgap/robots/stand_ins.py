@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.verdict import MOST, RULED_OUT
 from simgap.robots.borne_out import BORNE_OUT, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
@@ -161,10 +161,5 @@ def _told_apart(causing: _Fit, other: _Fit, lacking: _Fit) -> bool:
 
 def log_prior(f: Forms, model: Model) -> float:
     """Log prior of a set's parameters at its mode, constants left out (Cauchy; see `Candidate`)."""
-    at, out = f.gap.nuisance.shape[1], 0.0
-    for j in model.effects:
-        k = f.gap.candidates[j].at.size
-        x = model.x[at : at + k]
-        out -= 0.5 * (1 + k) * float(np.log1p(x @ x))
-        at += k
-    return out
+    each = [model.x[mine] for mine in coordinates(f, model.effects).values()]
+    return -sum(0.5 * (1 + x.size) * float(np.log1p(x @ x)) for x in each)

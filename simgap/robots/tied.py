@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
+from simgap.latest import latest
 from simgap.robots.whiten import Block, Source
 
 dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
@@ -53,13 +54,13 @@ LATEST = 2  # numerics: variances of a part whose factors are kept: most differe
 
 @dataclass(frozen=True)
 class Tied:
-    """A block's parts; `trace` (K,) of every source's covariance at s = 1; `latest` of each part what it was
+    """A block's parts; `trace` (K,) of every source's covariance at s = 1; `kept` of each part what it was
     at its latest variances."""
 
     parts: tuple[_Part, ...]
     size: int
     trace: np.ndarray
-    latest: tuple[dict, ...]
+    kept: tuple[dict, ...]
 
     @classmethod
     def of(cls, block: Block, residual: np.ndarray, names: Sequence[str]) -> Tied:
@@ -94,14 +95,10 @@ class Tied:
         inner, pull = np.eye(states), np.zeros(states)
         square = half = 0.0
         factors, whites, moved = [], [], []
-        for part, latest in zip(self.parts, self.latest, strict=True):
+        for part, store in zip(self.parts, self.kept, strict=True):
             key = tuple(float(variance[k]) for k, _ in part.sources)
-            if key not in latest:
-                done = part.whitened(key)
-                while len(latest) >= LATEST:
-                    del latest[next(iter(latest))]
-                latest[key] = done
-            factor, white, start, product, own = latest[key]
+            done = latest(store, key, lambda part=part, key=key: part.whitened(key), LATEST)
+            factor, white, start, product, own = done
             inner += product
             pull += start.T @ white
             square += float(white @ white)

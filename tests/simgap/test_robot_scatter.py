@@ -7,13 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from simgap_swing import Swing, log
 
+from hmmseg.errors import InputError
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.robots.borne_out import folds_of
+from simgap.robots.diagnose import diagnose
 from simgap.robots.linear import Linear
 from simgap.robots.scatter import over_numerics, over_rivals, scattering
 from simgap.robots.verdict import _beside_numerics
+from simgap.simulators.user import checked
 
 LOGS, N = 6, 60
 
@@ -21,17 +25,17 @@ LOGS, N = 6, 60
 def gap(sizes, noise: float = 1.0, names=("slope", "other")) -> tuple[Gap, np.ndarray]:
     """Logs in which the first effect has these sizes, and a second one that has none."""
     rng = np.random.default_rng(5)
-    log = np.repeat(np.arange(LOGS), N)
+    of = np.repeat(np.arange(LOGS), N)
     zeros, time = np.zeros(LOGS * N, int), np.tile(np.arange(N) * 0.01, LOGS)
-    rows = Rows(log, zeros, zeros, time, tuple("abcdef"), ("y",), ("whole",))
+    rows = Rows(of, zeros, zeros, time, tuple("abcdef"), ("y",), ("whole",))
     shapes = [np.sin(40 * time), np.cos(23 * time)]
-    residual = np.repeat(sizes, N) * shapes[0] + noise * rng.standard_normal(log.size)
+    residual = np.repeat(sizes, N) * shapes[0] + noise * rng.standard_normal(of.size)
     one, none, far = np.ones(1), np.zeros(1), np.full(1, 50.0)
     made = tuple(
-        Candidate(n, ("size",), none, none, one, np.zeros(log.size), s[:, None], -far, far)
+        Candidate(n, ("size",), none, none, one, np.zeros(of.size), s[:, None], -far, far)
         for n, s in zip(names, shapes, strict=True)
     )
-    return Gap(rows, residual, np.zeros((log.size, 0)), made), log
+    return Gap(rows, residual, np.zeros((of.size, 0)), made), of
 
 
 def test_logs_that_agree_leave_the_interval_and_others_widen_it():
@@ -86,3 +90,9 @@ def test_logs_of_one_group_are_held_out_together():
     object.__setattr__(linear, "rows", rows)  # all that folds are made of
     fold = folds_of(linear, 4, groups=[100, 200, 100, 200])
     assert fold.tolist() == [0] * 3 + [1] * 3 + [0] * 3 + [1] * 3
+
+
+@pytest.mark.parametrize("groups", [[1, 2, 1], [4, 4]])
+def test_groups_that_nothing_can_be_held_out_by_are_refused(groups):
+    with pytest.raises(InputError, match=r"groups: are \d in \d groups for 2 logs; expected"):
+        diagnose(checked(Swing(), "Swing"), [log(1), log(2)], groups=groups)

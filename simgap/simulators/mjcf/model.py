@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from hmmseg.robust import bridged
+from simgap.latest import latest
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
-from simgap.simulators.mjcf.latest import latest
 from simgap.simulators.mjcf.map import Map
 from simgap.simulators.mjcf.runs import Runs
 from simgap.simulators.mjcf.setting import Setting

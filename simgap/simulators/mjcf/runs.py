@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
-from simgap.simulators.mjcf.latest import latest
 from simgap.simulators.mjcf.signals import Side, aligned
 from simgap.simulators.protocol import Channel, Channels
 from simgap.simulators.recording import Recording
