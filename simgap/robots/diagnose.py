@@ -32,7 +32,8 @@ from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import pruned
 from simgap.robots.scatter import over_rivals
-from simgap.robots.search import Found, point_of, search
+from simgap.robots.search import Found, search
+from simgap.robots.settle import settled
 from simgap.robots.stand_ins import stand_ins
 from simgap.robots.twins import Twins, healthy_twins
 from simgap.robots.verdict import RobotVerdict, verdict_on
@@ -40,7 +41,6 @@ from simgap.robots.whiten import NONE, Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-REFITS = 3  # numerics: linearisations on the way to the least squares, discrepancies learned anew at each
 STAGES = 14  # look: what a progress bar counts at most
 
 
@@ -130,15 +130,12 @@ def _diagnosed(
     twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
     found = search(composed, parts, wanted, tell, forced, twins.factor, kept.of("search"), plain)
     fold = folds_of(found.linear, len(composed.recordings), groups)
-    if forced:
-        borne = tuple(found.names[j] for j in found.models[0].effects)
-        point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
-    else:
+    borne, point = found.best, found.linear.point
+    if not forced:
         tell("held-out logs")
         borne, point = kept("borne out", lambda: pruned(composed, parts, found, fold, twins.factor))
-    tell("refit")
-    settled = kept("settled", lambda: _settled(composed, point, twins.factor))
-    ended = _refitted(composed, parts, settled, wanted, borne, twins.factor)
+    tell("all candidates there")
+    ended = _about(composed, parts, found, point, wanted, borne, twins.factor)
     tell("shares")
     given = (whole, composed, parts, ended, plain.point, twins, fold, seed, wanted, bool(forced))
     verdict = kept("verdict", lambda: _concluded(*given))
@@ -186,14 +183,17 @@ def _told_by_logs(composed: Composed, said: Progress, kept: Kept) -> tuple[Compo
     return composed, plain, alike
 
 
-def _refitted(
-    composed: Composed, phases: Phases, point: Point, wanted: Sequence[str], borne: Sequence[str],
-    factor: np.ndarray,
+def _about(
+    composed: Composed, phases: Phases, found: Found, point: Point, wanted: Sequence[str],
+    borne: Sequence[str], factor: np.ndarray,
 ) -> Found:  # fmt: skip
-    """Everything linear about the best fit of what was borne out, its discrepancies, and that set there."""
-    linear = linearise(composed, point, [*fitted_along(composed), *wanted])
-    cov = covariances(composed, linear, factor)
-    off = learned(cov, linear.residual) if len(cov.blocks) else NONE
+    """Everything linear about the best fit of what was borne out, its discrepancies, and that set there; what
+    the search found out there is not worked out again."""
+    linear, cov, off = found.linear, found.covariances, found.discrepancy
+    if point != linear.point:
+        linear = linearise(composed, point, [*fitted_along(composed), *wanted])
+        cov = covariances(composed, linear, factor)
+        off = learned(cov, linear.residual) if len(cov.blocks) else NONE
     usable = [n for n in wanted if n in linear.moved]
     f = forms(gap_of(composed, linear, cov.whitener(off), phases, usable))
     causes = tuple(sorted(usable.index(n) for n in borne))
@@ -233,25 +233,16 @@ def _every(whole: Composed, point: Point, causes: Sequence[str], phases: Phases)
     return forms(gap_of(whole, linear, covariances(whole, linear).whitener(), phases, causes))
 
 
-def _settled(composed: Composed, point: Point, factor: np.ndarray | None = None) -> Point:
-    """The point of least squares, discrepancies learned anew on the way there."""
-    for _ in range(REFITS if point else 0):
-        rough = linearise(composed, point, [])
-        cov = covariances(composed, rough, factor)
-        point = moved_to(composed, rough, cov.whitener(learned(cov, rough.residual)), point)
-    return point
-
-
 def _plain(composed: Composed, point: Point, wanted: Sequence[str]) -> Linear:
     """The gap as the simulator comes, with what was never measured fitted, and all sensitivities there."""
-    return linearise(composed, _settled(composed, point), [*point, *wanted])
+    return linearise(composed, settled(composed, point).point, [*point, *wanted])
 
 
 def _least_squares(composed: Composed, plain: Linear, sensor: Whitener) -> Linear:
     """The gap as the simulator comes at its best: whatever the causes gain must be gained over this."""
     if not plain.point:
         return plain
-    return linearise(composed, moved_to(composed, plain, sensor, plain.point), [])
+    return linearise(composed, moved_to(composed, plain, sensor, plain.point).point, [])
 
 
 def _alike(composed: Composed, linear: Linear, names: Sequence[str]) -> Identifiability:

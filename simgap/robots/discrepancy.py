@@ -18,15 +18,20 @@ WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 ENOUGH = 40  # learned: windows from which discrepancies are learned
 
 
-def learned(cov: Covariances, residual: np.ndarray) -> Discrepancy:
-    """The discrepancy of a residual (N,); channels for which it gains nothing have none."""
+def learned(cov: Covariances, residual: np.ndarray, near: Discrepancy | None = None) -> Discrepancy:
+    """The discrepancy of a residual (N,); channels for which it gains nothing have none. `near`: that of a
+    residual of which this one is a part, with which to begin; what that has none of, this has none of."""
     names = tuple(dict.fromkeys(n for b in cov.blocks for n in b.sources))
+    if near is not None:
+        names = tuple(n for n in names if n in near.scale)
     rows = sum(b.rows.size for b in cov.blocks) / max(len(cov.blocks), 1)
     every = max(1, int(len(cov.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
     terms = [Tied.of(b, residual[b.rows], names) for b in cov.blocks[::every]]
     kept = list(range(len(names)))
     x = np.full(len(kept), -np.inf)
-    for k in kept:
+    if near is not None:
+        x = np.array([2 * np.log(near.scale[n]) for n in names])
+    for k in kept if near is None else ():
         guess = _first_guess(terms, k)
         trial = {
             v: _value(np.append(x[:k], v), terms, kept[: k + 1]) for v in guess - np.arange(0.0, 19.0, 3.0)

@@ -113,7 +113,7 @@ def explained(
     names, _ = regimes_of(rows)
 
     def least(*points: Point) -> np.ndarray:
-        found = [*points, *(moved_to(composed, linear, sensor, p) for p in points)]
+        found = [*points, *(moved_to(composed, linear, sensor, p).point for p in points)]
         return every(min(found, key=lambda p: asked(p).sum()))
 
     along = fitted_along(composed)

@@ -3,106 +3,166 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from simgap.progress import say
-from simgap.robots.linear import Base, Linear, base_at, numeric_at, vary
+from simgap.robots.linear import STEP, Base, Linear, base_at, numeric_at, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.whiten import Whitener
 
 STEPS = 8  # numerics: evaluations of a least-squares fit
+HALVINGS = 5  # numerics: of a step that straight lines took too far
+REACH = 3.0  # numerics: usual sizes: how far a fit's first step may go
+WIDE = 3.0  # numerics: posterior standard deviations: a finite difference
+FINEST = 1e-4  # numerics: usual sizes: the least one
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a set fits best, and what that `gained` over where the fit began [nats]."""
+
+    point: Point
+    gained: float
 
 
 def moved_to(
     composed: Composed, linear: Linear, whiten: Whitener, point: Point, only: Sequence[str] | None = None
-) -> Point:
+) -> Fit:
     """The point of least squares of whitened residuals, from a start; priors as in attribution. `only`: the
-    effects that are moved, all by default."""
-    if only is not None and set(only) != set(point):
-        held = {e: theta for e, theta in point.items() if e not in only}
-        free = {e: theta for e, theta in point.items() if e in only}
-        return {**point, **_moved(composed, linear, whiten, free, held)}
-    return _moved(composed, linear, whiten, point, {})
+    effects that are moved, all by default.
+
+    A start that straight lines took too far, so that it is worse than where they begin, is taken back by
+    halves towards there.
+    """
+    free = {e: theta for e, theta in point.items() if only is None or e in only}
+    held = {e: theta for e, theta in point.items() if e not in free}
+    if not any(free.values()):
+        return Fit(point, 0.0)
+    squares = _Squares(composed, linear, whiten, held, free)
+    here, there = squares.coordinates(linear.point), squares.coordinates(free)
+    cost, begin = squares.cost(here), there
+    if not np.array_equal(here, there):
+        for _ in range(HALVINGS):
+            if squares.cost(begin) <= cost:
+                break
+            begin = 0.5 * (here + begin)
+        else:
+            begin = here
+    first = squares.cost(begin)
+    if not np.isfinite(first):
+        return Fit(point, 0.0)
+    # The first step that is allowed is as long as the start is far from 0, so 0 is put where that suits.
+    offset = begin - REACH / np.sqrt(begin.size)
+    derivative: Any = lambda y: squares.jacobian(y + offset)  # noqa: E731
+    done = least_squares(
+        lambda y: squares.residual(y + offset), begin - offset, derivative,
+        bounds=(squares.low - offset, squares.high - offset), max_nfev=STEPS, method="trf", ftol=1e-5,
+    )  # fmt: skip
+    x = np.clip(done.x + offset, squares.low, squares.high)
+    return Fit({**point, **squares.at(x)}, first - float(done.cost))
 
 
-def _moved(
-    composed: Composed, linear: Linear, whiten: Whitener, point: Point, held: Point
-) -> dict[str, Mapping[str, float]]:
-    names = [(e, p) for e, theta in point.items() for p in theta]
-    known = [composed.effects[e].parameters[p] for e, p in names]
-    if not names:
-        return dict(point)
-    sd = np.array([p.sd for p in known])
-    low, high = np.array([p.low for p in known]), np.array([p.high for p in known])
-    nominal = np.array([p.nominal for p in known])
-    loose = np.array([composed.effects[e].fitted for e, _ in names])
+@dataclass
+class _Squares:
+    """Whitened residuals and priors of the effects that are `free`, at coordinates x (n,) in usual sizes from
+    nominal, while those that are `held` stay; `latest`: the derivative is asked for where the residual was;
+    `slopes`: by effect the squares (k,) of its latest derivatives."""
 
-    def at(x: np.ndarray) -> dict[str, dict[str, float]]:
+    composed: Composed
+    linear: Linear
+    whiten: Whitener
+    held: Point
+    free: Point
+    latest: dict[bytes, Base] = field(default_factory=dict)
+    slopes: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        effects = self.composed.effects
+        self.names = [(e, p) for e, theta in self.free.items() for p in theta]
+        order = [(e, p) for e in self.free for p in effects[e].parameters]
+        assert order == self.names, "a point names all parameters of its effects, in their order"
+        known = [effects[e].parameters[p] for e, p in self.names]
+        self.sd, self.nominal = np.array([p.sd for p in known]), np.array([p.nominal for p in known])
+        self.low = (np.array([p.low for p in known]) - self.nominal) / self.sd
+        self.high = (np.array([p.high for p in known]) - self.nominal) / self.sd
+        self.loose = np.array([effects[e].fitted for e, _ in self.names])
+        for effect in self.free:
+            if effect in self.linear.moved:
+                self._learn(effect, self.whiten(_finite(self.linear.moved[effect].jacobian)))
+
+    def at(self, x: np.ndarray) -> dict[str, Mapping[str, float]]:
+        """The free effects' values."""
         out: dict[str, dict[str, float]] = {}
-        for (effect, short), value in zip(names, nominal + sd * x, strict=True):
+        for (effect, short), value in zip(self.names, self.nominal + self.sd * x, strict=True):
             out.setdefault(effect, {})[short] = float(value)
-        return out
+        return dict(out)
 
-    last: dict[bytes, Base] = {}  # the derivative is asked for where the residual was
+    def coordinates(self, point: Point) -> np.ndarray:
+        """The coordinates of a point, just within bounds; what it does not name is neutral."""
+        neutral = {e: self.composed.effects[e].neutral() for e in self.free}
+        value = np.array([{**neutral[e], **point.get(e, {})}[p] for e, p in self.names])
+        return np.clip((value - self.nominal) / self.sd, self.low + 1e-6, self.high - 1e-6)
 
-    def based(x: np.ndarray) -> Base:
-        if x.tobytes() not in last:
-            say(f"fitting {', '.join(point)}")
-            last.clear()
-            last[x.tobytes()] = base_at(composed, {**held, **at(x)})
-        return last[x.tobytes()]
+    def base(self, x: np.ndarray) -> Base:
+        """Rollouts there."""
+        if x.tobytes() not in self.latest:
+            say(f"fitting {', '.join(self.free)}")
+            self.latest.clear()
+            self.latest[x.tobytes()] = base_at(self.composed, {**self.held, **self.at(x)})
+        return self.latest[x.tobytes()]
 
-    def residual(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([_white(linear, whiten, based(x)), _prior(x, loose)])
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        """Infinite where a window diverges that the linear model has: a fit turns back there."""
+        mine = np.isfinite(self.linear.residual)
+        found = np.where(mine, self.linear.rows.observed - self.base(x).rows, 0.0)
+        white = self.whiten(found) if np.isfinite(found).all() else np.full(found.size, np.inf)
+        return np.concatenate([white, _prior(x, self.loose)])
 
-    def jacobian(x: np.ndarray) -> np.ndarray:
-        here, base = at(x), numeric_at(composed, based(x))
-        columns = []
-        for effect in here:
-            moved = vary(composed, base, linear.starts, effect)
-            size = len(composed.effects[effect].parameters)
-            columns.append(np.zeros((linear.residual.size, size)) if moved is None else moved.jacobian)
-        whole = np.concatenate(columns, 1) * sd
-        slope = np.where(loose, 1.0, _slope(x))
-        return np.concatenate([-whiten(np.where(np.isfinite(whole), whole, 0.0)), np.diag(slope)])
+    def cost(self, x: np.ndarray) -> float:
+        """Half the squares [nats]."""
+        return 0.5 * float(np.sum(self.residual(x) ** 2))
 
-    order = [(e, p) for e in point for p in composed.effects[e].parameters]
-    assert order == names, "a point names all parameters of its effects, in their order"
-    begin = np.array([(point[e][p] - q.nominal) / q.sd for (e, p), q in zip(names, known, strict=True)])
-    bounds = (low - nominal) / sd, (high - nominal) / sd
-    inside = np.clip(begin, bounds[0] + 1e-6, bounds[1] - 1e-6)
-    derivative: Any = jacobian
-    done = least_squares(residual, inside, derivative, bounds=bounds, max_nfev=STEPS, method="trf", ftol=1e-5)
-    return dict(at(np.clip(done.x, *bounds)))
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Derivatives of `residual` by x."""
+        base, columns = numeric_at(self.composed, self.base(x)), []
+        for effect in self.free:
+            step = self._step(effect)
+            moved = vary(self.composed, base, self.linear.starts, effect, step=step)
+            size = len(self.composed.effects[effect].parameters)
+            white = np.zeros((self.linear.residual.size, size))
+            if moved is not None:
+                white = self.whiten(_finite(moved.jacobian))
+                self._learn(effect, white)
+            columns.append(white)
+        slope = np.where(self.loose, 1.0, _slope(x))
+        return np.concatenate([-np.concatenate(columns, 1) * self.sd, np.diag(slope)])
+
+    def _learn(self, effect: str, white: np.ndarray) -> None:
+        mine = np.array([e == effect for e, _ in self.names])
+        self.slopes[effect] = np.sum((white * self.sd[mine]) ** 2, 0)
+
+    def _step(self, effect: str) -> np.ndarray | None:
+        """Steps (k,) of the finite differences in usual sizes: as wide as the parameters are uncertain, for
+        what curves or kinks within a wider one is not the slope that a fit needs."""
+        if effect not in self.slopes:
+            return None
+        return np.clip(WIDE / np.sqrt(1 + self.slopes[effect]), FINEST, STEP)
 
 
-def cost_at(composed: Composed, linear: Linear, whiten: Whitener, point: Point) -> float:
-    """Half the squares that `moved_to` makes least, at a point [nats]."""
-    white = _white(linear, whiten, base_at(composed, point))
-    out = 0.5 * float(white @ white)
-    for effect, theta in point.items():
-        known = composed.effects[effect]
-        x = np.array([(v - known.parameters[p].nominal) / known.parameters[p].sd for p, v in theta.items()])
-        out += 0.5 * float(np.sum(_prior(x, np.full(x.size, known.fitted)) ** 2))
-    return out
-
-
-def _white(linear: Linear, whiten: Whitener, base: Base) -> np.ndarray:
-    """Whitened residuals (N,) at a base, of the rows that the linear model has."""
-    found = linear.rows.observed - base.rows
-    # A rollout that diverged is as far off as the recording is from its mean.
-    found = np.where(np.isfinite(found), found, linear.rows.observed)
-    return whiten(np.where(np.isfinite(linear.residual), found, 0.0))
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def _prior(x: np.ndarray, loose: np.ndarray) -> np.ndarray:
-    return np.where(loose, x, np.sqrt(2 * np.log1p(x**2)))
+    """Half their squares are minus the log priors: Gauss, or log(1 + x^2)."""
+    return np.where(loose, x, np.sign(x) * np.sqrt(2 * np.log1p(x**2)))
 
 
 def _slope(x: np.ndarray) -> np.ndarray:
-    """Derivative of sqrt(2 log(1 + x^2)), which is sqrt(2) sign(x) near 0 (0 at 0)."""
+    """Derivative of sign(x) sqrt(2 log(1 + x^2)), which is sqrt(2) at 0."""
     root = np.sqrt(2 * np.log1p(x**2))
-    return np.where(root > 1e-9, 2 * x / (1 + x**2) / np.maximum(root, 1e-9), 0.0)
+    return np.where(root > 1e-6, 2 * np.abs(x) / (1 + x**2) / np.maximum(root, 1e-6), np.sqrt(2.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from simgap.attribution.problem import Rows as GapRows
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
-from simgap.robots.whiten import Whitener
 
 
 def fitted_along(composed: Composed) -> tuple[str, ...]:
@@ -20,9 +19,14 @@ def fitted_along(composed: Composed) -> tuple[str, ...]:
 
 
 def gap_of(
-    composed: Composed, linear: Linear, whiten: Whitener, phases: Phases, candidates: Sequence[str]
+    composed: Composed,
+    linear: Linear,
+    whiten: Callable[[np.ndarray], np.ndarray],
+    phases: Phases,
+    candidates: Sequence[str],
 ) -> Gap:
-    """The gap about the linear model's point, at which it is exact; `candidates` in this order."""
+    """The gap about the linear model's point, at which it is exact; `candidates` in this order. `whiten`
+    takes rows (N,) or columns (N, k)."""
     finite = np.isfinite(linear.residual)
     residual = whiten(np.where(finite, linear.residual, 0.0))
     along, own = [], []

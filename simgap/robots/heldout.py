@@ -84,7 +84,7 @@ def _plain(composed: Composed, point: Point, logs: Sequence[int]) -> Point:
         return point
     part = composed.along(logs)
     linear = linearise(part, point, list(point))
-    return moved_to(part, linear, covariances(part, linear).whitener(), point)
+    return moved_to(part, linear, covariances(part, linear).whitener(), point).point
 
 
 def _measured(
@@ -137,6 +137,6 @@ def _refitted(
 ) -> Point:
     """The point fitted to some of the logs alone, exactly."""
     part = composed.along(logs)
-    linear = linearise(part, point, list(point))
+    linear = linearise(part, found.linear.point, [])
     cov = covariances(part, linear)
-    return moved_to(part, linear, cov.whitener(found.discrepancy), point, only)
+    return moved_to(part, linear, cov.whitener(found.discrepancy), point, only).point

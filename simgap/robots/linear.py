@@ -166,9 +166,11 @@ def vary(
     starts: Mapping[str, np.ndarray],
     name: str,
     at: Mapping[str, float] | None = None,
+    step: np.ndarray | None = None,
 ) -> Moved | None:
     """How an effect moves the rows from the base; None where it diverges. Where the base's point has it
-    act, or `at` is None, about the point itself; else about `at`, reached from neutral."""
+    act, or `at` is None, about the point itself; else about `at`, reached from neutral. `step` (k,): finite
+    differences of its parameters, in usual sizes."""
     effect = composed.effects[name]
     neutral = effect.neutral()
     now = {**neutral, **base.point.get(name, {})}
@@ -177,11 +179,12 @@ def vary(
         here = {**neutral, **at}
         rows = _rows_at(composed, base, starts, name, here)
         shift = rows - base.rows
-    columns = _each_log_at_once(composed, base, starts, name, here, rows) if effect.by_log else []
-    for short in () if effect.by_log else effect.parameters:
-        step = step_of(composed, name, short, here[short])
-        there = _rows_at(composed, base, starts, name, {**here, short: here[short] + step})
-        columns.append((there - rows) / step)
+    sizes = np.full(len(effect.parameters), STEP) if step is None else step
+    columns = _each_log_at_once(composed, base, starts, name, here, rows, sizes) if effect.by_log else []
+    for short, size in () if effect.by_log else zip(effect.parameters, sizes, strict=True):
+        move = step_of(composed, name, short, here[short], size)
+        there = _rows_at(composed, base, starts, name, {**here, short: here[short] + move})
+        columns.append((there - rows) / move)
     jacobian = np.stack(columns, 1)
     fine = np.isfinite(base.rows)
     if not (np.isfinite(jacobian[fine]).all() and np.isfinite(shift[fine]).all()):
@@ -209,6 +212,7 @@ def _each_log_at_once(
     name: str,
     here: Mapping[str, float],
     rows: np.ndarray,
+    sizes: np.ndarray,
 ) -> list[np.ndarray]:
     """Derivatives (N,) by every parameter of an effect that each log has of its own: logs do not act on each
     other, so one is varied in all of them together. Parameters go by log, then by kind."""
@@ -217,7 +221,7 @@ def _each_log_at_once(
     found = []
     for kind in range(kinds):
         mine = names[kind::kinds]
-        step = step_of(composed, name, mine[0], here[mine[0]])
+        step = step_of(composed, name, mine[0], here[mine[0]], sizes[kind::kinds].min())
         there = _rows_at(composed, base, starts, name, {**here, **{n: here[n] + step for n in mine}})
         found.append((there - rows) / step)
     log = composed.rows.log
@@ -245,10 +249,10 @@ def _rows_at(
     return out
 
 
-def step_of(composed: Composed, effect: str, name: str, value: float) -> float:
-    """A finite difference that stays within bounds."""
+def step_of(composed: Composed, effect: str, name: str, value: float, size: float = STEP) -> float:
+    """A finite difference of `size` usual sizes that stays within bounds."""
     parameter = composed.effects[effect].parameters[name]
-    step = STEP * parameter.sd
+    step = size * parameter.sd
     return step if value + step <= parameter.high else -step
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from simgap.attribution.posterior import forms
 from simgap.robots.borne_out import weakest
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.search import Found, point_of
+from simgap.robots.search import Found
+from simgap.robots.settle import settled
 from simgap.robots.whiten import covariances
 
 
@@ -28,19 +28,17 @@ def pruned(
     """The effects that are left, and the point of their best fit. `fold` (N,): of each row; `factor` (N,)
     multiplies the noise's sd."""
     along = fitted_along(composed)
-    kept = tuple(found.names[j] for j in found.models[0].effects)
-    point = point_of(composed, found.forms, found.models[0].effects, found.linear.point)
-    linear, whiten = found.linear, found.whiten
+    kept, point, linear, whiten = found.best, found.linear.point, found.linear, found.whiten
     while kept:
-        point = moved_to(composed, linear, whiten, point)
-        linear = linearise(composed, point, [*along, *kept])
-        cov = covariances(composed, linear, factor)
-        whiten = cov.whitener(learned(cov, linear.residual))
         f = forms(gap_of(composed, linear, whiten, phases, kept))
         rows = np.flatnonzero(np.isfinite(linear.residual))
         out = weakest(f.gap, range(len(kept)), fold[rows])
         if out is None:
             break
         kept = tuple(n for j, n in enumerate(kept) if j != out)
-        point = {n: values for n, values in point.items() if n in along or n in kept}
+        left = {n: values for n, values in point.items() if n in along or n in kept}
+        point = settled(composed, left, factor).point
+        linear = linearise(composed, point, [*along, *kept])
+        cov = covariances(composed, linear, factor)
+        whiten = cov.whitener(learned(cov, linear.residual))
     return kept, point

@@ -8,7 +8,7 @@ and before a search ends all are asked again where it would end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,17 +16,20 @@ import numpy as np
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.progress import Progress, say
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import cost_at, moved_to
+from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
+from simgap.robots.judged import Judge
 from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, base_at, linearise, numeric_at, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.whiten import Covariances, Discrepancy, Whitener, covariances
+from simgap.robots.settle import settled
+from simgap.robots.whiten import NONE, Covariances, Discrepancy, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with
-SETTLED = 2.0  # numerics: nats that a further round must gain
+PROPOSED = 4  # numerics: sets by each scale that are judged by the discrepancy that they leave
+FAR = 5.0  # numerics: usual sizes
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Step:
     point: Point
     best: tuple[str, ...] = ()
     seen: frozenset[tuple[str, ...]] = frozenset()
-    settled: bool = False
+    ended: bool = False
     field: tuple[str, ...] = ()
     whole: bool = True
 
@@ -70,26 +73,24 @@ def search(
     kept: Kept = NOWHERE,
     plain: Linear | None = None,
 ) -> Found:
-    """Search until the best set and its parameters stay: where there are many windows in some of them first,
-    from which all are gone on with. `plain`: all candidates' sensitivities at a point, if they are known."""
-    point: Point = {n: composed.effects[n].neutral() for n in fitted_along(composed)}
-    begin = Step(point)
+    """Search until the best set stays: where there are many windows in some of them first, from which all are
+    gone on with. `plain`: all candidates' sensitivities where what is fitted along fits best without them, if
+    they are known."""
+    ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor, plain)
+    begin = Step(kept("fitted along", ask.along))
     few = composed.thinned()
     if not forced and len(few) < len(composed.windows):
         part, mine = composed.among(few), np.isin(composed.rows.window, few)
         noise = None if factor is None else factor[mine]
         known = None if plain is None else plain.among(part, mine)
-        ask = _Ask(part, phases, tuple(candidates), (), noise, known)
+        some = _Ask(part, phases, tuple(candidates), (), noise, known)
 
         def ended() -> Step:
-            found, last = _searched(ask, Step(_along(ask, point)), tell, kept.of("some windows"))
-            there = point_of(part, found.forms, found.models[0].effects, found.linear.point)
-            return Step(there, found.best, field=last.field, whole=False)
+            last = _searched(some, begin, tell, kept.of("some windows"))[1]
+            point = settled(composed, last.point, factor).point
+            return Step(point, last.best, field=last.field, whole=False)
 
         begin = kept("some windows", ended)
-    ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor, plain)
-    if not begin.best:
-        begin = Step(kept("fitted along", lambda: _along(ask, point)))
     return _searched(ask, begin, tell, kept)[0]
 
 
@@ -104,6 +105,13 @@ class _Ask:
     forced: tuple[str, ...]
     factor: np.ndarray | None
     plain: Linear | None = None
+
+    def along(self) -> Point:
+        """What is fitted along, without any cause."""
+        if self.plain is not None:
+            return self.plain.point
+        neutral = {n: self.composed.effects[n].neutral() for n in fitted_along(self.composed)}
+        return settled(self.composed, neutral, self.factor).point
 
     def asked(self, step: Step, number: int) -> tuple[str, ...]:
         """The candidates that a round asks: all in the last one."""
@@ -120,9 +128,9 @@ class _Ask:
             return known
         return linearise(self.composed, point, names)
 
-    def covariances(self, linear: Linear) -> Covariances:
-        """Of the windows about a point."""
-        return covariances(self.composed, linear, self.factor)
+    def forms(self, linear: Linear, whiten: Whitener, names: Sequence[str]) -> Forms:
+        """The gap about a point, of these candidates."""
+        return forms(gap_of(self.composed, linear, whiten, self.phases, names))
 
 
 def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> tuple[Found, Step]:
@@ -139,100 +147,81 @@ def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> tuple[Found,
         tell(f"round {number + 1}")
         after = kept(f"round {number + 1}", made)
         tell(f"round {number + 1}: {' + '.join(after.best) or 'nothing'}")
-        if after.settled:
+        if after.ended:
             break
         step = after
     return _round(ask, step, number)[0] if found is None else found, after
 
 
-def _along(ask: _Ask, point: Point) -> Point:
-    """What is fitted along, without any cause."""
-    for _ in range(2 if point else 0):
-        rough = linearise(ask.composed, point, list(point))
-        cov = ask.covariances(rough)
-        point = moved_to(ask.composed, rough, cov.whitener(learned(cov, rough.residual)), point)
-    return point
-
-
 def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
-    """One round: what is best about the step's point, and where to go on."""
+    """One round: what is best about the step's point, and where that settles."""
     composed, asked = ask.composed, ask.asked(step, number)
     linear = ask.linearised(step.point, asked)
     usable = [n for n in asked if n in linear.moved]
-    cov = ask.covariances(linear)
+    cov = covariances(composed, linear, ask.factor)
     off = learned(cov, linear.residual)
-    whiten = cov.whitener(off)
-    every = forms(gap_of(composed, linear, whiten, ask.phases, usable))
-    linear, names = leaders(composed, linear, whiten, every, step.best)
-    f = forms(gap_of(composed, linear, whiten, ask.phases, names))
-    if ask.forced:
-        chosen = tuple(j for j, n in enumerate(names) if n in ask.forced)
-        models = [fitted(f, chosen), fitted(f, ())]
-    else:
-        models = [one_more(f, [names.index(n) for n in step.best if n in names])]
-    now = tuple(sorted(names[j] for j in models[0].effects))
-    found = Found(linear, whiten, cov, off, f, tuple(models), now)
+    # What a cause does is hidden by the discrepancy that is left without it, and what is none of the causes'
+    # doing misleads without one: what comes near by either is asked.
+    scales = [cov.whitener(d) for d in ((off, NONE) if off else (NONE,))]
+    every = [ask.forms(linear, whiten, usable) for whiten in scales]
+    linear, names = leaders(composed, linear, every, ask.forced or step.best)
+    held = tuple(n for n in names if n in (ask.forced or step.best))
+    judge = Judge(composed, ask.phases, linear, cov, off, every[0].log_odds)
+    sets = {held}
+    if not ask.forced:
+        for whiten in scales:
+            f = ask.forms(linear, whiten, names)
+            near = one_more(f, [names.index(n) for n in held])[:PROPOSED]
+            sets |= {tuple(names[j] for j in model.effects) for model in near}
+    judged = {one: judge(one) for one in sorted(sets)}
+    best = max(judged.values(), key=lambda one: one.score)
+    # Sets that take turns are alike, and none will win.
+    ends = {*best.names} == {*held} or tuple(sorted(best.names)) in step.seen or number == ROUNDS - 1
+    ends = ends and {*held} <= {*step.point}
+    best = judged[held] if ends else best
+    f = ask.forms(linear, best.whiten, names)
+    model = fitted(f, tuple(names.index(n) for n in best.names))
+    now = tuple(sorted(best.names))
+    found = Found(linear, best.whiten, cov, best.discrepancy, f, (model,), now)
     whole = len(asked) == len(ask.candidates)
     field = tuple(sorted({*names, *_nearest(every, now)})) if whole else step.field
-    first = number == 0 and not step.best and bool(step.point)  # what is fitted along is yet to follow
-    stays = now == step.best and not first
-    settled = stays and _gain(found) < SETTLED
-    again = now != step.best and now in step.seen  # sets that take turns are alike, and none will win
-    last = settled or again or number == ROUNDS - 1
-    if not last:
-        there = point_of(composed, f, models[0].effects, step.point)
-        point = moved_to(composed, linear, whiten, there)
-        # The mode, by which the set is chosen, weighs groups by what they leave; the exact fit does not, so
-        # that it may stay where the mode is not. A further round would then be this one again.
-        costs = [cost_at(composed, linear, whiten, p) for p in (step.point, point)] if stays else [np.inf, 0]
-        last = costs[0] - costs[1] < SETTLED
-    if last:
-        if not whole:
-            return found, replace(step, whole=True)
-        return found, replace(step, best=now, settled=True, field=field)
-    # Whatever the set has gained or lost changes what comes near beside it; where it stays, that stays too.
-    whole = now != step.best or len(field) == len(ask.candidates)
-    return found, Step(point, now, step.seen | {now}, field=field, whole=whole)
+    if ends:
+        return found, replace(step, ended=whole, field=field, whole=True)
+    first = moved_to(composed, linear, best.whiten, point_of(composed, f, model.effects, step.point))
+    point = settled(composed, first.point, ask.factor).point
+    # Whatever the set has gained or lost changes what comes near beside it.
+    return found, Step(point, now, step.seen | {now}, field=field)
 
 
-def _nearest(f: Forms, best: Sequence[str]) -> list[str]:
-    """The candidates that gain most beside these."""
+def _nearest(every: Sequence[Forms], best: Sequence[str]) -> list[str]:
+    """The candidates that gain most beside these, by either scale."""
+    return _ranked([_gains(f, best)[0] for f in every])[:LEADERS]
+
+
+def _gains(f: Forms, best: Sequence[str]) -> tuple[dict[str, float], dict[str, Model]]:
+    """Of every candidate beside these the score and the model."""
     own = {c.name: j for j, c in enumerate(f.gap.candidates)}
-    beside = [own[n] for n in best]
-    gain = {n: fitted(f, tuple(sorted((*beside, j)))).score for n, j in own.items() if n not in best}
-    return sorted(gain, key=lambda n: -gain[n])[:LEADERS]
+    beside = [own[n] for n in best if n in own]
+    models = {n: fitted(f, tuple(sorted((*beside, j)))) for n, j in own.items() if n not in best}
+    return {n: m.score for n, m in models.items()}, models
 
 
-def one_more(f: Forms, best: Sequence[int]) -> Model:
-    """The best set with one effect more than these at most, or one exchanged or left out: what is far off is
-    best moved towards in steps, each exact where it arrives."""
+def _ranked(gains: Sequence[Mapping[str, float]]) -> list[str]:
+    """Names by their better rank in several scores, best first."""
+    ranks = [sorted(one, key=lambda n: -one[n]) for one in gains]
+    return list(dict.fromkeys(name for level in zip(*ranks, strict=True) for name in level))
+
+
+def one_more(f: Forms, best: Sequence[int]) -> list[Model]:
+    """Sets with one effect more than these at most, or one exchanged or left out, best first: what is far off
+    is best moved towards in steps, each exact where it arrives."""
     every = range(len(f.gap.candidates))
     fewer = [tuple(j for j in best if j != out) for out in best]
     sets = {tuple(sorted({*kept, j})) for kept in (tuple(best), *fewer) for j in every} | {
         *fewer,
         tuple(best),
     }
-    return max((fitted(f, effects) for effects in sorted(sets)), key=lambda m: m.score)
-
-
-def _gain(found: Found) -> float:
-    """What the best set would gain by moving its parameters from the point to its mode [nats], linearly."""
-    gap, model = found.forms.gap, found.models[0]
-    x = np.concatenate(
-        [
-            np.zeros(gap.nuisance.shape[1]),
-            *[
-                ((gap.candidates[j].at - gap.candidates[j].neutral) / gap.candidates[j].scale)
-                for j in model.effects
-            ],
-        ]
-    )
-    z = gap.nuisance.shape[1]
-    away = (model.x - x)[z:]
-    if not away.size:
-        return 0.0
-    inner = np.linalg.inv(model.covariance[z:, z:] + 1e-12 * np.eye(away.size))
-    return 0.5 * float(away @ inner @ away)
+    return sorted((fitted(f, effects) for effects in sorted(sets)), key=lambda m: -m.score)
 
 
 def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point) -> Point:
@@ -247,36 +236,33 @@ def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point)
 
 
 def leaders(
-    composed: Composed, linear: Linear, whiten: Whitener, f: Forms, best: tuple[str, ...]
+    composed: Composed, linear: Linear, every: Sequence[Forms], best: Sequence[str]
 ) -> tuple[Linear, list[str]]:
-    """The candidates of `f` that gain most beside the best set, rolled out at their own best fits."""
-    usable = [c.name for c in f.gap.candidates]
-    held = [n for n in best if n in usable]
-    own = {n: j for j, n in enumerate(usable)}
-    with_best = tuple(sorted(own[n] for n in held))
-    gains, at = {}, {}
-    for name in usable:
-        if name in held:
-            continue
-        effects = tuple(sorted((*with_best, own[name])))
-        model = fitted(f, effects)
-        gains[name] = model.score
-        c = f.gap.candidates[own[name]]
-        values = c.neutral + c.scale * model.x[coordinates(f, effects)[own[name]]]
-        values = np.clip(values, c.low, c.high)
-        # Straight lines are trusted to a few usual sizes only.
-        values = np.clip(values, c.neutral - 5 * c.scale, c.neutral + 5 * c.scale)
-        at[name] = dict(zip(c.parameters, values.tolist(), strict=True))
-    first = sorted(gains, key=lambda n: -gains[n])[: max(LEADERS - len(held), 4)]
+    """The candidates that gain most beside the best set by any of these forms, rolled out at their own best
+    fits, and all of the set that there are."""
+    held = [n for n in best if n in linear.moved]
+    told = [_gains(f, held) for f in every]
+    first = _ranked([gains for gains, _ in told])[: max(LEADERS - len(held), 4)]
     base = numeric_at(composed, base_at(composed, linear.point))
     more = {}
     for name in sorted(first, key=lambda n: not composed.numeric(n)):
         say(f"{name} at its best")
-        if all(
-            abs(at[name][n] - p.nominal) < 1e-3 * p.sd for n, p in composed.effects[name].parameters.items()
-        ):
+        place = [sorted(gains, key=lambda n, gains=gains: -gains[n]).index(name) for gains, _ in told]
+        f, models = every[int(np.argmin(place))], told[int(np.argmin(place))][1]
+        at = _best_of(f, models[name], name)
+        known = composed.effects[name].parameters
+        if all(abs(at[n] - p.nominal) < 1e-3 * p.sd for n, p in known.items()):
             continue
-        one = vary(composed, base, linear.starts, name, at[name])
+        one = vary(composed, base, linear.starts, name, at)
         if one is not None:
             more[name] = one
     return linear.with_moved(more), sorted([*held, *first])
+
+
+def _best_of(f: Forms, model: Model, name: str) -> dict[str, float]:
+    """An effect's parameters in a model; straight lines are trusted to a few usual sizes only."""
+    number = next(j for j in model.effects if f.gap.candidates[j].name == name)
+    c = f.gap.candidates[number]
+    values = np.clip(c.neutral + c.scale * model.x[coordinates(f, model.effects)[number]], c.low, c.high)
+    values = np.clip(values, c.neutral - FAR * c.scale, c.neutral + FAR * c.scale)
+    return dict(zip(c.parameters, values.tolist(), strict=True))

@@ -21,14 +21,13 @@ from simgap.robots.borne_out import BORNE_OUT, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
-from simgap.robots.linear import linearise
+from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
 from simgap.robots.search import Found, leaders, point_of
+from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
 
-ROUNDS = 3  # numerics: of an exact fit, each linearised where the last ended
-SETTLED = 2.0  # numerics: squares that a further round must gain
 TRIED = 6  # numerics: effects that are tried in a cause's place: those that gain most there
 
 
@@ -55,8 +54,9 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Asked:
-    """What sets are compared in: windows, the fold and the factor on the noise's sd of each row (N,), and the
-    whitening by the discrepancies that the causes themselves leave, and by the sensors' noise alone."""
+    """What sets are compared in: windows, the fold and the factor on the noise's sd of each row (N,), the
+    whitening by the discrepancies that the causes themselves leave, and by the sensors' noise alone, and how
+    many windows the simulator diverges in with the causes."""
 
     composed: Composed
     phases: Phases
@@ -64,6 +64,7 @@ class _Asked:
     factor: np.ndarray
     whiten: Whitener
     sensor: Whitener
+    dropped: int
 
     def among(self, numbers: Sequence[int], point: Point) -> _Asked:
         """The same in some of the windows alone."""
@@ -72,18 +73,13 @@ class _Asked:
         linear = linearise(part, point, [])
         cov = covariances(part, linear, factor)
         whiten = cov.whitener(learned(cov, linear.residual))
-        return _Asked(part, self.phases, self.fold[mine], factor, whiten, cov.whitener())
+        return _Asked(part, self.phases, self.fold[mine], factor, whiten, cov.whitener(), linear.dropped)
 
     def fit(self, point: Point, causes: Sequence[str]) -> _Fit | None:
         """A set fitted exactly, from a point; None where the simulator diverges with it."""
-        along, squares = fitted_along(self.composed), np.inf
-        for _ in range(ROUNDS):
-            point = moved_to(self.composed, linearise(self.composed, point, []), self.whiten, point)
-            linear, before = linearise(self.composed, point, [*along, *causes]), squares
-            squares = float(np.sum(self.whiten(np.nan_to_num(linear.residual)) ** 2))
-            if before - squares < SETTLED:
-                break
-        if not {*causes} <= linear.moved.keys():
+        point = settled(self.composed, point, whiten=self.whiten).point
+        linear = linearise(self.composed, point, [*fitted_along(self.composed), *causes])
+        if linear.dropped > self.dropped or not {*causes} <= linear.moved.keys():
             return None
         f = forms(gap_of(self.composed, linear, self.whiten, self.phases, causes))
         every = tuple(range(len(causes)))
@@ -99,13 +95,16 @@ class _Asked:
         linear = linearise(self.composed, point, [*along, *here, *wanted])
         usable = [n for n in (*here, *wanted) if n in linear.moved]
         every = forms(gap_of(self.composed, linear, self.whiten, self.phases, usable))
-        linear, names = leaders(self.composed, linear, self.whiten, every, tuple(here))
+        linear, names = leaders(self.composed, linear, [every], here)
         f = forms(gap_of(self.composed, linear, self.whiten, self.phases, names))
         mine = [names.index(n) for n in here if n in names]
         sets = {j: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}
         gain = {j: fitted(f, effects).score for j, effects in sets.items()}
         first = sorted(gain, key=lambda j: -gain[j])[:TRIED]
-        return [(names[j], point_of(self.composed, f, sets[j], point)) for j in first]
+        return [(names[j], self._begun(linear, point_of(self.composed, f, sets[j], point))) for j in first]
+
+    def _begun(self, linear: Linear, point: Point) -> Point:
+        return moved_to(self.composed, linear, self.whiten, point).point
 
 
 def stand_ins(
@@ -125,7 +124,8 @@ def stand_ins(
     point = ended.linear.point
     acting = [n for n in point if n not in fitted_along(composed)]
     others = [n for n in wanted if n not in acting]
-    asked = [_Asked(composed, phases, fold, factor, ended.whiten, ended.covariances.whitener())]
+    given = composed, phases, fold, factor, ended.whiten, ended.covariances.whitener(), ended.linear.dropped
+    asked = [_Asked(*given)]
     few = composed.thinned()
     if len(few) < len(composed.windows) and np.unique(fold[np.isin(composed.rows.window, few)]).size > 2:
         asked.insert(0, asked[0].among(few, point))

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, lapack, solve_triangular
+from scipy.linalg import lapack
 
 from simgap.latest import latest
+from simgap.robots.triangular import factored, solved_by
 from simgap.robots.whiten import Block, Source
 
-dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
 dpotri: Any = lapack.dpotri  # type: ignore[attr-defined]  # inverse from a Cholesky factor
 
 
@@ -42,9 +42,8 @@ class _Part:
         for (_, source), one in zip(self.sources, variance, strict=True):
             if one > 0:
                 source.add(whole, one)
-        factor = _factor(whole)
-        columns = np.column_stack([self.residual, self.start])
-        both = solve_triangular(factor, columns, lower=True, check_finite=False)
+        factor = factored(whole)
+        both = solved_by(factor, np.column_stack([self.residual, self.start]))
         white, start = both[:, 0], both[:, 1:]
         return factor, white, start, start.T @ start, float(np.log(np.diag(factor)).sum())
 
@@ -108,10 +107,10 @@ class Tied:
             moved.append(start)
         if not states:
             return Solved(self, factors, whites, moved, inner, pull, square, half)
-        factor = _factor(inner)
-        gone = solve_triangular(factor, pull, lower=True, check_finite=False)
-        back = cho_solve((factor, True), np.column_stack([pull, np.eye(states)]), check_finite=False)
-        square -= float(gone @ gone)
+        factor = factored(inner)
+        gone = solved_by(factor, np.column_stack([pull, np.eye(states)]))
+        back = solved_by(factor, gone, transposed=True)
+        square -= float(gone[:, 0] @ gone[:, 0])
         half += float(np.log(np.diag(factor)).sum())
         return Solved(self, factors, whites, moved, back[:, 1:], back[:, 0], square, half)
 
@@ -136,10 +135,7 @@ class Solved:
         for part, factor, white, start in zip(
             self.tied.parts, self.factors, self.whites, self.moved, strict=True
         ):
-            both = solve_triangular(
-                factor, np.column_stack([white - start @ self.back, start]),
-                lower=True, trans=1, check_finite=False,
-            )  # fmt: skip
+            both = solved_by(factor, np.column_stack([white - start @ self.back, start]), transposed=True)
             alpha, columns = both[:, 0], both[:, 1:]
             # Of B^-1 the lower half alone: covariances are as symmetric as it is. C^-1 is that less what the
             # start takes, of which a few columns tell all.
@@ -165,11 +161,3 @@ def _labels(block: Block) -> np.ndarray:
         if source.covariance.ndim == 2 and source.rows.size:
             label[np.isin(label, np.unique(label[source.rows]))] = label[source.rows].min()
     return label
-
-
-def _factor(matrix: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor; LinAlgError where there is none."""
-    factor, fault = dpotrf(matrix, lower=1, clean=1)
-    if fault:
-        raise np.linalg.LinAlgError("not positive definite")
-    return factor

@@ -24,10 +24,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
+from simgap.robots.triangular import factored, solved_by
 from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
 
@@ -59,8 +59,13 @@ class Whitener:
         """Rows (N,) or columns (N, k), whitened; rows of diverged windows become 0."""
         out = np.zeros_like(values, float)
         for block, factor in zip(self.blocks, self.factors, strict=True):
-            out[block] = solve_triangular(factor, values[block], lower=True, check_finite=False)
+            out[block] = solved_by(factor, values[block])
         return out
+
+    @property
+    def half_log_det(self) -> float:
+        """Half the log determinant of all rows' covariance."""
+        return sum(float(np.log(np.diag(factor)).sum()) for factor in self.factors)
 
 
 @dataclass(frozen=True)
@@ -123,7 +128,7 @@ class Covariances:
 
     def whitener(self, discrepancy: Discrepancy = NONE) -> Whitener:
         """The whitener of all rows."""
-        factors = [cholesky(block.covariance(discrepancy), lower=True) for block in self.blocks]
+        factors = [factored(block.covariance(discrepancy)) for block in self.blocks]
         return Whitener(tuple(block.rows for block in self.blocks), tuple(factors))
 
 
