@@ -25,7 +25,7 @@ import pandas as pd
 from experiments.robots_check.faults import FAULTS, drawn
 from experiments.robots_check.robots import ROBOTS, map_toml, nominal_xml
 from experiments.robots_check.score import scored
-from experiments.robots_check.worlds import LOGS, motion, noise_of, run, usual, world_of
+from experiments.robots_check.worlds import LOGS, motion, nats, noise_of, run, usual, world_of
 from experiments.saving import save
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "robots_check.json"
@@ -51,9 +51,11 @@ def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> 
     faults = [drawn(robot, plain, str(k), rng) for k in chosen]
     began = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        paths = []
+        paths, seen = [], np.zeros(len(faults))
         for log in range(LOGS):
-            shown = pd.DataFrame(run(robot, world_of(xml, faults, sizes), motion(robot, rng)))
+            wanted = motion(robot, rng)
+            seen += nats(robot, xml, faults, sizes, wanted, noise)
+            shown = pd.DataFrame(run(robot, world_of(xml, faults, sizes), wanted))
             for joint, sd in noise.items():
                 shown[f"q_{joint}"] += sd * rng.standard_normal(len(shown))
             paths.append(Path(folder) / f"log_{log}.csv")
@@ -70,7 +72,7 @@ def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> 
         "case": number,
         "robot": robot.name,
         "kind": kind,
-        "faults": [vars(f) for f in faults],
+        "faults": [vars(f) | {"nats": n} for f, n in zip(faults, seen.tolist(), strict=True)],
         "found": told,
         "seconds": time.process_time() - began,
     }

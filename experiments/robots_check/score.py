@@ -9,6 +9,9 @@ import numpy as np
 from scipy.stats import beta
 
 NUMERICS = "option."  # steps and integrators do differ: naming them is no false alarm
+FLOOR = (
+    15.0  # nats: of a fault that shows less, even one who knows all else could not be sure among a hundred
+)
 
 
 def share(hits: int, of: int) -> dict[str, Any]:
@@ -18,16 +21,21 @@ def share(hits: int, of: int) -> dict[str, Any]:
     return {"hits": hits, "of": of, "share": hits / of if of else None, "interval_90": [low, high]}
 
 
+def above(fault: Mapping[str, Any]) -> bool:
+    """Whether a fault shows enough to be found."""
+    return fault["nats"] >= FLOOR
+
+
 def _physical(names: Sequence[str]) -> list[str]:
     return [n for n in names if not n.startswith(NUMERICS)]
 
 
 def right(one: Mapping[str, Any]) -> bool:
-    """Whether every fault is among causes or their rivals, and no other cause is told."""
+    """Whether every fault above the floor is among causes or their rivals, and no other cause is told."""
     told = one["found"]["causes"]
     every = {*told, *one["found"]["indistinguishable"]}
     allowed = {r for f in one["faults"] for r in f["right"]}
-    met = all(every & set(f["right"]) for f in one["faults"])
+    met = all(every & set(f["right"]) for f in one["faults"] if above(f))
     strange = [n for n in _physical(told) if n not in allowed]
     # In a set, what stands for a fault may be any of its rivals.
     spare = len([f for f in one["faults"] if not set(told) & set(f["right"])])
@@ -66,15 +74,21 @@ def covered(one: Mapping[str, Any]) -> list[bool]:
 def scored(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The figures, pooled and by kind, and every case in a line."""
     of = lambda *kinds: [c for c in every if c["kind"] in kinds]  # noqa: E731
-    healthy, outside, known = of("healthy"), of("outside"), of("single", "pair", "dense")
+    healthy = of("healthy")
+    outside = [c for c in of("outside") if above(c["faults"][0])]
+    known = [c for c in of("single", "pair", "dense") if any(map(above, c["faults"]))]
     inside = [hit for c in every for hit in covered(c)]
+    faults = [f for c in every for f in c["faults"]]
     return {
         "cases": len(every),
+        "faults": len(faults),
+        "below_the_floor": sum(not above(f) for f in faults),
         "robots": sorted({c["robot"] for c in every}),
         "false_alarms": share(sum(map(alarm, healthy)), len(healthy)),
         "named_right": share(sum(map(right, known)), len(known)),
         "named_right_by_kind": {
-            k: share(sum(map(right, of(k))), len(of(k))) for k in ("single", "pair", "dense")
+            k: share(sum(right(c) for c in known if c["kind"] == k), sum(c["kind"] == k for c in known))
+            for k in ("single", "pair", "dense")
         },
         "outside_held_back": share(sum(map(held_back, outside)), len(outside)),
         "intervals_cover": share(sum(inside), len(inside)),
@@ -87,7 +101,9 @@ def scored(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 "case": c["case"],
                 "robot": c["robot"],
                 "kind": c["kind"],
-                "faults": [f"{f['kind']} {f['thing']} {f['size']:.3g}" for f in c["faults"]],
+                "faults": [
+                    f"{f['kind']} {f['thing']} {f['size']:.3g} ({f['nats']:.0f} nats)" for f in c["faults"]
+                ],
                 "verdict": c["found"]["verdict"],
                 "causes": c["found"]["causes"],
                 "rivals": c["found"]["indistinguishable"],

@@ -20,6 +20,7 @@ NOISE = 5e-4  # rad, of hinges
 PLACE_NOISE = 1e-4  # m, of slides
 FINER = 3  # the world's step is the model's over this
 LOGS = 3
+WINDOW = 40  # rows of what a fault is seen in
 PACE = 2.5  # Hz: of the controller
 HELD, SETTLED = 1.0, 0.5  # s: while a body is held where the grip closes on it, and then until the log begins
 
@@ -75,8 +76,9 @@ def run(
     wanted: Callable[[float], np.ndarray],
     measure: bool = False,
     rate: float = RATE,
+    states: list[np.ndarray] | None = None,
 ) -> dict:
-    """A log: `t`, commands as logged, positions without noise."""
+    """A log: `t`, commands as logged, positions without noise; the state at every row goes into `states`."""
     model, data = world.model, LIKE.MjData(world.model)
     actuators = [model.actuator(a).id for a in robot.driven]
     dofs = [int(model.jnt_dofadr[model.joint(j).id]) for j, _ in robot.driven.values()]
@@ -98,6 +100,8 @@ def run(
     gear = model.actuator_gear[actuators, 0]
     for i in range(-before, rows):
         log[max(i, 0)] = data.qpos[read]
+        if states is not None and i >= 0:
+            states.append(np.concatenate([data.qpos, data.qvel]))
         LIKE.mj_fullM(model, inertia, data.qM) if hasattr(data, "qM") else LIKE.mj_fullM(model, data, inertia)
         mass = np.maximum(np.diag(inertia)[dofs], 1e-6)
         off, pace = wanted(max(i, 0) / rate) - data.qpos[places], 2 * np.pi * PACE
@@ -136,6 +140,59 @@ def run(
             j: tuple(max(float(np.sqrt(np.mean(np.square(v)))), 1e-6) for v in each)
             for j, each in shown.items()
         }
+    return out
+
+
+def nats(
+    robot: Robot, xml: str, faults: list[Fault], sizes: Mapping[str, tuple[float, float, float]],
+    wanted: Callable[[float], np.ndarray], noise: Mapping[str, float],
+) -> list[float]:  # fmt: skip
+    """What each fault shows in a log [nats] to one who knows all else: half the squares, in units of the
+    noise, by which windows begun from the true states go otherwise without it, straight lines left out."""
+    states: list[np.ndarray] = []
+    shown = run(robot, world_of(xml, faults, sizes), wanted, states=states)
+    told = _replayed(robot, world_of(xml, faults, sizes), shown, states)
+    out = []
+    for k in range(len(faults)):
+        without = _replayed(robot, world_of(xml, faults[:k] + faults[k + 1 :], sizes), shown, states)
+        total = 0.0
+        for joint, sd in noise.items():
+            for one in np.split(told[joint] - without[joint], np.arange(WINDOW, len(states), WINDOW)):
+                line = np.stack([np.ones(one.size), np.arange(one.size)], 1)
+                left = one - line @ np.linalg.lstsq(line, one, rcond=None)[0]
+                total += 0.5 * float(left @ left) / sd**2
+        out.append(total)
+    return out
+
+
+def _replayed(robot: Robot, world: World, shown: Mapping, states: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Positions as read, by joint, in windows begun from these states and driven by the logged commands."""
+    model, data = world.model, LIKE.MjData(world.model)
+    actuators = [model.actuator(a).id for a in robot.driven]
+    read = [int(model.jnt_qposadr[model.joint(j).id]) for j in robot.read]
+    for name, command in robot.grip.items():
+        data.ctrl[model.actuator(name).id] = command
+    t, commands = shown["t"], np.stack([shown[f"u_{a}"] for a in robot.driven], 1)
+    for act in world.command:
+        commands = act(t, commands)
+    log, steps = np.zeros((t.size, len(read))), round((t[1] - t[0]) / model.opt.timestep)
+    for i in range(t.size):
+        if i % WINDOW == 0:
+            data.time = t[i]
+            data.qpos[:], data.qvel[:] = np.split(states[i], [model.nq])
+            data.qacc_warmstart[:] = 0.0
+        log[i] = data.qpos[read]
+        data.ctrl[actuators] = commands[i]
+        for _ in range(steps):
+            data.qfrc_applied[:] = 0.0
+            for push in world.torque:
+                push(data, t[i])
+            LIKE.mj_step(model, data)
+    out = {}
+    for k, joint in enumerate(robot.read):
+        out[joint] = log[:, k]
+        for act in world.read.get(joint, []):
+            out[joint] = act(t, out[joint])
     return out
 
 

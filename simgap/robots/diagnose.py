@@ -17,8 +17,7 @@ from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.progress import Progress, silent
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
-from simgap.robots.borne_out import folds_of
-from simgap.robots.discrepancy import learned
+from simgap.robots.causes import Asked, about, sought
 from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.explained import explained
 from simgap.robots.fit import moved_to
@@ -30,14 +29,13 @@ from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
-from simgap.robots.prune import pruned
 from simgap.robots.scatter import over_rivals
-from simgap.robots.search import Found, search
+from simgap.robots.search import Found
 from simgap.robots.settle import settled
 from simgap.robots.stand_ins import stand_ins
 from simgap.robots.twins import Twins, healthy_twins
 from simgap.robots.verdict import RobotVerdict, verdict_on
-from simgap.robots.whiten import NONE, Whitener, covariances
+from simgap.robots.whiten import Whitener, covariances
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -128,14 +126,11 @@ def _diagnosed(
     wanted = [n for n in plain.moved if n not in fitted_along(composed)]
     tell("healthy twins")
     twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
-    found = search(composed, parts, wanted, tell, forced, twins.factor, kept.of("search"), plain)
-    fold = folds_of(found.linear, len(composed.recordings), groups)
-    borne, point = found.best, found.linear.point
-    if not forced:
-        tell("held-out logs")
-        borne, point = kept("borne out", lambda: pruned(composed, parts, found, fold, twins.factor))
+    ask = Asked(composed, parts, tuple(wanted), tuple(forced), twins.factor, groups)
+    found, borne, point = sought(ask, plain, tell, kept)
+    fold = ask.fold(found.linear)
     tell("all candidates there")
-    ended = _about(composed, parts, found, point, wanted, borne, twins.factor)
+    ended = about(ask, found, point, borne)
     tell("shares")
     given = (whole, composed, parts, ended, plain.point, twins, fold, seed, wanted, bool(forced))
     verdict = kept("verdict", lambda: _concluded(*given))
@@ -181,24 +176,6 @@ def _told_by_logs(composed: Composed, said: Progress, kept: Kept) -> tuple[Compo
         if one.exact:
             said(f"{', '.join(one.names)} act only together on these logs: no such log can tell them apart")
     return composed, plain, alike
-
-
-def _about(
-    composed: Composed, phases: Phases, found: Found, point: Point, wanted: Sequence[str],
-    borne: Sequence[str], factor: np.ndarray,
-) -> Found:  # fmt: skip
-    """Everything linear about the best fit of what was borne out, its discrepancies, and that set there; what
-    the search found out there is not worked out again."""
-    linear, cov, off = found.linear, found.covariances, found.discrepancy
-    if point != linear.point:
-        linear = linearise(composed, point, [*fitted_along(composed), *wanted])
-        cov = covariances(composed, linear, factor)
-        off = learned(cov, linear.residual) if len(cov.blocks) else NONE
-    usable = [n for n in wanted if n in linear.moved]
-    f = forms(gap_of(composed, linear, cov.whitener(off), phases, usable))
-    causes = tuple(sorted(usable.index(n) for n in borne))
-    names = tuple(usable[j] for j in causes)
-    return Found(linear, cov.whitener(off), cov, off, f, (fitted(f, causes),), names)
 
 
 def _concluded(

@@ -14,7 +14,8 @@ from simgap.robots.borne_out import borne_out
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
-from simgap.robots.search import Found, point_of
+from simgap.robots.proposals import point_of
+from simgap.robots.search import Found
 from simgap.robots.whiten import Whitener, covariances
 
 

@@ -1,35 +1,36 @@
 """Which effects act: search about a point, move the point to what was found, and search again there.
 
-Each round is exact at its point (all effects found so far at their values) and linear about it. Leaders are
-rolled out at their own best fit, so that what kinks at its neutral value is seen where it acts. Of many
-candidates most are nowhere near: while the best set stays, those are asked that came near it when all were,
-and before a search ends all are asked again where it would end.
+Each round is exact at its point (all effects found so far at their values) and linear about it. Straight
+lines promise what an exact fit may not keep: a set is gone on with if it scores better where it settles than
+the one before did, so that scores rise and no sets take turns. Where there are many windows, a search of
+some of them tells which candidates come near, and before it ends all are asked again where it would end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
+from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
-from simgap.robots.judged import Judge
+from simgap.robots.judged import Judge, Judged
 from simgap.robots.kept import NOWHERE, Kept
-from simgap.robots.linear import Linear, base_at, linearise, numeric_at, vary
+from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.settle import settled
+from simgap.robots.proposals import leaders, nearest, one_more, point_of
+from simgap.robots.settle import SETTLED, settled
 from simgap.robots.whiten import NONE, Covariances, Discrepancy, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with
 PROPOSED = 4  # numerics: sets by each scale that are judged by the discrepancy that they leave
-FAR = 5.0  # numerics: usual sizes
+TRIED = 3  # numerics: sets that are fitted exactly until one is better
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,11 @@ class Found:
 
 @dataclass(frozen=True)
 class Step:
-    """Where a search stands: about which point it goes on, the best set so far, and all that were best;
+    """Where a search stands: about which point it goes on, and the best set so far, which settled there;
     `field`: the candidates that came near when all were asked; `whole`: all are asked next."""
 
     point: Point
     best: tuple[str, ...] = ()
-    seen: frozenset[tuple[str, ...]] = frozenset()
     ended: bool = False
     field: tuple[str, ...] = ()
     whole: bool = True
@@ -72,13 +72,16 @@ def search(
     factor: np.ndarray | None = None,
     kept: Kept = NOWHERE,
     plain: Linear | None = None,
+    begin: Step | None = None,
 ) -> Found:
     """Search until the best set stays: where there are many windows in some of them first, from which all are
     gone on with. `plain`: all candidates' sensitivities where what is fitted along fits best without them, if
-    they are known."""
+    they are known. `begin`: a set to go on from, in all windows."""
     ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor, plain)
-    begin = Step(kept("fitted along", ask.along))
+    if begin is not None:
+        return _searched(ask, begin, tell, kept)[0]
     few = composed.thinned()
+    start = Step(kept("fitted along", ask.along))
     if not forced and len(few) < len(composed.windows):
         part, mine = composed.among(few), np.isin(composed.rows.window, few)
         noise = None if factor is None else factor[mine]
@@ -86,12 +89,12 @@ def search(
         some = _Ask(part, phases, tuple(candidates), (), noise, known)
 
         def ended() -> Step:
-            last = _searched(some, begin, tell, kept.of("some windows"))[1]
+            last = _searched(some, start, tell, kept.of("some windows"))[1]
             point = settled(composed, last.point, factor).point
             return Step(point, last.best, field=last.field, whole=False)
 
-        begin = kept("some windows", ended)
-    return _searched(ask, begin, tell, kept)[0]
+        start = kept("some windows", ended)
+    return _searched(ask, start, tell, kept)[0]
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,22 @@ class _Ask:
             return known
         return linearise(self.composed, point, names)
 
+    def settled(self, judge: Judge, point: Point, one: Judged) -> Point:
+        """Where a set settles that was judged about a point."""
+        f = self.forms(judge.linear, one.whiten, one.names)
+        begin = point_of(self.composed, f, tuple(range(len(one.names))), point)
+        first = moved_to(self.composed, judge.linear, one.whiten, begin)
+        return settled(self.composed, first.point, self.factor).point
+
+    def score(self, point: Point, names: tuple[str, ...], judge: Judge) -> float:
+        """Of a set where it has settled; minus infinity where it diverges and the judge's point does not."""
+        linear = linearise(self.composed, point, [*fitted_along(self.composed), *names])
+        if linear.dropped > judge.linear.dropped or linear.diverged:
+            return -np.inf
+        cov = covariances(self.composed, linear, self.factor)
+        near = learned(cov, linear.residual)
+        return Judge(self.composed, self.phases, linear, cov, near, judge.log_odds)(names).score
+
     def forms(self, linear: Linear, whiten: Whitener, names: Sequence[str]) -> Forms:
         """The gap about a point, of these candidates."""
         return forms(gap_of(self.composed, linear, whiten, self.phases, names))
@@ -154,7 +173,8 @@ def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> tuple[Found,
 
 
 def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
-    """One round: what is best about the step's point, and where that settles."""
+    """One round: the sets that promise most about the step's point, and where the first that keeps what it
+    promised settles."""
     composed, asked = ask.composed, ask.asked(step, number)
     linear = ask.linearised(step.point, asked)
     usable = [n for n in asked if n in linear.moved]
@@ -164,105 +184,25 @@ def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
     # doing misleads without one: what comes near by either is asked.
     scales = [cov.whitener(d) for d in ((off, NONE) if off else (NONE,))]
     every = [ask.forms(linear, whiten, usable) for whiten in scales]
-    linear, names = leaders(composed, linear, every, ask.forced or step.best)
+    linear, names = leaders(composed, linear, every, ask.forced or step.best, LEADERS)
     held = tuple(n for n in names if n in (ask.forced or step.best))
     judge = Judge(composed, ask.phases, linear, cov, off, every[0].log_odds)
-    sets = {held}
-    if not ask.forced:
-        for whiten in scales:
-            f = ask.forms(linear, whiten, names)
-            near = one_more(f, [names.index(n) for n in held])[:PROPOSED]
-            sets |= {tuple(names[j] for j in model.effects) for model in near}
-    judged = {one: judge(one) for one in sorted(sets)}
-    best = max(judged.values(), key=lambda one: one.score)
-    # Sets that take turns are alike, and none will win.
-    ends = {*best.names} == {*held} or tuple(sorted(best.names)) in step.seen or number == ROUNDS - 1
-    ends = ends and {*held} <= {*step.point}
-    best = judged[held] if ends else best
-    f = ask.forms(linear, best.whiten, names)
-    model = fitted(f, tuple(names.index(n) for n in best.names))
-    now = tuple(sorted(best.names))
-    found = Found(linear, best.whiten, cov, best.discrepancy, f, (model,), now)
-    whole = len(asked) == len(ask.candidates)
-    field = tuple(sorted({*names, *_nearest(every, now)})) if whole else step.field
-    if ends:
-        return found, replace(step, ended=whole, field=field, whole=True)
-    first = moved_to(composed, linear, best.whiten, point_of(composed, f, model.effects, step.point))
-    point = settled(composed, first.point, ask.factor).point
-    # Whatever the set has gained or lost changes what comes near beside it.
-    return found, Step(point, now, step.seen | {now}, field=field)
-
-
-def _nearest(every: Sequence[Forms], best: Sequence[str]) -> list[str]:
-    """The candidates that gain most beside these, by either scale."""
-    return _ranked([_gains(f, best)[0] for f in every])[:LEADERS]
-
-
-def _gains(f: Forms, best: Sequence[str]) -> tuple[dict[str, float], dict[str, Model]]:
-    """Of every candidate beside these the score and the model."""
-    own = {c.name: j for j, c in enumerate(f.gap.candidates)}
-    beside = [own[n] for n in best if n in own]
-    models = {n: fitted(f, tuple(sorted((*beside, j)))) for n, j in own.items() if n not in best}
-    return {n: m.score for n, m in models.items()}, models
-
-
-def _ranked(gains: Sequence[Mapping[str, float]]) -> list[str]:
-    """Names by their better rank in several scores, best first."""
-    ranks = [sorted(one, key=lambda n: -one[n]) for one in gains]
-    return list(dict.fromkeys(name for level in zip(*ranks, strict=True) for name in level))
-
-
-def one_more(f: Forms, best: Sequence[int]) -> list[Model]:
-    """Sets with one effect more than these at most, or one exchanged or left out, best first: what is far off
-    is best moved towards in steps, each exact where it arrives."""
-    every = range(len(f.gap.candidates))
-    fewer = [tuple(j for j in best if j != out) for out in best]
-    sets = {tuple(sorted({*kept, j})) for kept in (tuple(best), *fewer) for j in every} | {
-        *fewer,
-        tuple(best),
-    }
-    return sorted((fitted(f, effects) for effects in sorted(sets)), key=lambda m: -m.score)
-
-
-def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point) -> Point:
-    """Where these effects have their mode, and what is fitted along stays as in `point`."""
-    model = fitted(f, tuple(effects))
-    out = {n: dict(point[n]) for n in fitted_along(composed)}
-    for j, mine in coordinates(f, model.effects).items():
-        c = f.gap.candidates[j]
-        values = np.clip(c.neutral + c.scale * model.x[mine], c.low, c.high)
-        out[c.name] = dict(zip(c.parameters, values.tolist(), strict=True))
-    return out
-
-
-def leaders(
-    composed: Composed, linear: Linear, every: Sequence[Forms], best: Sequence[str]
-) -> tuple[Linear, list[str]]:
-    """The candidates that gain most beside the best set by any of these forms, rolled out at their own best
-    fits, and all of the set that there are."""
-    held = [n for n in best if n in linear.moved]
-    told = [_gains(f, held) for f in every]
-    first = _ranked([gains for gains, _ in told])[: max(LEADERS - len(held), 4)]
-    base = numeric_at(composed, base_at(composed, linear.point))
-    more = {}
-    for name in sorted(first, key=lambda n: not composed.numeric(n)):
-        say(f"{name} at its best")
-        place = [sorted(gains, key=lambda n, gains=gains: -gains[n]).index(name) for gains, _ in told]
-        f, models = every[int(np.argmin(place))], told[int(np.argmin(place))][1]
-        at = _best_of(f, models[name], name)
-        known = composed.effects[name].parameters
-        if all(abs(at[n] - p.nominal) < 1e-3 * p.sd for n, p in known.items()):
-            continue
-        one = vary(composed, base, linear.starts, name, at)
-        if one is not None:
-            more[name] = one
-    return linear.with_moved(more), sorted([*held, *first])
-
-
-def _best_of(f: Forms, model: Model, name: str) -> dict[str, float]:
-    """An effect's parameters in a model; straight lines are trusted to a few usual sizes only."""
-    number = next(j for j in model.effects if f.gap.candidates[j].name == name)
-    c = f.gap.candidates[number]
-    values = np.clip(c.neutral + c.scale * model.x[coordinates(f, model.effects)[number]], c.low, c.high)
-    values = np.clip(values, c.neutral - FAR * c.scale, c.neutral + FAR * c.scale)
-    return dict(zip(c.parameters, values.tolist(), strict=True))
+    here = judge(held)
+    f = ask.forms(linear, here.whiten, names)
+    model = fitted(f, tuple(names.index(n) for n in held))
+    found = Found(linear, here.whiten, cov, here.discrepancy, f, (model,), held)
+    if not {*held} <= {*step.point}:
+        return found, Step(ask.settled(judge, step.point, here), held)
+    if not ask.forced and number < ROUNDS - 1:
+        sets = {tuple(names[j] for j in m.effects) for w in scales
+                for m in one_more(ask.forms(linear, w, names), model.effects)[:PROPOSED]}  # fmt: skip
+        promising = sorted(map(judge, sorted(sets - {held})), key=lambda one: -one.score)
+        for one in [p for p in promising if p.score > here.score + SETTLED][:TRIED]:
+            say(f"trying {' + '.join(one.names) or 'nothing'}")
+            point = ask.settled(judge, step.point, one)
+            if ask.score(point, one.names, judge) > here.score + SETTLED:
+                return found, Step(point, one.names)
+    # Whatever a set has gained or lost changes what comes near beside it.
+    if len(asked) < len(ask.candidates):
+        return found, replace(step, whole=True)
+    return found, replace(step, ended=True, field=tuple(sorted({*names, *nearest(every, held)[:LEADERS]})))

@@ -24,7 +24,8 @@ from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.search import Found, leaders, point_of
+from simgap.robots.proposals import leaders, point_of
+from simgap.robots.search import LEADERS, Found
 from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
 
@@ -95,7 +96,7 @@ class _Asked:
         linear = linearise(self.composed, point, [*along, *here, *wanted])
         usable = [n for n in (*here, *wanted) if n in linear.moved]
         every = forms(gap_of(self.composed, linear, self.whiten, self.phases, usable))
-        linear, names = leaders(self.composed, linear, [every], here)
+        linear, names = leaders(self.composed, linear, [every], here, LEADERS)
         f = forms(gap_of(self.composed, linear, self.whiten, self.phases, names))
         mine = [names.index(n) for n in here if n in names]
         sets = {j: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}

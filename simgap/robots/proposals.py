@@ -1,0 +1,91 @@
+"""Which sets of effects to ask about: what gains most beside a set, about a point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted
+from simgap.progress import say
+from simgap.robots.gap import fitted_along
+from simgap.robots.linear import Linear, base_at, numeric_at, vary
+from simgap.robots.model import Composed, Point
+
+FAR = 5.0  # numerics: usual sizes
+FEWEST = 4  # numerics: candidates that are asked beside a set, however large it is
+
+
+def nearest(every: Sequence[Forms], best: Sequence[str]) -> list[str]:
+    """Candidates by what they gain beside these, by their better rank in any of these forms, first first."""
+    return _ranked([_gains(f, best)[0] for f in every])
+
+
+def _gains(f: Forms, best: Sequence[str]) -> tuple[dict[str, float], dict[str, Model]]:
+    """Of every candidate beside these the score and the model."""
+    own = {c.name: j for j, c in enumerate(f.gap.candidates)}
+    beside = [own[n] for n in best if n in own]
+    models = {n: fitted(f, tuple(sorted((*beside, j)))) for n, j in own.items() if n not in best}
+    return {n: m.score for n, m in models.items()}, models
+
+
+def _ranked(gains: Sequence[Mapping[str, float]]) -> list[str]:
+    """Names by their better rank in several scores, best first."""
+    ranks = [sorted(one, key=lambda n: -one[n]) for one in gains]
+    return list(dict.fromkeys(name for level in zip(*ranks, strict=True) for name in level))
+
+
+def one_more(f: Forms, best: Sequence[int]) -> list[Model]:
+    """Sets with one effect more than these at most, or one exchanged or left out, best first: what is far off
+    is best moved towards in steps, each exact where it arrives."""
+    every = range(len(f.gap.candidates))
+    fewer = [tuple(j for j in best if j != out) for out in best]
+    sets = {tuple(sorted({*kept, j})) for kept in (tuple(best), *fewer) for j in every} | {
+        *fewer,
+        tuple(best),
+    }
+    return sorted((fitted(f, effects) for effects in sorted(sets)), key=lambda m: -m.score)
+
+
+def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point) -> Point:
+    """Where these effects have their mode, and what is fitted along stays as in `point`."""
+    model = fitted(f, tuple(effects))
+    out = {n: dict(point[n]) for n in fitted_along(composed)}
+    for j, mine in coordinates(f, model.effects).items():
+        c = f.gap.candidates[j]
+        values = np.clip(c.neutral + c.scale * model.x[mine], c.low, c.high)
+        out[c.name] = dict(zip(c.parameters, values.tolist(), strict=True))
+    return out
+
+
+def leaders(
+    composed: Composed, linear: Linear, every: Sequence[Forms], best: Sequence[str], count: int
+) -> tuple[Linear, list[str]]:
+    """The candidates that gain most beside the best set by any of these forms, about `count` with it, rolled
+    out at their own best fits so that what kinks at its neutral value is seen where it acts; and the set."""
+    held = [n for n in best if n in linear.moved]
+    told = [_gains(f, held) for f in every]
+    first = _ranked([gains for gains, _ in told])[: max(count - len(held), FEWEST)]
+    base = numeric_at(composed, base_at(composed, linear.point))
+    more = {}
+    for name in sorted(first, key=lambda n: not composed.numeric(n)):
+        say(f"{name} at its best")
+        place = [sorted(gains, key=lambda n, gains=gains: -gains[n]).index(name) for gains, _ in told]
+        f, models = every[int(np.argmin(place))], told[int(np.argmin(place))][1]
+        at = _best_of(f, models[name], name)
+        known = composed.effects[name].parameters
+        if all(abs(at[n] - p.nominal) < 1e-3 * p.sd for n, p in known.items()):
+            continue
+        one = vary(composed, base, linear.starts, name, at)
+        if one is not None:
+            more[name] = one
+    return linear.with_moved(more), sorted([*held, *first])
+
+
+def _best_of(f: Forms, model: Model, name: str) -> dict[str, float]:
+    """An effect's parameters in a model; straight lines are trusted to a few usual sizes only."""
+    number = next(j for j in model.effects if f.gap.candidates[j].name == name)
+    c = f.gap.candidates[number]
+    values = np.clip(c.neutral + c.scale * model.x[coordinates(f, model.effects)[number]], c.low, c.high)
+    values = np.clip(values, c.neutral - FAR * c.scale, c.neutral + FAR * c.scale)
+    return dict(zip(c.parameters, values.tolist(), strict=True))
