@@ -82,6 +82,7 @@ def scored(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         "cases": len(every),
         "faults": len(faults),
+        "floor": FLOOR,
         "below_the_floor": sum(not above(f) for f in faults),
         "robots": sorted({c["robot"] for c in every}),
         "false_alarms": share(sum(map(alarm, healthy)), len(healthy)),

@@ -17,7 +17,8 @@ from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.progress import Progress, silent
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
-from simgap.robots.causes import Asked, about, sought
+from simgap.robots.borne_out import folds_of
+from simgap.robots.causes import about
 from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.explained import explained
 from simgap.robots.fit import moved_to
@@ -29,8 +30,9 @@ from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
+from simgap.robots.prune import pruned
 from simgap.robots.scatter import over_rivals
-from simgap.robots.search import Found
+from simgap.robots.search import Asked, Found, search
 from simgap.robots.settle import settled
 from simgap.robots.stand_ins import stand_ins
 from simgap.robots.twins import Twins, healthy_twins
@@ -126,9 +128,13 @@ def _diagnosed(
     wanted = [n for n in plain.moved if n not in fitted_along(composed)]
     tell("healthy twins")
     twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
-    ask = Asked(composed, parts, tuple(wanted), tuple(forced), twins.factor, groups)
-    found, borne, point = sought(ask, plain, tell, kept)
-    fold = ask.fold(found.linear)
+    fold = folds_of(plain, len(composed.recordings), groups)
+    ask = Asked(composed, parts, tuple(wanted), tuple(forced), twins.factor, fold, plain)
+    found = search(ask, tell, kept.of("search"))
+    borne, point = found.best, found.linear.point
+    if not forced:
+        tell("held-out logs")
+        borne, point = kept("borne out", lambda: pruned(ask, found))
     tell("all candidates there")
     ended = about(ask, found, point, borne)
     tell("shares")

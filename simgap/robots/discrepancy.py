@@ -15,6 +15,8 @@ from simgap.robots.tied import Solved, Tied
 from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy
 
 WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
+# numerics: log variances are found to a hundredth of a nat
+CLOSE = {"maxiter": 25, "ftol": 1e-6, "gtol": 0.05}
 ENOUGH = 40  # learned: windows from which discrepancies are learned
 
 
@@ -40,9 +42,7 @@ def learned(cov: Covariances, residual: np.ndarray, near: Discrepancy | None = N
     plain = _value(np.zeros(0), terms, [])
     while kept:
         bounds = [(v - 25.0, v + 12.0) for v in x]
-        done = minimize(
-            _cost, x, (terms, kept), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25}
-        )
+        done = minimize(_cost, x, (terms, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE)
         if plain - done.fun < WORTH:
             return NONE
         costs = [

@@ -131,7 +131,7 @@ class _Squares:
         base, columns = numeric_at(self.composed, self.base(x)), []
         for effect in self.free:
             step = self._step(effect)
-            moved = vary(self.composed, base, self.linear.starts, effect, step=step)
+            moved = vary(self.composed, base, self.linear.starts, effect, step=step, shifted=False)
             size = len(self.composed.effects[effect].parameters)
             white = np.zeros((self.linear.residual.size, size))
             if moved is not None:
@@ -151,6 +151,16 @@ class _Squares:
         if effect not in self.slopes:
             return None
         return np.clip(WIDE / np.sqrt(1 + self.slopes[effect]), FINEST, STEP)
+
+
+def prior_cost(composed: Composed, point: Point) -> float:
+    """Minus the log prior density of a point, constants left out [nats]."""
+    out = 0.0
+    for effect, theta in point.items():
+        known = composed.effects[effect]
+        x = np.array([(v - known.parameters[p].nominal) / known.parameters[p].sd for p, v in theta.items()])
+        out += 0.5 * float(np.sum(_prior(x, np.full(x.size, known.fitted)) ** 2))
+    return out
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

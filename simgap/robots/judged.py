@@ -2,8 +2,9 @@
 
 The discrepancy that a model leaves without a cause is as large as what the cause does, and under it the cause
 gains little: it would be passed over for one that acts where nothing was off. So both are fitted together,
-parameters and discrepancies' sizes in turn, and a set's score is of its rows as they are: the log determinant
-of their covariance is in it, so that what a set explains need not be left to a discrepancy.
+parameters and discrepancies' sizes in turn, from that discrepancy and from none, and a set's score is of its
+rows as they are: the log determinant of their covariance is in it, so that what a set explains need not be
+left to a discrepancy.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from simgap.robots.gap import gap_of
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
-from simgap.robots.whiten import Covariances, Discrepancy, Whitener
+from simgap.robots.whiten import NONE, Covariances, Discrepancy, Whitener
 
 TURNS = 2  # numerics: fits of parameters and of discrepancies in turn
 
@@ -50,12 +51,16 @@ class Judge:
     def __call__(self, names: Sequence[str]) -> Judged:
         """The set's score."""
         raw = gap_of(self.composed, self.linear, lambda rows: rows, self.phases, names)
+        begin = (NONE, self.near) if self.near else (NONE,)
+        return max((self._from(names, raw, off) for off in begin), key=lambda one: one.score)
+
+    def _from(self, names: Sequence[str], raw: Gap, off: Discrepancy) -> Judged:
         seen = np.isfinite(self.linear.residual)
-        off, left = self.near, np.zeros(seen.size)
+        left = np.zeros(seen.size)
         for _ in range(TURNS):
             f, model, _ = self._fitted(names, off)
             left[seen] = residual_of(raw, f, model)
-            off = learned(self.covariances, left, off)
+            off = learned(self.covariances, left, self.near)
         f, model, whiten = self._fitted(names, off)
         prior = len(names) * (self.log_odds - f.log_odds)
         return Judged(tuple(names), off, whiten, model.score + prior - whiten.half_log_det)

@@ -167,10 +167,12 @@ def vary(
     name: str,
     at: Mapping[str, float] | None = None,
     step: np.ndarray | None = None,
+    shifted: bool = True,
 ) -> Moved | None:
     """How an effect moves the rows from the base; None where it diverges. Where the base's point has it
     act, or `at` is None, about the point itself; else about `at`, reached from neutral. `step` (k,): finite
-    differences of its parameters, in usual sizes."""
+    differences of its parameters, in usual sizes. `shifted`: whether the way from neutral to a point that has
+    it act is wanted; it is of no use for what is fitted along."""
     effect = composed.effects[name]
     neutral = effect.neutral()
     now = {**neutral, **base.point.get(name, {})}
@@ -190,8 +192,10 @@ def vary(
     if not (np.isfinite(jacobian[fine]).all() and np.isfinite(shift[fine]).all()):
         return None
     point = np.array([here[n] for n in effect.parameters])
-    if name in base.point:  # a straight line back to neutral
-        shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
+    if name in base.point and shifted and not effect.fitted:
+        shift = base.rows - _rows_at(composed, base, starts, name, neutral)
+        if not np.isfinite(shift[fine]).all():  # a straight line back, where nothing else leads there
+            shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
     return Moved(point, shift, jacobian)
 
 

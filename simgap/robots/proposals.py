@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from simgap.robots.linear import Linear, base_at, numeric_at, vary
 from simgap.robots.model import Composed, Point
 
 FAR = 5.0  # numerics: usual sizes
+REFINED = 8  # numerics: sets of those with the same effects left that are fitted to the end
 FEWEST = 4  # numerics: candidates that are asked beside a set, however large it is
 
 
@@ -21,11 +23,13 @@ def nearest(every: Sequence[Forms], best: Sequence[str]) -> list[str]:
     return _ranked([_gains(f, best)[0] for f in every])
 
 
-def _gains(f: Forms, best: Sequence[str]) -> tuple[dict[str, float], dict[str, Model]]:
-    """Of every candidate beside these the score and the model."""
+def _gains(
+    f: Forms, best: Sequence[str], without: Sequence[str] = ()
+) -> tuple[dict[str, float], dict[str, Model]]:
+    """Of every candidate beside these the score and the model; of those in `without` none."""
     own = {c.name: j for j, c in enumerate(f.gap.candidates)}
     beside = [own[n] for n in best if n in own]
-    models = {n: fitted(f, tuple(sorted((*beside, j)))) for n, j in own.items() if n not in best}
+    models = {n: fitted(f, tuple(sorted((*beside, j)))) for n, j in own.items() if n not in {*best, *without}}
     return {n: m.score for n, m in models.items()}, models
 
 
@@ -58,20 +62,48 @@ def point_of(composed: Composed, f: Forms, effects: Sequence[int], point: Point)
     return out
 
 
+def two_more(f: Forms, best: Sequence[int]) -> list[Model]:
+    """Sets with two effects more than these, or one exchanged for two, best first: what helps only together,
+    and what one effect stands in for. Those are fitted that are left by least squares to lead."""
+    now = fitted(f, tuple(sorted(best)))
+    product = np.tensordot(now.precision, f.product, 1)
+    others = [j for j in range(len(f.gap.candidates)) if j not in best]
+    beside = [tuple(best), *(tuple(j for j in best if j != out) for out in best)]
+    found: list[Model] = []
+    for kept in beside:
+        sets = [tuple(sorted((*kept, *pair))) for pair in combinations(others, 2)]
+        sets.sort(key=lambda effects: _left(f, product, effects))
+        found += [fitted(f, effects) for effects in sets[:REFINED]]
+    return sorted(found, key=lambda m: -m.score)
+
+
+def _left(f: Forms, product: np.ndarray, effects: tuple[int, ...]) -> float:
+    """Squares that a set leaves with a prior of the usual size; `product`: of all columns."""
+    own = f.spectrum.own
+    free = [*range(1, 1 + f.spectrum.num_nuisances), *(k for j in effects for k in own[j][1:])]
+    constant = [0, *(own[j][0] for j in effects)]
+    sign = np.array([1.0, *(-1.0 for _ in effects)])
+    pull = sign @ product[np.ix_(constant, free)]
+    bend = product[np.ix_(free, free)] + np.eye(len(free))
+    return float(sign @ product[np.ix_(constant, constant)] @ sign - pull @ np.linalg.solve(bend, pull))
+
+
 def leaders(
     composed: Composed, linear: Linear, every: Sequence[Forms], best: Sequence[str], count: int
 ) -> tuple[Linear, list[str]]:
-    """The candidates that gain most beside the best set by any of these forms, about `count` with it, rolled
-    out at their own best fits so that what kinks at its neutral value is seen where it acts; and the set."""
+    """The candidates that gain most by any of these forms, beside the best set or in the place of one of it
+    (what does the same gains nothing beside it), about `count` with it, rolled out at their own best fits so
+    that what kinks at its neutral value is seen where it acts; and the set."""
     held = [n for n in best if n in linear.moved]
-    told = [_gains(f, held) for f in every]
-    first = _ranked([gains for gains, _ in told])[: max(count - len(held), FEWEST)]
+    beside = [held, *([n for n in held if n != out] for out in held)]
+    told = [(f, *_gains(f, kept, held)) for kept in beside for f in every]
+    first = _ranked([gains for _, gains, _ in told])[: max(count - len(held), FEWEST)]
+    place = [{n: k for k, n in enumerate(_ranked([gains]))} for _, gains, _ in told]
     base = numeric_at(composed, base_at(composed, linear.point))
     more = {}
     for name in sorted(first, key=lambda n: not composed.numeric(n)):
         say(f"{name} at its best")
-        place = [sorted(gains, key=lambda n, gains=gains: -gains[n]).index(name) for gains, _ in told]
-        f, models = every[int(np.argmin(place))], told[int(np.argmin(place))][1]
+        f, _, models = told[int(np.argmin([rank[name] for rank in place]))]
         at = _best_of(f, models[name], name)
         known = composed.effects[name].parameters
         if all(abs(at[n] - p.nominal) < 1e-3 * p.sd for n, p in known.items()):

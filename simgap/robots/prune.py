@@ -10,35 +10,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from simgap.attribution.posterior import forms
 from simgap.robots.borne_out import weakest
 from simgap.robots.discrepancy import learned
-from simgap.robots.gap import fitted_along, gap_of
+from simgap.robots.gap import fitted_along
 from simgap.robots.linear import linearise
-from simgap.robots.model import Composed, Point
-from simgap.robots.phases import Phases
-from simgap.robots.search import Found
+from simgap.robots.model import Point
+from simgap.robots.search import Asked, Found
 from simgap.robots.settle import settled
 from simgap.robots.whiten import covariances
 
 
-def pruned(
-    composed: Composed, phases: Phases, found: Found, fold: np.ndarray, factor: np.ndarray | None
-) -> tuple[tuple[str, ...], Point]:
-    """The effects that are left, and the point of their best fit. `fold` (N,): of each row; `factor` (N,)
-    multiplies the noise's sd."""
-    along = fitted_along(composed)
+def pruned(ask: Asked, found: Found) -> tuple[tuple[str, ...], Point]:
+    """The effects that are left, and the point of their best fit."""
+    composed, along = ask.composed, fitted_along(ask.composed)
     kept, point, linear, whiten = found.best, found.linear.point, found.linear, found.whiten
     while kept:
-        f = forms(gap_of(composed, linear, whiten, phases, kept))
-        rows = np.flatnonzero(np.isfinite(linear.residual))
-        out = weakest(f.gap, range(len(kept)), fold[rows])
+        f = ask.forms(linear, whiten, kept)
+        out = weakest(f.gap, range(len(kept)), ask.fold[np.isfinite(linear.residual)])
         if out is None:
             break
         kept = tuple(n for j, n in enumerate(kept) if j != out)
         left = {n: values for n, values in point.items() if n in along or n in kept}
-        point = settled(composed, left, factor).point
+        point = settled(composed, left, ask.factor).point
         linear = linearise(composed, point, [*along, *kept])
-        cov = covariances(composed, linear, factor)
+        cov = covariances(composed, linear, ask.factor)
         whiten = cov.whitener(learned(cov, linear.residual))
     return kept, point

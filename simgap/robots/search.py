@@ -8,13 +8,14 @@ some of them tells which candidates come near, and before it ends all are asked 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
+from simgap.robots.borne_out import EVEN, weakest
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
@@ -23,7 +24,7 @@ from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.proposals import leaders, nearest, one_more, point_of
+from simgap.robots.proposals import leaders, nearest, one_more, point_of, two_more
 from simgap.robots.settle import SETTLED, settled
 from simgap.robots.whiten import NONE, Covariances, Discrepancy, Whitener, covariances
 
@@ -63,58 +64,26 @@ class Step:
     whole: bool = True
 
 
-def search(
-    composed: Composed,
-    phases: Phases,
-    candidates: Sequence[str],
-    tell: Progress,
-    forced: Sequence[str] = (),
-    factor: np.ndarray | None = None,
-    kept: Kept = NOWHERE,
-    plain: Linear | None = None,
-    begin: Step | None = None,
-) -> Found:
-    """Search until the best set stays: where there are many windows in some of them first, from which all are
-    gone on with. `plain`: all candidates' sensitivities where what is fitted along fits best without them, if
-    they are known. `begin`: a set to go on from, in all windows."""
-    ask = _Ask(composed, phases, tuple(candidates), tuple(forced), factor, plain)
-    if begin is not None:
-        return _searched(ask, begin, tell, kept)[0]
-    few = composed.thinned()
-    start = Step(kept("fitted along", ask.along))
-    if not forced and len(few) < len(composed.windows):
-        part, mine = composed.among(few), np.isin(composed.rows.window, few)
-        noise = None if factor is None else factor[mine]
-        known = None if plain is None else plain.among(part, mine)
-        some = _Ask(part, phases, tuple(candidates), (), noise, known)
-
-        def ended() -> Step:
-            last = _searched(some, start, tell, kept.of("some windows"))[1]
-            point = settled(composed, last.point, factor).point
-            return Step(point, last.best, field=last.field, whole=False)
-
-        start = kept("some windows", ended)
-    return _searched(ask, start, tell, kept)[0]
-
-
 @dataclass(frozen=True)
-class _Ask:
-    """What a search is asked: in which windows, with which candidates, by which noise; `plain`: what is known
-    of these windows at one point."""
+class Asked:
+    """In which windows which candidates are asked, which of them are `forced`, the `factor` (N,) on the
+    noise's sd and the `fold` (N,) of each row; `plain`: all candidates' sensitivities in these windows where
+    what is fitted along fits best without them; `last`: what takes long was tried in some of the windows."""
 
     composed: Composed
     phases: Phases
     candidates: tuple[str, ...]
     forced: tuple[str, ...]
-    factor: np.ndarray | None
-    plain: Linear | None = None
+    factor: np.ndarray
+    fold: np.ndarray
+    plain: Linear
+    last: bool = False
 
-    def along(self) -> Point:
-        """What is fitted along, without any cause."""
-        if self.plain is not None:
-            return self.plain.point
-        neutral = {n: self.composed.effects[n].neutral() for n in fitted_along(self.composed)}
-        return settled(self.composed, neutral, self.factor).point
+    def among(self, numbers: Sequence[int]) -> Asked:
+        """The same in some of the windows."""
+        part, mine = self.composed.among(numbers), np.isin(self.composed.rows.window, numbers)
+        plain = self.plain.among(part, mine)
+        return replace(self, composed=part, factor=self.factor[mine], fold=self.fold[mine], plain=plain)
 
     def asked(self, step: Step, number: int) -> tuple[str, ...]:
         """The candidates that a round asks: all in the last one."""
@@ -125,34 +94,32 @@ class _Ask:
 
     def linearised(self, point: Point, names: Sequence[str]) -> Linear:
         """All about a point; what is known there is not worked out again."""
-        names = [*fitted_along(self.composed), *names]
-        known = self.plain
-        if known is not None and known.point == point and {*names} <= {*known.moved, *known.diverged}:
+        names, known = [*fitted_along(self.composed), *names], self.plain
+        if known.point == point and {*names} <= {*known.moved, *known.diverged}:
             return known
         return linearise(self.composed, point, names)
-
-    def settled(self, judge: Judge, point: Point, one: Judged) -> Point:
-        """Where a set settles that was judged about a point."""
-        f = self.forms(judge.linear, one.whiten, one.names)
-        begin = point_of(self.composed, f, tuple(range(len(one.names))), point)
-        first = moved_to(self.composed, judge.linear, one.whiten, begin)
-        return settled(self.composed, first.point, self.factor).point
-
-    def score(self, point: Point, names: tuple[str, ...], judge: Judge) -> float:
-        """Of a set where it has settled; minus infinity where it diverges and the judge's point does not."""
-        linear = linearise(self.composed, point, [*fitted_along(self.composed), *names])
-        if linear.dropped > judge.linear.dropped or linear.diverged:
-            return -np.inf
-        cov = covariances(self.composed, linear, self.factor)
-        near = learned(cov, linear.residual)
-        return Judge(self.composed, self.phases, linear, cov, near, judge.log_odds)(names).score
 
     def forms(self, linear: Linear, whiten: Whitener, names: Sequence[str]) -> Forms:
         """The gap about a point, of these candidates."""
         return forms(gap_of(self.composed, linear, whiten, self.phases, names))
 
 
-def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> tuple[Found, Step]:
+def search(ask: Asked, tell: Progress, kept: Kept = NOWHERE) -> Found:
+    """Search until the best set stays: where there are many windows in some of them first, from which all are
+    gone on with."""
+    start, few = Step(ask.plain.point), ask.composed.thinned()
+    if not ask.forced and len(few) < len(ask.composed.windows):
+
+        def ended() -> Step:
+            last = _searched(ask.among(few), start, tell, kept.of("some windows"))[1]
+            point = settled(ask.composed, last.point, ask.factor).point
+            return Step(point, last.best, field=last.field, whole=False)
+
+        start, ask = kept("some windows", ended), replace(ask, last=True)
+    return _searched(ask, start, tell, kept)[0]
+
+
+def _searched(ask: Asked, step: Step, tell: Progress, kept: Kept) -> tuple[Found, Step]:
     """Rounds until the best set stays. A round that was kept is made again only if it is the last."""
     found: Found | None = None
 
@@ -172,37 +139,126 @@ def _searched(ask: _Ask, step: Step, tell: Progress, kept: Kept) -> tuple[Found,
     return _round(ask, step, number)[0] if found is None else found, after
 
 
-def _round(ask: _Ask, step: Step, number: int) -> tuple[Found, Step]:
+def _round(ask: Asked, step: Step, number: int) -> tuple[Found, Step]:
     """One round: the sets that promise most about the step's point, and where the first that keeps what it
     promised settles."""
-    composed, asked = ask.composed, ask.asked(step, number)
-    linear = ask.linearised(step.point, asked)
-    usable = [n for n in asked if n in linear.moved]
-    cov = covariances(composed, linear, ask.factor)
-    off = learned(cov, linear.residual)
-    # What a cause does is hidden by the discrepancy that is left without it, and what is none of the causes'
-    # doing misleads without one: what comes near by either is asked.
-    scales = [cov.whitener(d) for d in ((off, NONE) if off else (NONE,))]
-    every = [ask.forms(linear, whiten, usable) for whiten in scales]
-    linear, names = leaders(composed, linear, every, ask.forced or step.best, LEADERS)
-    held = tuple(n for n in names if n in (ask.forced or step.best))
-    judge = Judge(composed, ask.phases, linear, cov, off, every[0].log_odds)
-    here = judge(held)
-    f = ask.forms(linear, here.whiten, names)
-    model = fitted(f, tuple(names.index(n) for n in held))
-    found = Found(linear, here.whiten, cov, here.discrepancy, f, (model,), held)
-    if not {*held} <= {*step.point}:
-        return found, Step(ask.settled(judge, step.point, here), held)
+    asked = ask.asked(step, number)
+    place = _Place.of(ask, step.point, ask.forced or step.best, asked)
+    found = place.found()
+    if not {*place.held} <= {*step.point}:
+        return found, Step(place.settled(place.here), place.held)
     if not ask.forced and number < ROUNDS - 1:
-        sets = {tuple(names[j] for j in m.effects) for w in scales
-                for m in one_more(ask.forms(linear, w, names), model.effects)[:PROPOSED]}  # fmt: skip
-        promising = sorted(map(judge, sorted(sets - {held})), key=lambda one: -one.score)
-        for one in [p for p in promising if p.score > here.score + SETTLED][:TRIED]:
-            say(f"trying {' + '.join(one.names) or 'nothing'}")
-            point = ask.settled(judge, step.point, one)
-            if ask.score(point, one.names, judge) > here.score + SETTLED:
-                return found, Step(point, one.names)
+        better = _better(place, place.here.score) or _exchanged(place, asked)
+        if better is not None:
+            return found, better
     # Whatever a set has gained or lost changes what comes near beside it.
     if len(asked) < len(ask.candidates):
         return found, replace(step, whole=True)
-    return found, replace(step, ended=True, field=tuple(sorted({*names, *nearest(every, held)[:LEADERS]})))
+    field = {*place.names, *nearest(place.every, place.held)[:LEADERS]}
+    return found, replace(step, ended=True, field=tuple(sorted(field)))
+
+
+def _better(place: _Place, than: float) -> Step | None:
+    """A set that promises more than the place's own, and that keeps it where it settles."""
+    tried: set[tuple[str, ...]] = {place.held}
+    for propose in (one_more, two_more):
+        sets = place.proposed(propose)
+        promising = sorted(map(place.judge, sorted(sets - tried)), key=lambda one: -one.score)
+        for one in [p for p in promising if p.score > place.here.score + SETTLED][:TRIED]:
+            say(f"trying {' + '.join(one.names) or 'nothing'}")
+            point = place.settled(one)
+            if place.keeps(point, one.names, than + SETTLED):
+                return Step(point, one.names)
+        tried |= sets
+        if not place.here.discrepancy:  # nothing is left for what helps only together
+            break
+    return None
+
+
+def _exchanged(place: _Place, asked: Sequence[str]) -> Step | None:
+    """A set with others in the place of one effect, if that is better: sought about the point without it, for
+    what it does to the model changes what others seem to do."""
+    ask = place.ask
+    if ask.last or not place.here.discrepancy:
+        return None
+    for out in place.held:
+        rest = tuple(n for n in place.held if n != out)
+        left = {n: values for n, values in place.linear.point.items() if n != out}
+        point = settled(ask.composed, left, ask.factor).point
+        other = _Place.of(ask, point, rest, [n for n in asked if n != out])
+        better = _better(other, place.here.score)
+        if better is not None:
+            return better
+    return None
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A set where it has settled, `held`, judged `here`, and the gap linear about there: by two `scales`,
+    that of the discrepancy that is left and of the sensors' noise alone, `every` candidate, and the `names`
+    of those that come near."""
+
+    ask: Asked
+    linear: Linear
+    scales: tuple[Whitener, ...]
+    every: tuple[Forms, ...]
+    names: tuple[str, ...]
+    held: tuple[str, ...]
+    judge: Judge
+    here: Judged
+
+    @classmethod
+    def of(cls, ask: Asked, point: Point, held: Sequence[str], asked: Sequence[str]) -> _Place:
+        """About a point, with these candidates."""
+        linear = ask.linearised(point, asked)
+        usable = [n for n in asked if n in linear.moved]
+        cov = covariances(ask.composed, linear, ask.factor)
+        off = learned(cov, linear.residual)
+        # What a cause does is hidden by the discrepancy that is left without it, and what is none of the
+        # causes' doing misleads without one: what comes near by either is asked.
+        scales = tuple(cov.whitener(d) for d in ((off, NONE) if off else (NONE,)))
+        every = tuple(ask.forms(linear, whiten, usable) for whiten in scales)
+        linear, names = leaders(ask.composed, linear, every, held, LEADERS)
+        there = tuple(n for n in names if n in held)
+        judge = Judge(ask.composed, ask.phases, linear, cov, off, every[0].log_odds)
+        return cls(ask, linear, scales, every, tuple(names), there, judge, judge(there))
+
+    def found(self) -> Found:
+        """What is known there, the set the best."""
+        f = self.ask.forms(self.linear, self.here.whiten, self.names)
+        model = fitted(f, tuple(self.names.index(n) for n in self.held))
+        cov, off = self.judge.covariances, self.here.discrepancy
+        return Found(self.linear, self.here.whiten, cov, off, f, (model,), self.held)
+
+    def proposed(self, propose: Callable[[Forms, Sequence[int]], list[Model]]) -> set[tuple[str, ...]]:
+        """Other sets that promise most, by each scale."""
+        own, found = [self.names.index(n) for n in self.held], set()
+        for whiten in self.scales:
+            models = propose(self.ask.forms(self.linear, whiten, self.names), own)[:PROPOSED]
+            found |= {tuple(self.names[j] for j in m.effects) for m in models}
+        return found
+
+    def settled(self, one: Judged) -> Point:
+        """Where a set settles that was judged here."""
+        f = self.ask.forms(self.linear, one.whiten, one.names)
+        begin = point_of(self.ask.composed, f, tuple(range(len(one.names))), self.linear.point)
+        first = moved_to(self.ask.composed, self.linear, one.whiten, begin)
+        return settled(self.ask.composed, first.point, self.ask.factor).point
+
+    def keeps(self, point: Point, names: tuple[str, ...], least: float) -> bool:
+        """Whether a set scores more than `least` where it has settled, and held-out logs do not speak against
+        what is new in it. It does not where the simulator diverges more than it did."""
+        ask = self.ask
+        linear = linearise(ask.composed, point, [*fitted_along(ask.composed), *names])
+        if linear.dropped > self.linear.dropped or linear.diverged:
+            return False
+        cov = covariances(ask.composed, linear, ask.factor)
+        judge = Judge(
+            ask.composed, ask.phases, linear, cov, learned(cov, linear.residual), self.judge.log_odds
+        )
+        there = judge(names)
+        if there.score <= least:
+            return False
+        f = ask.forms(linear, there.whiten, names)
+        out = weakest(f.gap, range(len(names)), ask.fold[np.isfinite(linear.residual)], EVEN)
+        return out is None or names[out] in self.held

@@ -3,9 +3,8 @@
 A straight line from where one hysteresis acts to where another would is no measure of either: about the point
 of a dead band, friction at its neutral value moves nothing. So what could take a cause's place is sought
 about the point without that cause, fitted exactly, and linearised where it then is. It stands in where it
-explains most of what the cause does, unless the cause is the better of the two by more than what nobody
-explains, and logs that took no part in a fit bear that out: where the model is off by itself, all rows
-together are no judge of small differences, and what is left could be anything.
+explains most of what the cause does, unless logs that took no part in a fit bear out that the cause is the
+better of the two: where the model is off by itself, all rows together are no judge of small differences.
 """
 
 from __future__ import annotations
@@ -157,7 +156,8 @@ def _told_apart(causing: _Fit, other: _Fit, lacking: _Fit) -> bool:
     strange = log_prior(causing.forms, causing.model) - log_prior(other.forms, other.model)
     if strange > np.log(RULED_OUT):
         return True
-    return worse > causing.left and chance_of(causing.held_out - other.held_out) <= BORNE_OUT
+    gain = causing.held_out - other.held_out
+    return float(gain.sum()) > np.log(RULED_OUT) and chance_of(gain) <= BORNE_OUT
 
 
 def log_prior(f: Forms, model: Model) -> float:
