@@ -13,7 +13,6 @@ from simgap.robots.linear import Linear
 
 FOLDS = 6  # numerics: parts that are held out in turn; each fit keeps five sixths
 BORNE_OUT = 0.05  # chosen: chance of held-out gains as good without any
-EVEN = 0.5  # chosen: the same, where held-out rows speak against an effect sooner than for it
 
 
 def folds_of(linear: Linear, num_logs: int, groups: Sequence[int] | None = None) -> np.ndarray:
@@ -74,15 +73,20 @@ def chance_of(gain: np.ndarray) -> float:
     return float(_chances(gain[:, None])[0])
 
 
-def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray, most: float = BORNE_OUT) -> int | None:
+def borne(gain: np.ndarray) -> bool:
+    """Whether held-out rows (folds,) bear a gain out; one fold says nothing against it."""
+    return gain.size < 2 or (float(gain.sum()) > 0 and chance_of(gain) < BORNE_OUT)
+
+
+def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> int | None:
     """Of a set's effects that held-out rows do not bear out beside the others the one that gains least; None
-    where all are borne out: their gains have a chance of less than `most` without them."""
+    where all are borne out."""
     kept = tuple(sorted(effects))
     if not kept or np.unique(fold).size < 2:
         return None
     score = held_out_scores(gap, [kept, *(tuple(j for j in kept if j != out) for out in kept)], fold)
     gain = score[:, :1] - score[:, 1:]
-    failing = _chances(gain) >= most
+    failing = _chances(gain) >= BORNE_OUT
     least = np.where(failing, np.arcsinh(gain).mean(0), np.inf)
     return kept[int(least.argmin())] if failing.any() else None
 

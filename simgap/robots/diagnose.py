@@ -30,9 +30,9 @@ from simgap.robots.linear import Linear, linearise, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
-from simgap.robots.prune import pruned
+from simgap.robots.prune import sought
 from simgap.robots.scatter import over_rivals
-from simgap.robots.search import Asked, Found, search
+from simgap.robots.search import Asked, Found
 from simgap.robots.settle import settled
 from simgap.robots.stand_ins import stand_ins
 from simgap.robots.twins import Twins, healthy_twins
@@ -130,11 +130,7 @@ def _diagnosed(
     twins = kept("twins", lambda: healthy_twins(composed, plain, seed))
     fold = folds_of(plain, len(composed.recordings), groups)
     ask = Asked(composed, parts, tuple(wanted), tuple(forced), twins.factor, fold, plain)
-    found = search(ask, tell, kept.of("search"))
-    borne, point = found.best, found.linear.point
-    if not forced:
-        tell("held-out logs")
-        borne, point = kept("borne out", lambda: pruned(ask, found))
+    found, borne, point = sought(ask, tell, kept)
     tell("all candidates there")
     ended = about(ask, found, point, borne)
     tell("shares")

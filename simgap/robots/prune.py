@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from simgap.progress import Progress
 from simgap.robots.borne_out import weakest
 from simgap.robots.discrepancy import learned
 from simgap.robots.gap import fitted_along
+from simgap.robots.kept import Kept
 from simgap.robots.linear import linearise
 from simgap.robots.model import Point
-from simgap.robots.search import Asked, Found
+from simgap.robots.search import Asked, Found, exchanged, search
 from simgap.robots.settle import settled
 from simgap.robots.whiten import covariances
+
+AGAIN = 3  # numerics: searches, each from what held-out logs leave of the last
 
 
 def pruned(ask: Asked, found: Found) -> tuple[tuple[str, ...], Point]:
@@ -36,3 +40,25 @@ def pruned(ask: Asked, found: Found) -> tuple[tuple[str, ...], Point]:
         cov = covariances(composed, linear, ask.factor)
         whiten = cov.whitener(learned(cov, linear.residual))
     return kept, point
+
+
+def sought(ask: Asked, tell: Progress, kept: Kept) -> tuple[Found, tuple[str, ...], Point]:
+    """Where the search ended, which of its causes held-out logs bear out, and the point of their best fit.
+
+    What they do not bear out was the best at its time, and may have kept what belongs in the place of another
+    from being found: the search goes on from what they leave, if that leads on.
+    """
+    begin, part = None, kept.of("search")
+    for number in range(AGAIN):
+        found = search(ask, tell, part, begin)
+        if ask.forced:
+            return found, found.best, found.linear.point
+        tell("held-out logs")
+        borne, point = part("borne out", lambda found=found: pruned(ask, found))
+        if borne == found.best:
+            break
+        begin = part("exchanged", lambda point=point, borne=borne: exchanged(ask, point, borne))
+        if begin is None:
+            break
+        part = kept.of(f"search {number + 2}")
+    return found, borne, point

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
-from simgap.robots.borne_out import EVEN, weakest
+from simgap.robots.borne_out import borne, held_out_scores
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
@@ -79,8 +80,12 @@ class Asked:
     plain: Linear
     last: bool = False
 
-    def among(self, numbers: Sequence[int]) -> Asked:
-        """The same in some of the windows."""
+    @cached_property
+    def few(self) -> Asked:
+        """The same in some of the windows, or this where they are few anyway."""
+        numbers = self.composed.thinned()
+        if len(numbers) >= len(self.composed.windows):
+            return self
         part, mine = self.composed.among(numbers), np.isin(self.composed.rows.window, numbers)
         plain = self.plain.among(part, mine)
         return replace(self, composed=part, factor=self.factor[mine], fold=self.fold[mine], plain=plain)
@@ -104,19 +109,26 @@ class Asked:
         return forms(gap_of(self.composed, linear, whiten, self.phases, names))
 
 
-def search(ask: Asked, tell: Progress, kept: Kept = NOWHERE) -> Found:
+def search(ask: Asked, tell: Progress, kept: Kept = NOWHERE, begin: Step | None = None) -> Found:
     """Search until the best set stays: where there are many windows in some of them first, from which all are
-    gone on with."""
-    start, few = Step(ask.plain.point), ask.composed.thinned()
-    if not ask.forced and len(few) < len(ask.composed.windows):
+    gone on with. `begin`: a set to go on from, found in some of the windows."""
+    few = ask.few
+    start = Step(ask.plain.point) if begin is None else begin
+    if not ask.forced and few is not ask:
 
         def ended() -> Step:
-            last = _searched(ask.among(few), start, tell, kept.of("some windows"))[1]
+            last = _searched(few, start, tell, kept.of("some windows"))[1]
             point = settled(ask.composed, last.point, ask.factor).point
             return Step(point, last.best, field=last.field, whole=False)
 
         start, ask = kept("some windows", ended), replace(ask, last=True)
     return _searched(ask, start, tell, kept)[0]
+
+
+def exchanged(ask: Asked, point: Point, held: Sequence[str]) -> Step | None:
+    """What to go on from once held-out logs have taken effects out of a set: with others in the place of one
+    of those that are left, if that is better."""
+    return _exchanged(_Place.of(ask.few, point, held, ask.candidates), ask.candidates)
 
 
 def _searched(ask: Asked, step: Step, tell: Progress, kept: Kept) -> tuple[Found, Step]:
@@ -148,7 +160,7 @@ def _round(ask: Asked, step: Step, number: int) -> tuple[Found, Step]:
     if not {*place.held} <= {*step.point}:
         return found, Step(place.settled(place.here), place.held)
     if not ask.forced and number < ROUNDS - 1:
-        better = _better(place, place.here.score) or _exchanged(place, asked)
+        better = _better(place, place) or _exchanged(place, asked)
         if better is not None:
             return found, better
     # Whatever a set has gained or lost changes what comes near beside it.
@@ -158,8 +170,13 @@ def _round(ask: Asked, step: Step, number: int) -> tuple[Found, Step]:
     return found, replace(step, ended=True, field=tuple(sorted(field)))
 
 
-def _better(place: _Place, than: float) -> Step | None:
-    """A set that promises more than the place's own, and that keeps it where it settles."""
+def _better(place: _Place, now: _Place) -> Step | None:
+    """A set that promises more than the place's own, and that scores better than what is held now where it
+    settles.
+
+    What comes one by one is judged again when the search has ended. Two at once, or others in the place of
+    one, held-out logs must bear out at once: where the model is off by itself there are many such sets.
+    """
     tried: set[tuple[str, ...]] = {place.held}
     for propose in (one_more, two_more):
         sets = place.proposed(propose)
@@ -167,7 +184,9 @@ def _better(place: _Place, than: float) -> Step | None:
         for one in [p for p in promising if p.score > place.here.score + SETTLED][:TRIED]:
             say(f"trying {' + '.join(one.names) or 'nothing'}")
             point = place.settled(one)
-            if place.keeps(point, one.names, than + SETTLED):
+            score, held_out = place.tried(point, one.names)
+            sure = place is now and propose is one_more
+            if score > now.here.score + SETTLED and (sure or borne(held_out - now.held_out)):
                 return Step(point, one.names)
         tried |= sets
         if not place.here.discrepancy:  # nothing is left for what helps only together
@@ -185,8 +204,7 @@ def _exchanged(place: _Place, asked: Sequence[str]) -> Step | None:
         rest = tuple(n for n in place.held if n != out)
         left = {n: values for n, values in place.linear.point.items() if n != out}
         point = settled(ask.composed, left, ask.factor).point
-        other = _Place.of(ask, point, rest, [n for n in asked if n != out])
-        better = _better(other, place.here.score)
+        better = _better(_Place.of(ask, point, rest, [n for n in asked if n != out]), place)
         if better is not None:
             return better
     return None
@@ -245,20 +263,25 @@ class _Place:
         first = moved_to(self.ask.composed, self.linear, one.whiten, begin)
         return settled(self.ask.composed, first.point, self.ask.factor).point
 
-    def keeps(self, point: Point, names: tuple[str, ...], least: float) -> bool:
-        """Whether a set scores more than `least` where it has settled, and held-out logs do not speak against
-        what is new in it. It does not where the simulator diverges more than it did."""
+    @cached_property
+    def held_out(self) -> np.ndarray:
+        """Log likelihood of each fold's rows (folds,), fitted to the others."""
+        return self._held_out(self.linear, self.here)
+
+    def tried(self, point: Point, names: tuple[str, ...]) -> tuple[float, np.ndarray]:
+        """Of a set where it has settled its score, minus infinity where the simulator diverges more than it
+        did, and its log likelihood of each fold's rows (folds,)."""
         ask = self.ask
         linear = linearise(ask.composed, point, [*fitted_along(ask.composed), *names])
         if linear.dropped > self.linear.dropped or linear.diverged:
-            return False
+            return -np.inf, np.zeros(np.unique(ask.fold).size)
         cov = covariances(ask.composed, linear, ask.factor)
-        judge = Judge(
-            ask.composed, ask.phases, linear, cov, learned(cov, linear.residual), self.judge.log_odds
-        )
-        there = judge(names)
-        if there.score <= least:
-            return False
-        f = ask.forms(linear, there.whiten, names)
-        out = weakest(f.gap, range(len(names)), ask.fold[np.isfinite(linear.residual)], EVEN)
-        return out is None or names[out] in self.held
+        off = learned(cov, linear.residual)
+        one = Judge(ask.composed, ask.phases, linear, cov, off, self.judge.log_odds)(names)
+        return one.score, self._held_out(linear, one)
+
+    def _held_out(self, linear: Linear, one: Judged) -> np.ndarray:
+        f, fold = self.ask.forms(linear, one.whiten, one.names), self.ask.fold
+        every = tuple(range(len(one.names)))
+        score = held_out_scores(f.gap, [every], fold[np.isfinite(linear.residual)])[:, 0]
+        return score - one.whiten.half_log_dets(np.unique(fold, return_inverse=True)[1])

@@ -67,6 +67,11 @@ class Whitener:
         """Half the log determinant of all rows' covariance."""
         return sum(float(np.log(np.diag(factor)).sum()) for factor in self.factors)
 
+    def half_log_dets(self, group: np.ndarray) -> np.ndarray:
+        """The same by group of rows; `group` (N,), blocks are within groups."""
+        own = [float(np.log(np.diag(factor)).sum()) for factor in self.factors]
+        return np.bincount(group[[block[0] for block in self.blocks]], own, group.max() + 1)
+
 
 @dataclass(frozen=True)
 class Source:
