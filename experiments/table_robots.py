@@ -55,7 +55,8 @@ def check() -> str | None:
     counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
     note = (
         f"{found['cases']} cases ({counts}; {found['below_the_floor']} of {found['faults']} faults show less "
-        f"than the floor of {found['floor']:g} nats and are not asked); in brackets 90 % intervals. Processor time a case: {seconds}. "
+        f"than the floor of {found['floor']:g} nats and are not asked); in brackets 90 % intervals. "
+        f"Processor time a case: {seconds}. "
         f"Code of {found['made_by']}."
     )
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"

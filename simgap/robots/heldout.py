@@ -16,6 +16,7 @@ from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.proposals import point_of
 from simgap.robots.search import Found
+from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
 
 
@@ -140,4 +141,6 @@ def _refitted(
     part = composed.along(logs)
     linear = linearise(part, found.linear.point, [])
     cov = covariances(part, linear)
-    return moved_to(part, linear, cov.whitener(found.discrepancy), point, only).point
+    whiten = cov.whitener(found.discrepancy)
+    there = moved_to(part, linear, whiten, point, only).point
+    return there if only is not None else settled(part, there, whiten=whiten).point

@@ -157,7 +157,7 @@ def _told_apart(causing: _Fit, other: _Fit, lacking: _Fit) -> bool:
     if strange > np.log(RULED_OUT):
         return True
     gain = causing.held_out - other.held_out
-    return float(gain.sum()) > np.log(RULED_OUT) and chance_of(gain) <= BORNE_OUT
+    return float(gain.sum()) > float(np.log(RULED_OUT)) and chance_of(gain) <= BORNE_OUT
 
 
 def log_prior(f: Forms, model: Model) -> float:
