@@ -10,7 +10,7 @@ import numpy as np
 from simgap.attribution.heldout import fraction_gone
 from simgap.attribution.posterior import forms
 from simgap.attribution.search import sought
-from simgap.robots.borne_out import borne_out
+from simgap.robots.borne_out import borne_out, folds_of
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
@@ -55,6 +55,8 @@ def shrinkage(
     gap = found.forms.gap
     before, after = plain.residual.copy(), np.full(rows.log.size, np.nan)
     kept_sets = []
+    # Of few groups fewer are left here, which could bear nothing out: each log is a fold of its own.
+    within = folds_of(found.linear, len(composed.recordings))
     whole_logs = all(np.unique(fold[rows.log == log]).size == 1 for log in np.unique(rows.log))
     for number in np.unique(fold):
         inside = fold == number
@@ -63,7 +65,7 @@ def shrinkage(
         if forced:
             kept = tuple(j for j, n in enumerate(found.names) if n in causes)
         else:
-            kept = borne_out(gap.taken(seen), sought(train)[0].effects, fold[index][seen])
+            kept = borne_out(gap.taken(seen), sought(train)[0].effects, within[index][seen])
         kept_sets.append(tuple(found.names[j] for j in kept))
         point = point_of(composed, train, kept, found.linear.point)
         if whole_logs:
