@@ -13,6 +13,7 @@ from simgap.robots.linear import Linear
 
 FOLDS = 6  # numerics: parts that are held out in turn; each fit keeps five sixths
 BORNE_OUT = 0.05  # chosen: chance of held-out gains as good without any
+EVEN = 0.5  # chosen: the same of a bet: held-out rows are sooner for it than against it
 
 
 def folds_of(linear: Linear, num_logs: int, groups: Sequence[int] | None = None) -> np.ndarray:
@@ -78,22 +79,23 @@ def borne(gain: np.ndarray) -> bool:
     return gain.size < 2 or (float(gain.sum()) > 0 and chance_of(gain) < BORNE_OUT)
 
 
-def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> int | None:
+def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray, most: float = BORNE_OUT) -> int | None:
     """Of a set's effects that held-out rows do not bear out beside the others the one that gains least; None
-    where all are borne out."""
+    where all are, by a chance of less than `most`."""
     kept = tuple(sorted(effects))
     if not kept or np.unique(fold).size < 2:
         return None
     score = held_out_scores(gap, [kept, *(tuple(j for j in kept if j != out) for out in kept)], fold)
     gain = score[:, :1] - score[:, 1:]
-    failing = _chances(gain) >= BORNE_OUT
+    failing = _chances(gain) >= most
     least = np.where(failing, np.arcsinh(gain).mean(0), np.inf)
     return kept[int(least.argmin())] if failing.any() else None
 
 
-def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray) -> tuple[int, ...]:
-    """Of a set's effects those that held-out rows bear out beside the others; the weakest one goes first."""
+def borne_out(gap: Gap, effects: Sequence[int], fold: np.ndarray, most: float = BORNE_OUT) -> tuple[int, ...]:
+    """Of a set's effects those that held-out rows bear out beside the others, as in `weakest`, which goes
+    first."""
     kept = tuple(sorted(effects))
-    while (out := weakest(gap, kept, fold)) is not None:
+    while (out := weakest(gap, kept, fold, most)) is not None:
         kept = tuple(j for j in kept if j != out)
     return kept

@@ -10,7 +10,7 @@ import numpy as np
 from simgap.attribution.heldout import fraction_gone
 from simgap.attribution.posterior import forms
 from simgap.attribution.search import sought
-from simgap.robots.borne_out import borne_out, folds_of
+from simgap.robots.borne_out import EVEN, borne_out
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
@@ -49,14 +49,12 @@ def shrinkage(
     forced: bool = False,
 ) -> Shrinkage | None:
     """Nested: every fold is predicted by a search and a fit that saw the others alone, about the point where
-    the search ended. `plain`: the linear model where only what is fitted along is; `causes` are taken where
+    the search ended. To be told, a cause must be borne out; to predict by, it need only be the better bet. `plain`: the linear model where only what is fitted along is; `causes` are taken where
     they are `forced`."""
     rows, index = found.linear.rows, np.flatnonzero(np.isfinite(found.linear.residual))
     gap = found.forms.gap
     before, after = plain.residual.copy(), np.full(rows.log.size, np.nan)
     kept_sets = []
-    # Of few groups fewer are left here, which could bear nothing out: each log is a fold of its own.
-    within = folds_of(found.linear, len(composed.recordings))
     whole_logs = all(np.unique(fold[rows.log == log]).size == 1 for log in np.unique(rows.log))
     for number in np.unique(fold):
         inside = fold == number
@@ -65,7 +63,7 @@ def shrinkage(
         if forced:
             kept = tuple(j for j, n in enumerate(found.names) if n in causes)
         else:
-            kept = borne_out(gap.taken(seen), sought(train)[0].effects, within[index][seen])
+            kept = borne_out(gap.taken(seen), sought(train)[0].effects, fold[index][seen], EVEN)
         kept_sets.append(tuple(found.names[j] for j in kept))
         point = point_of(composed, train, kept, found.linear.point)
         if whole_logs:
