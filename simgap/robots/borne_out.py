@@ -70,13 +70,9 @@ def _chances(gain: np.ndarray) -> np.ndarray:
 
 
 def chance_of(gain: np.ndarray) -> float:
-    """Chance that a set gains as much over another on held-out rows (folds,) without being any better."""
-    return float(_chances(gain[:, None])[0])
-
-
-def borne(gain: np.ndarray) -> bool:
-    """Whether held-out rows (folds,) bear a gain out; one fold says nothing against it."""
-    return gain.size < 2 or (float(gain.sum()) > 0 and chance_of(gain) < BORNE_OUT)
+    """Chance that a set gains as much over another on held-out rows (folds,) without being any better; of one
+    fold, which tells nothing, none."""
+    return 0.0 if gain.size < 2 else float(_chances(gain[:, None])[0])
 
 
 def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray, most: float = BORNE_OUT) -> int | None:

@@ -49,8 +49,9 @@ def shrinkage(
     forced: bool = False,
 ) -> Shrinkage | None:
     """Nested: every fold is predicted by a search and a fit that saw the others alone, about the point where
-    the search ended. To be told, a cause must be borne out; to predict by, it need only be the better bet. `plain`: the linear model where only what is fitted along is; `causes` are taken where
-    they are `forced`."""
+    the search ended. To be told, a cause must be borne out; to predict by, it need only be the better bet.
+    `plain`: the linear model where only what is fitted along is; `causes` are taken where they are `forced`.
+    """
     rows, index = found.linear.rows, np.flatnonzero(np.isfinite(found.linear.residual))
     gap = found.forms.gap
     before, after = plain.residual.copy(), np.full(rows.log.size, np.nan)

@@ -16,7 +16,7 @@ import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
-from simgap.robots.borne_out import borne, held_out_scores
+from simgap.robots.borne_out import BORNE_OUT, EVEN, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along, gap_of
@@ -174,8 +174,9 @@ def _better(place: _Place, now: _Place) -> Step | None:
     """A set that promises more than the place's own, and that scores better than what is held now where it
     settles.
 
-    What comes one by one is judged again when the search has ended. Two at once, or others in the place of
-    one, held-out logs must bear out at once: where the model is off by itself there are many such sets.
+    What comes one by one is judged again when the search has ended, and held-out logs need only be for it
+    sooner than against it. Two at once, or others in the place of one, they must bear out: where the model is
+    off by itself there are many such sets.
     """
     tried: set[tuple[str, ...]] = {place.held}
     for propose in (one_more, two_more):
@@ -185,8 +186,8 @@ def _better(place: _Place, now: _Place) -> Step | None:
             say(f"trying {' + '.join(one.names) or 'nothing'}")
             point = place.settled(one)
             score, held_out = place.tried(point, one.names)
-            sure = place is now and propose is one_more
-            if score > now.here.score + SETTLED and (sure or borne(held_out - now.held_out)):
+            most = EVEN if place is now and propose is one_more else BORNE_OUT
+            if score > now.here.score + SETTLED and chance_of(held_out - now.held_out) < most:
                 return Step(point, one.names)
         tried |= sets
         if not place.here.discrepancy:  # nothing is left for what helps only together
