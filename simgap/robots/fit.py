@@ -43,15 +43,7 @@ def moved_to(
     if not any(free.values()):
         return Fit(point, 0.0)
     squares = _Squares(composed, linear, whiten, held, free)
-    here, there = squares.coordinates(linear.point), squares.coordinates(free)
-    cost, begin = squares.cost(here), there
-    if not np.array_equal(here, there):
-        for _ in range(HALVINGS):
-            if squares.cost(begin) <= cost:
-                break
-            begin = 0.5 * (here + begin)
-        else:
-            begin = here
+    begin = squares.reached()
     first = squares.cost(begin)
     if not np.isfinite(first):
         return Fit(point, 0.0)
@@ -64,6 +56,14 @@ def moved_to(
     )  # fmt: skip
     x = np.clip(done.x + offset, squares.low, squares.high)
     return Fit({**point, **squares.at(x)}, first - float(done.cost))
+
+
+def reached(composed: Composed, linear: Linear, whiten: Whitener, point: Point) -> Point:
+    """The start that `moved_to` has for a point, as far as straight lines from the linear model's lead."""
+    if not any(point.values()):
+        return point
+    squares = _Squares(composed, linear, whiten, {}, point)
+    return squares.at(squares.reached())
 
 
 @dataclass
@@ -106,6 +106,19 @@ class _Squares:
         neutral = {e: self.composed.effects[e].neutral() for e in self.free}
         value = np.array([{**neutral[e], **point.get(e, {})}[p] for e, p in self.names])
         return np.clip((value - self.nominal) / self.sd, self.low + 1e-6, self.high - 1e-6)
+
+    def reached(self) -> np.ndarray:
+        """Where the free effects are, or half as far from the linear model's point, and half again, while
+        that is worse than there."""
+        here, x = self.coordinates(self.linear.point), self.coordinates(self.free)
+        if np.array_equal(here, x):
+            return x
+        cost = self.cost(here)
+        for _ in range(HALVINGS):
+            if self.cost(x) <= cost:
+                return x
+            x = 0.5 * (here + x)
+        return here
 
     def base(self, x: np.ndarray) -> Base:
         """Rollouts there."""

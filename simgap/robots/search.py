@@ -18,7 +18,7 @@ from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
 from simgap.robots.borne_out import BORNE_OUT, EVEN, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import moved_to
+from simgap.robots.fit import reached
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.judged import Judge, Judged
 from simgap.robots.kept import NOWHERE, Kept
@@ -261,8 +261,8 @@ class _Place:
         """Where a set settles that was judged here."""
         f = self.ask.forms(self.linear, one.whiten, one.names)
         begin = point_of(self.ask.composed, f, tuple(range(len(one.names))), self.linear.point)
-        first = moved_to(self.ask.composed, self.linear, one.whiten, begin)
-        return settled(self.ask.composed, first.point, self.ask.factor).point
+        first = reached(self.ask.composed, self.linear, one.whiten, begin)
+        return settled(self.ask.composed, first, self.ask.factor).point
 
     @cached_property
     def held_out(self) -> np.ndarray:

@@ -18,9 +18,9 @@ from simgap.attribution.posterior import Forms, Model, coordinates, fitted, form
 from simgap.attribution.verdict import MOST, RULED_OUT
 from simgap.robots.borne_out import BORNE_OUT, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import moved_to
+from simgap.robots.fit import reached
 from simgap.robots.gap import fitted_along, gap_of
-from simgap.robots.linear import Linear, linearise
+from simgap.robots.linear import linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
 from simgap.robots.proposals import leaders, point_of
@@ -101,10 +101,8 @@ class _Asked:
         sets = {j: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}
         gain = {j: fitted(f, effects).score for j, effects in sets.items()}
         first = sorted(gain, key=lambda j: -gain[j])[:TRIED]
-        return [(names[j], self._begun(linear, point_of(self.composed, f, sets[j], point))) for j in first]
-
-    def _begun(self, linear: Linear, point: Point) -> Point:
-        return moved_to(self.composed, linear, self.whiten, point).point
+        there = {names[j]: point_of(self.composed, f, sets[j], point) for j in first}
+        return [(n, reached(self.composed, linear, self.whiten, p)) for n, p in there.items()]
 
 
 def stand_ins(
