@@ -186,7 +186,8 @@ def _concluded(
 ) -> RobotVerdict:  # fmt: skip
     """The verdict on what was borne out, told of the windows of `whole`; `wanted` are all candidates.
 
-    Where the model is off by itself, only held-out logs tell small differences between effects."""
+    What could take a cause's place is fitted exactly and judged by held-out logs: straight lines from where
+    the cause acts tell little of it, and where the model is off by itself nothing else tells them apart."""
     linear, sensor = ended.linear, ended.covariances.whitener()
     rows = np.flatnonzero(np.isfinite(linear.residual))
     s = forms(gap_of(composed, linear, sensor, phases, ended.names))
@@ -197,8 +198,7 @@ def _concluded(
     rng = np.random.default_rng(seed)
     causes = ended.models[0].effects
     verdict = verdict_on(ended.forms, s, causes, null, rng, explains, every, fold[rows], forced, numerics)
-    off = bool(ended.discrepancy) and len(composed.recordings) >= 3
-    if not (verdict.causes and off) or forced:
+    if not verdict.causes or len(composed.recordings) < 3 or forced:
         return verdict
     others = stand_ins(composed, phases, ended, wanted, verdict.causes, fold, twins.factor)
     wider = over_rivals(ended.forms, verdict.model, [(one.forms, one.model) for one in others])

@@ -179,14 +179,14 @@ def _better(place: _Place, now: _Place) -> Step | None:
     off by itself there are many such sets.
     """
     tried: set[tuple[str, ...]] = {place.held}
-    for propose in (one_more, two_more):
-        sets = place.proposed(propose)
+    for proposals in ((one_more,), (two_more,)) if place is now else ((one_more, two_more),):
+        sets = set().union(*map(place.proposed, proposals))
         promising = sorted(map(place.judge, sorted(sets - tried)), key=lambda one: -one.score)
         for one in [p for p in promising if p.score > place.here.score + SETTLED][:TRIED]:
             say(f"trying {' + '.join(one.names) or 'nothing'}")
             point = place.settled(one)
             score, held_out = place.tried(point, one.names)
-            most = EVEN if place is now and propose is one_more else BORNE_OUT
+            most = EVEN if place is now and one_more in proposals else BORNE_OUT
             if score > now.here.score + SETTLED and chance_of(held_out - now.held_out) < most:
                 return Step(point, one.names)
         tried |= sets
