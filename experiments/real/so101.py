@@ -47,7 +47,7 @@ class Arm:
     says = {  # noqa: RUF012
         "friction": "Coulomb friction holds a joint within this angle of where the P gain would have it",
         "dead_band": "the controller does not see errors below this",
-        "backlash": "the joint lags behind its motor by half of this play either way",
+        "backlash": "the joint lags behind its motor by this either way, half of the play",
         "sag": "a constant load holds a joint off its command",
     }
 
@@ -65,11 +65,13 @@ class Arm:
 
 @njit(cache=True)
 def follow(p, t, command, q, v):
-    """Angles (num_timesteps,) of one joint; p: servo, friction, dead band, backlash, sag."""
+    """Angles (num_timesteps,) of one joint; p: servo, friction, dead band, backlash, sag. Widths are half of
+    what lies between one way and the other."""
     servo, friction, band, play, sag = p
     out = np.empty(t.size)
     out[0] = q
-    motor = q + 0.5 * play * np.sign(command[0] - q)
+    # A motor rests where its controller has it, or pushes on the side of the gears that is towards there.
+    motor = min(max(command[0] + sag, q - play), q + play)
     for i in range(t.size - 1):
         steps = max(1, int(np.ceil((t[i + 1] - t[i]) / STEP - 1e-9)))
         h = (t[i + 1] - t[i]) / steps
@@ -80,6 +82,6 @@ def follow(p, t, command, q, v):
             brake = h * servo**2 * friction
             v = 0.0 if abs(v) <= brake else v - np.sign(v) * brake
             motor += h * v
-            q = min(max(q, motor - 0.5 * play), motor + 0.5 * play)
+            q = min(max(q, motor - play), motor + play)
         out[i + 1] = q
     return out

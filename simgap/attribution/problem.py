@@ -8,7 +8,8 @@ linearised: shift_j(theta) = shift + jacobian @ (theta - at).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -121,6 +122,10 @@ class Gap:
                    tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
                    None if self.carried is None else self.carried[:, rows],
                    None if self.tolerance is None else self.tolerance[rows], self.usual)  # fmt: skip
+
+    def only(self, effects: Sequence[int]) -> Gap:
+        """The gap with some of its candidates alone, in this order."""
+        return replace(self, candidates=tuple(self.candidates[j] for j in effects))
 
     @property
     def raw_columns(self) -> Float[np.ndarray, "n m"]:

@@ -5,6 +5,8 @@ Sets within a window of the best are kept (Occam's window: Madigan & Raftery, JA
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, mode, quadratic_forms
@@ -16,13 +18,17 @@ BEAM = 5  # numerics: sets of each size that are extended
 MOST = 6  # numerics: effects of a set at most
 
 
-def sought(f: Forms, beam: int = BEAM, named: bool = False) -> list[Model]:
+def sought(
+    f: Forms, beam: int = BEAM, named: bool = False, among: Sequence[int] | None = None
+) -> list[Model]:
     """All sets found within the window of the best, best first; the empty set is always one.
 
     Neighbours of a set are screened from its mode in a few steps; those that lead are fitted to the end.
     `beam`: how many sets of the window are extended. `named`: of candidates that have a name alone.
+    `among`: of these candidates alone.
     """
-    among = [j for j, c in enumerate(f.gap.candidates) if c.named or not named]
+    every = range(len(f.gap.candidates)) if among is None else among
+    among = [j for j in every if f.gap.candidates[j].named or not named]
     seen: dict[tuple[int, ...], Model] = {(): fitted(f, ()), **{(j,): fitted(f, (j,)) for j in among}}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}

@@ -81,7 +81,9 @@ def weakest(gap: Gap, effects: Sequence[int], fold: np.ndarray, most: float = BO
     kept = tuple(sorted(effects))
     if not kept or np.unique(fold).size < 2:
         return None
-    score = held_out_scores(gap, [kept, *(tuple(j for j in kept if j != out) for out in kept)], fold)
+    whole = tuple(range(len(kept)))
+    sets = [whole, *(tuple(j for j in whole if j != out) for out in whole)]
+    score = held_out_scores(gap.only(kept), sets, fold)
     gain = score[:, :1] - score[:, 1:]
     failing = _chances(gain) >= most
     least = np.where(failing, np.arcsinh(gain).mean(0), np.inf)

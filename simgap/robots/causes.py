@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from simgap.attribution.posterior import fitted, forms
+from simgap.robots.blocks import NONE
 from simgap.robots.discrepancy import learned
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import linearise
 from simgap.robots.model import Point
 from simgap.robots.search import Asked, Found
-from simgap.robots.whiten import NONE, covariances
+from simgap.robots.whiten import covariances
 
 
 def about(ask: Asked, found: Found, point: Point, borne: Sequence[str]) -> Found:

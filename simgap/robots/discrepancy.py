@@ -7,46 +7,45 @@ which a cause shows would count for little, and where a search ends would hang o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.optimize import minimize
 
 from simgap.progress import say
-from simgap.robots.tied import Solved, Tied
-from simgap.robots.whiten import BLOCK, NONE, Covariances, Discrepancy
+from simgap.robots.blocks import NONE, Discrepancy
+from simgap.robots.tied import Likelihood
+from simgap.robots.whiten import Covariances
 
 WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 # numerics: log variances are found to a hundredth of a nat
 CLOSE = {"maxiter": 25, "ftol": 1e-6, "gtol": 0.05}
-ENOUGH = 40  # learned: windows from which discrepancies are learned
 
 
-def learned(cov: Covariances, residual: np.ndarray, near: Discrepancy | None = None) -> Discrepancy:
+def learned(
+    cov: Covariances, residual: np.ndarray, near: Discrepancy | None = None, begin: Discrepancy = NONE
+) -> Discrepancy:
     """The discrepancy of a residual (N,); channels for which it gains nothing have none. `near`: that of a
-    residual of which this one is a part, with which to begin; what that has none of, this has none of."""
-    names = tuple(dict.fromkeys(n for b in cov.blocks for n in b.sources))
+    residual of which this one is a part, with which to begin; what that has none of, this has none of.
+    `begin`: sizes to begin with in the place of those."""
+    names = cov.names
+    if not names:
+        return NONE
+    sizes = _Sizes(cov.tied.of_residual(residual), len(names))
+    kept = [k for k, name in enumerate(names) if near is None or name in near.scale]
     if near is not None:
-        names = tuple(n for n in names if n in near.scale)
-    rows = sum(b.rows.size for b in cov.blocks) / max(len(cov.blocks), 1)
-    every = max(1, int(len(cov.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
-    terms = [Tied.of(b, residual[b.rows], names) for b in cov.blocks[::every]]
-    kept = list(range(len(names)))
-    x = np.full(len(kept), -np.inf)
-    if near is not None:
-        x = np.array([2 * np.log(near.scale[n]) for n in names])
-    for k in kept if near is None else ():
-        guess = _first_guess(terms, k)
-        trial = {
-            v: _value(np.append(x[:k], v), terms, kept[: k + 1]) for v in guess - np.arange(0.0, 19.0, 3.0)
-        }
-        x[k] = min(trial, key=lambda v: trial[v])
-    plain = _value(np.zeros(0), terms, [])
+        x = np.array([2 * np.log({**near.scale, **begin.scale}[names[k]]) for k in kept])
+    else:
+        x = sizes.first_guess()
+    plain = sizes.value(np.zeros(0), [])
     while kept:
         bounds = [(v - 25.0, v + 12.0) for v in x]
-        done = minimize(_cost, x, (terms, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE)
+        done = minimize(sizes.cost, x, (kept,), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE)
         if plain - done.fun < WORTH:
             return NONE
         costs = [
-            _value(np.delete(done.x, i), terms, kept[:i] + kept[i + 1 :]) - done.fun for i in range(len(kept))
+            sizes.value(np.delete(done.x, i), kept[:i] + kept[i + 1 :]) - done.fun for i in range(len(kept))
         ]
         least = int(np.argmin(costs))
         if costs[least] >= WORTH:
@@ -56,36 +55,37 @@ def learned(cov: Covariances, residual: np.ndarray, near: Discrepancy | None = N
     return NONE
 
 
-def _first_guess(terms: list[Tied], k: int) -> float:
-    """Log variance that alone would explain the residual's excess."""
-    ratio = [t.square / max(float(t.trace[k]), 1e-300) for t in terms if t.trace[k] > 0]
-    return float(np.log(max(np.median(ratio), 1e-30))) if ratio else -60.0
+@dataclass(frozen=True)
+class _Sizes:
+    """The likelihood by log variances of those sources, of `count`, that are kept."""
 
+    likelihood: Likelihood
+    count: int
 
-def _value(x: np.ndarray, terms: list[Tied], kept: list[int]) -> float:
-    """Minus log likelihood of the log variances."""
-    return sum(_cost_of(term.solved(_variance(term, x, kept))) for term in terms)
+    def value(self, x: np.ndarray, kept: Sequence[int]) -> float:
+        """Minus log likelihood."""
+        return self.likelihood.value(self._variance(x, kept))
 
+    def cost(self, x: np.ndarray, kept: Sequence[int]) -> tuple[float, np.ndarray]:
+        """`value` and its gradient."""
+        say("how far the model is off by itself")
+        variance = self._variance(x, kept)
+        value, slope = self.likelihood.slope(variance)
+        return value, (variance * slope)[list(kept)]
 
-def _variance(term: Tied, x: np.ndarray, kept: list[int]) -> np.ndarray:
-    """Variances (K,) of all sources, 0 for those that are not kept."""
-    out = np.zeros(term.trace.size)
-    out[kept] = np.exp(x)
-    return out
+    def first_guess(self) -> np.ndarray:
+        """Log variances (K,) found one after another: at most what alone would explain the residual."""
+        x = np.zeros(0)
+        squares, trace = self.likelihood.squares, self.likelihood.tied.trace
+        for k in range(self.count):
+            there = trace[:, k] > 0
+            most = max(float(np.median(squares[there] / trace[there, k])), 1e-30) if there.any() else 1e-26
+            trial = [np.append(x, v) for v in np.log(most) - np.arange(0.0, 19.0, 3.0)]
+            x = min(trial, key=lambda v, k=k: self.value(v, range(k + 1)))
+        return x
 
-
-def _cost_of(found: Solved) -> float:
-    return found.half + 0.5 * found.square
-
-
-def _cost(x: np.ndarray, terms: list[Tied], kept: list[int]) -> tuple[float, np.ndarray]:
-    """`_value` and its gradient."""
-    say("how far the model is off by itself")
-    value, slope = 0.0, np.zeros(len(kept))
-    for term in terms:
-        variance = _variance(term, x, kept)
-        found = term.solved(variance)
-        value += _cost_of(found)
-        trace, pull = found.slopes()
-        slope += 0.5 * (variance * (trace - pull))[kept]
-    return value, slope
+    def _variance(self, x: np.ndarray, kept: Sequence[int]) -> np.ndarray:
+        """Variances (K,) of all sources, 0 for those that are not kept."""
+        out = np.zeros(self.count)
+        out[list(kept)] = np.exp(x)
+        return out

@@ -67,6 +67,12 @@ class Explained:
         lost = self.lost.sum(2)
         return lost / np.maximum(lost.sum(0), 1e-12)
 
+    @property
+    def open_without(self) -> np.ndarray:
+        """Of what is left (J, R) in each regime without a cause the share that is left with it, at most."""
+        left = np.maximum(self.after - self.floor, 0.0).sum(1) + np.sqrt(2 * self.floor.sum(1))
+        return np.where(self.asked, left / np.maximum(left + self.lost.sum(2), 1e-12), 1.0)
+
     def shares(self, rng: np.random.Generator) -> Shares:
         """All regimes together."""
         before, floor = float(self.before.sum()), float(self.floor.sum())

@@ -14,8 +14,8 @@ from simgap.robots.borne_out import EVEN, borne_out
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
-from simgap.robots.proposals import point_of
-from simgap.robots.search import Found
+from simgap.robots.proposals import nearest, point_of
+from simgap.robots.search import LEADERS, Found
 from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
 
@@ -64,7 +64,9 @@ def shrinkage(
         if forced:
             kept = tuple(j for j, n in enumerate(found.names) if n in causes)
         else:
-            kept = borne_out(gap.taken(seen), sought(train)[0].effects, fold[index][seen], EVEN)
+            near = {*nearest([train], found.best)[:LEADERS], *found.best}
+            best = sought(train, among=[j for j, n in enumerate(found.names) if n in near])[0]
+            kept = borne_out(gap.taken(seen), best.effects, fold[index][seen], EVEN)
         kept_sets.append(tuple(found.names[j] for j in kept))
         point = point_of(composed, train, kept, found.linear.point)
         if whole_logs:

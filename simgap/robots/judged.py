@@ -16,12 +16,13 @@ import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.problem import Gap
+from simgap.robots.blocks import NONE, Discrepancy
 from simgap.robots.discrepancy import learned
 from simgap.robots.gap import gap_of
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
-from simgap.robots.whiten import NONE, Covariances, Discrepancy, Whitener
+from simgap.robots.whiten import Covariances, Whitener
 
 TURNS = 2  # numerics: fits of parameters and of discrepancies in turn
 
@@ -60,7 +61,7 @@ class Judge:
         for _ in range(TURNS):
             f, model, _ = self._fitted(names, off)
             left[seen] = residual_of(raw, f, model)
-            off = learned(self.covariances, left, self.near)
+            off = learned(self.covariances, left, self.near, off)
         f, model, whiten = self._fitted(names, off)
         prior = len(names) * (self.log_odds - f.log_odds)
         return Judged(tuple(names), off, whiten, model.score + prior - whiten.half_log_det)

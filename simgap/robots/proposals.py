@@ -20,7 +20,7 @@ FEWEST = 4  # numerics: candidates that are asked beside a set, however large it
 
 def nearest(every: Sequence[Forms], best: Sequence[str]) -> list[str]:
     """Candidates by what they gain beside these, by their better rank in any of these forms, first first."""
-    return _ranked([_gains(f, best)[0] for f in every])
+    return ranked([_gains(f, best)[0] for f in every])
 
 
 def _gains(
@@ -33,7 +33,7 @@ def _gains(
     return {n: m.score for n, m in models.items()}, models
 
 
-def _ranked(gains: Sequence[Mapping[str, float]]) -> list[str]:
+def ranked(gains: Sequence[Mapping[str, float]]) -> list[str]:
     """Names by their better rank in several scores, best first."""
     ranks = [sorted(one, key=lambda n: -one[n]) for one in gains]
     return list(dict.fromkeys(name for level in zip(*ranks, strict=True) for name in level))
@@ -97,8 +97,8 @@ def leaders(
     held = [n for n in best if n in linear.moved]
     beside = [held, *([n for n in held if n != out] for out in held)]
     told = [(f, *_gains(f, kept, held)) for kept in beside for f in every]
-    first = _ranked([gains for _, gains, _ in told])[: max(count - len(held), FEWEST)]
-    place = [{n: k for k, n in enumerate(_ranked([gains]))} for _, gains, _ in told]
+    first = ranked([gains for _, gains, _ in told])[: max(count - len(held), FEWEST)]
+    place = [{n: k for k, n in enumerate(ranked([gains]))} for _, gains, _ in told]
     base = numeric_at(composed, base_at(composed, linear.point))
     more = {}
     for name in sorted(first, key=lambda n: not composed.numeric(n)):

@@ -16,6 +16,7 @@ import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.progress import Progress, say
+from simgap.robots.blocks import NONE, Discrepancy
 from simgap.robots.borne_out import BORNE_OUT, EVEN, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import reached
@@ -27,7 +28,7 @@ from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
 from simgap.robots.proposals import leaders, nearest, one_more, point_of, two_more
 from simgap.robots.settle import SETTLED, settled
-from simgap.robots.whiten import NONE, Covariances, Discrepancy, Whitener, covariances
+from simgap.robots.whiten import Covariances, Whitener, covariances
 
 ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with

@@ -5,12 +5,16 @@ of a dead band, friction at its neutral value moves nothing. So what could take 
 about the point without that cause, fitted exactly, and linearised where it then is. It stands in where it
 explains most of what the cause does, unless logs that took no part in a fit bear out that the cause is the
 better of the two: where the model is off by itself, all rows together are no judge of small differences.
+
+Hystereses have many best fits. One is found from where straight lines lead, and one from where the effect
+does most nearly what the cause does: a play of no width is a best fit too, but it is not that one that the
+logs may have in a dead band's place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,12 +22,12 @@ from simgap.attribution.posterior import Forms, Model, coordinates, fitted, form
 from simgap.attribution.verdict import MOST, RULED_OUT
 from simgap.robots.borne_out import BORNE_OUT, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import reached
+from simgap.robots.fit import moved_to, reached
 from simgap.robots.gap import fitted_along, gap_of
-from simgap.robots.linear import linearise
+from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
-from simgap.robots.proposals import leaders, point_of
+from simgap.robots.proposals import leaders, point_of, ranked
 from simgap.robots.search import LEADERS, Found
 from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
@@ -88,21 +92,61 @@ class _Asked:
         left = float(np.sum(self.sensor(np.nan_to_num(linear.residual)) ** 2)) - rows.size
         return _Fit(point, f, fitted(f, every), score, max(left, 0.0))
 
-    def likely(self, point: Point, wanted: Sequence[str]) -> list[tuple[str, Point]]:
-        """Effects that gain most beside those of a point, and from where each is to be fitted."""
+    def likely(self, point: Point, out: str, wanted: Sequence[str]) -> list[tuple[str, tuple[Point, ...]]]:
+        """Effects that gain most in the place of one that acts at a point, `out`, or that do most nearly what
+        it does, and from where each is to be fitted."""
+        without = {n: values for n, values in point.items() if n != out}
         along = fitted_along(self.composed)
-        here = [n for n in point if n not in along]
-        linear = linearise(self.composed, point, [*along, *here, *wanted])
+        here = [n for n in without if n not in along]
+        linear = linearise(self.composed, without, [*along, *here, *wanted])
         usable = [n for n in (*here, *wanted) if n in linear.moved]
         every = forms(gap_of(self.composed, linear, self.whiten, self.phases, usable))
         linear, names = leaders(self.composed, linear, [every], here, LEADERS)
+        place = _Place.of(self, point, linear)
+        alike = {n: -place.led(n)[1] for n in usable if n not in here}
+        names = sorted({*names, *sorted(alike, key=lambda n: -alike[n])[:TRIED]})
         f = forms(gap_of(self.composed, linear, self.whiten, self.phases, names))
         mine = [names.index(n) for n in here if n in names]
-        sets = {j: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}
-        gain = {j: fitted(f, effects).score for j, effects in sets.items()}
-        first = sorted(gain, key=lambda j: -gain[j])[:TRIED]
-        there = {names[j]: point_of(self.composed, f, sets[j], point) for j in first}
-        return [(n, reached(self.composed, linear, self.whiten, p)) for n, p in there.items()]
+        sets = {n: tuple(sorted((*mine, j))) for j, n in enumerate(names) if n not in here}
+        gains = {n: fitted(f, effects).score for n, effects in sets.items()}
+        first = ranked([gains, {n: alike[n] for n in sets}])[:TRIED]
+        led = {n: point_of(self.composed, f, sets[n], without) for n in first}
+        return [(n, (place.nearest(n), reached(self.composed, linear, self.whiten, led[n]))) for n in first]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A cause's place: its doing as if that were what was recorded, all else as it is, and the linear model
+    without it."""
+
+    composed: Composed
+    linear: Linear
+    sensor: Whitener
+
+    @classmethod
+    def of(cls, asked: _Asked, point: Point, linear: Linear) -> _Place:
+        """Of the cause that acts at a point and not at the linear model's."""
+        there = base_at(asked.composed, point).rows
+        target = np.where(np.isfinite(there), there, linear.rows.observed)
+        rows = replace(linear.rows, observed=target)
+        left = np.nan_to_num(target - (linear.rows.observed - linear.residual))
+        linear = replace(linear, rows=rows, residual=left)
+        return cls(replace(asked.composed, rows=rows), linear, asked.sensor)
+
+    def led(self, name: str) -> tuple[dict[str, float], float]:
+        """Where straight lines have an effect do most nearly the same, and the squares that it leaves."""
+        moved, known = self.linear.moved[name], self.composed.effects[name].parameters
+        slope = self.sensor(np.nan_to_num(moved.jacobian))
+        wanted = self.sensor(self.linear.residual - np.nan_to_num(moved.shift))
+        step, *_ = np.linalg.lstsq(slope, wanted)
+        values = np.clip(moved.at + step, [p.low for p in known.values()], [p.high for p in known.values()])
+        left = wanted - slope @ (values - moved.at)
+        return dict(zip(known, values.tolist(), strict=True)), float(left @ left)
+
+    def nearest(self, name: str) -> Point:
+        """The point at which an effect does most nearly the same."""
+        begin = {**self.linear.point, name: self.led(name)[0]}
+        return moved_to(self.composed, self.linear, self.sensor, begin, [name]).point
 
 
 def stand_ins(
@@ -133,17 +177,31 @@ def stand_ins(
         fewer = [n for n in acting if n != out]
         without = {n: values for n, values in point.items() if n != out}
         bare = [one.fit(without, fewer) for one in asked]
-        for name, begin in asked[0].likely(without, others):
-            fit = None
-            for one, causing, lacking in zip(asked, best, bare, strict=True):
-                fit = one.fit(begin, [*fewer, name])
-                if fit is None or causing is None or lacking is None or _told_apart(causing, fit, lacking):
-                    break
-                begin = fit.point
-            else:
+        for name, starts in asked[0].likely(point, out, others):
+            for begin in starts:
+                fit = _alike(asked, best, bare, begin, [*fewer, name])
                 if fit is not None:
                     found[name] = StandIn(name, fit.forms, fit.model)
+                    break
     return tuple(found.values())
+
+
+def _alike(
+    asked: Sequence[_Asked],
+    best: Sequence[_Fit | None],
+    bare: Sequence[_Fit | None],
+    begin: Point,
+    causes: Sequence[str],
+) -> _Fit | None:
+    """Another set that no windows of `asked` tell from the `best` one, fitted from a start; `bare` is without
+    the cause and what stands for it. None where some do."""
+    fit = None
+    for one, causing, lacking in zip(asked, best, bare, strict=True):
+        fit = one.fit(begin, causes)
+        if fit is None or causing is None or lacking is None or _told_apart(causing, fit, lacking):
+            return None
+        begin = fit.point
+    return fit
 
 
 def _told_apart(causing: _Fit, other: _Fit, lacking: _Fit) -> bool:

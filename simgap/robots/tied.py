@@ -1,163 +1,220 @@
-"""The likelihood of one block's rows, by parts that nothing but the start ties.
+"""The likelihood of blocks of rows, by parts that nothing but the start ties.
 
-In flight a discrepancy is of one channel, and only the uncertain start ties channels: the covariance is
-B + U U' with B in blocks and few columns U, one for each state. By Woodbury's identity
+In flight a discrepancy is of one channel, and only the uncertain start ties channels: a block's covariance is
+B + U U' with B in parts and few columns U, one for each state. By Woodbury's identity
 
-    square = |z|^2 - |w|^2,  log det = log det B + log det M,   z = L^-1 r,  Z = L^-1 U,  B = L L',
-    M = 1 + Z'Z,  M = K K',  w = K^-1 Z'z,
+    r' C^-1 r = r' B^-1 r - p' M^-1 p,  log det C = log det B + log det M,  M = 1 + U' B^-1 U,  p = U' B^-1 r,
 
-so that of a block of six channels six small factors are made in place of a large one.
+so that of a block of six channels six small factors are made in place of a large one. Parts of about one
+size with the same sources are worked out together: there are hundreds, and one by one most of the time would
+go into the calls.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack
 
 from simgap.latest import latest
-from simgap.robots.triangular import factored, solved_by
-from simgap.robots.whiten import Block, Source
+from simgap.robots.blocks import Block, Source
+from simgap.robots.triangular import all_inverses, all_solved_by
 
-dpotri: Any = lapack.dpotri  # type: ignore[attr-defined]  # inverse from a Cholesky factor
+LATEST = 2  # numerics: variances of a stack by which it is kept: most differences are in another's
+SIZES = 8  # numerics: parts are filled up to a multiple of so many rows, with rows that change nothing
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Rows that no other part's share a source with but such as tie none: their `variance` (m,), `start`
-    (m, S), `residual` (m,), and sources by number."""
+class _Stack:
+    """Parts (P,) of one size m and the same sources, filled up: which of the gap's `rows` (P, m), -1 where
+    there is none, and of which `block` (P,); their `variance` (P, m), `start` (P, m, S), and by source its
+    number, its parts (p,) and its covariance (p, m, m) in these, or variances (p, m) where it ties none."""
 
+    rows: np.ndarray
+    block: np.ndarray
     variance: np.ndarray
     start: np.ndarray
-    residual: np.ndarray
-    sources: tuple[tuple[int, Source], ...]
+    sources: tuple[tuple[int, np.ndarray, np.ndarray], ...]
 
-    def whitened(self, variance: Sequence[float]) -> tuple:
-        """With its sources of these variances: factor, residual and start whitened by it, the start's
-        products (S, S), half the log determinant."""
-        whole = np.diag(self.variance)
-        for (_, source), one in zip(self.sources, variance, strict=True):
-            if one > 0:
-                source.add(whole, one)
-        factor = factored(whole)
-        both = solved_by(factor, np.column_stack([self.residual, self.start]))
-        white, start = both[:, 0], both[:, 1:]
-        return factor, white, start, start.T @ start, float(np.log(np.diag(factor)).sum())
-
-
-LATEST = 2  # numerics: variances of a part whose factors are kept: most differences are in another part's
+    def covariance(self, variance: np.ndarray) -> np.ndarray:
+        """Of the parts (P, m, m) with sources of these variances (K,)."""
+        parts, size = self.variance.shape
+        out = np.zeros((parts, size, size))
+        diagonal = np.einsum("pii->pi", out)  # a view
+        diagonal += self.variance
+        for k, mine, own in self.sources:
+            if variance[k] > 0 and own.ndim == 2:
+                diagonal[mine] += variance[k] * own
+            elif variance[k] > 0:
+                out[mine] += variance[k] * own
+        return out
 
 
 @dataclass(frozen=True)
 class Tied:
-    """A block's parts; `trace` (K,) of every source's covariance at s = 1; `kept` of each part what it was
-    at its latest variances."""
+    """Blocks (B,) of rows, their parts stacked by size; `trace` (B, K) of every source's covariance."""
 
-    parts: tuple[_Part, ...]
-    size: int
+    stacks: tuple[_Stack, ...]
     trace: np.ndarray
-    kept: tuple[dict, ...]
+    states: int
 
     @classmethod
-    def of(cls, block: Block, residual: np.ndarray, names: Sequence[str]) -> Tied:
-        """Of a block with a residual (n,); sources are numbered as in `names`."""
-        label = _labels(block)
-        parts = []
-        for number in np.unique(label):
-            mine = np.flatnonzero(label == number)
-            place = np.full(label.size, -1)
-            place[mine] = np.arange(mine.size)
-            own = []
-            for k, name in enumerate(names):
-                if name in block.sources:
-                    source = block.sources[name]
-                    here = place[source.rows] >= 0
-                    if here.any():
-                        covariance = source.covariance[here]
-                        covariance = covariance if covariance.ndim == 1 else covariance[:, here]
-                        own.append((k, Source(place[source.rows[here]], covariance)))
-            parts.append(_Part(block.variance[mine], block.start[mine], residual[mine], tuple(own)))
-        trace = np.array([block.sources[n].trace if n in block.sources else 0.0 for n in names])
-        return cls(tuple(parts), label.size, trace, tuple({} for _ in parts))
+    def of(cls, blocks: Sequence[Block], names: Sequence[str]) -> Tied:
+        """Sources are numbered as in `names`."""
+        states = max((b.start.shape[1] for b in blocks), default=0)
+        alike: dict[tuple, list[tuple[int, np.ndarray]]] = {}
+        for number, block in enumerate(blocks):
+            for rows in _parts(block):
+                own = tuple(n for n in names if n in block.sources and _reaches(block.sources[n], rows))
+                alike.setdefault((own, -(-rows.size // SIZES) * SIZES), []).append((number, rows))
+        stacks = tuple(_stack(blocks, parts, names, size, states) for (_, size), parts in alike.items())
+        trace = [[b.sources[n].trace if n in b.sources else 0.0 for n in names] for b in blocks]
+        return cls(stacks, np.array(trace).reshape(len(blocks), len(names)), states)
 
-    @property
-    def square(self) -> float:
-        """Sum of squares of the residual."""
-        return sum(float(p.residual @ p.residual) for p in self.parts)
-
-    def solved(self, variance: np.ndarray) -> Solved:
-        """With sources of these variances (K,); LinAlgError where noise is lost in rounding."""
-        states = self.parts[0].start.shape[1]
-        inner, pull = np.eye(states), np.zeros(states)
-        square = half = 0.0
-        factors, whites, moved = [], [], []
-        for part, store in zip(self.parts, self.kept, strict=True):
-            key = tuple(float(variance[k]) for k, _ in part.sources)
-            done = latest(store, key, lambda part=part, key=key: part.whitened(key), LATEST)
-            factor, white, start, product, own = done
-            inner += product
-            pull += start.T @ white
-            square += float(white @ white)
-            half += own
-            factors.append(factor)
-            whites.append(white)
-            moved.append(start)
-        if not states:
-            return Solved(self, factors, whites, moved, inner, pull, square, half)
-        factor = factored(inner)
-        gone = solved_by(factor, np.column_stack([pull, np.eye(states)]))
-        back = solved_by(factor, gone, transposed=True)
-        square -= float(gone[:, 0] @ gone[:, 0])
-        half += float(np.log(np.diag(factor)).sum())
-        return Solved(self, factors, whites, moved, back[:, 1:], back[:, 0], square, half)
+    def of_residual(self, residual: np.ndarray) -> Likelihood:
+        """The likelihood of the gap's rows (N,)."""
+        filled = np.append(residual, 0.0)  # what -1 takes
+        return Likelihood(
+            self, tuple(filled[stack.rows] for stack in self.stacks), tuple({} for _ in self.stacks)
+        )
 
 
 @dataclass(frozen=True)
-class Solved:
-    """A block's `square` r' C^-1 r and `half` its log determinant; of its parts the factors, and residual and
-    start whitened by them; `inverse` (S, S) of M, and it times Z'z (S,)."""
+class Likelihood:
+    """Of a residual, in the stacks' shapes (P, m), by the variances of all sources (K,); `kept` is of every
+    stack what it was at its latest variances."""
 
     tied: Tied
-    factors: list[np.ndarray]
-    whites: list[np.ndarray]
-    moved: list[np.ndarray]
-    inverse: np.ndarray
-    back: np.ndarray
-    square: float
-    half: float
+    residual: tuple[np.ndarray, ...]
+    kept: tuple[dict, ...]
 
-    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        """By every source's variance (K,): trace of C^-1 Q, and r' C^-1 Q C^-1 r."""
-        trace, pull = np.zeros(self.tied.trace.size), np.zeros(self.tied.trace.size)
-        for part, factor, white, start in zip(
-            self.tied.parts, self.factors, self.whites, self.moved, strict=True
-        ):
-            both = solved_by(factor, np.column_stack([white - start @ self.back, start]), transposed=True)
-            alpha, columns = both[:, 0], both[:, 1:]
-            # Of B^-1 the lower half alone: covariances are as symmetric as it is. C^-1 is that less what the
-            # start takes, of which a few columns tell all.
-            inverse = dpotri(factor, lower=1)[0]
-            diagonal, less = np.diag(inverse), columns @ self.inverse
-            for k, source in part.sources:
-                at, own = source.rows, source.covariance
-                if own.ndim == 1:
-                    taken = np.einsum("ij,ij->i", less[at], columns[at])
-                    trace[k] += float((diagonal[at] - taken) @ own)
-                    pull[k] += float(alpha[at] ** 2 @ own)
+    @property
+    def squares(self) -> np.ndarray:
+        """Sums of squares (B,) of the residual by block."""
+        out = np.zeros(len(self.tied.trace))
+        for stack, residual in zip(self.tied.stacks, self.residual, strict=True):
+            np.add.at(out, stack.block, np.sum(residual**2, 1))
+        return out
+
+    def value(self, variance: np.ndarray) -> float:
+        """Minus the log likelihood, but for a constant; LinAlgError where noise is lost in rounding."""
+        return self._solved(variance)[0]
+
+    def slope(self, variance: np.ndarray) -> tuple[float, np.ndarray]:
+        """`value`, and its derivatives (K,): half of tr C^-1 Q - r' C^-1 Q C^-1 r."""
+        value, inner, back, halves = self._solved(variance)
+        slope = np.zeros(variance.size)
+        for stack, half in zip(self.tied.stacks, halves, strict=True):
+            both = all_solved_by(
+                half.factor, half.white, transposed=True
+            )  # B^-1 of the residual and the start
+            columns = both[:, :, 1:]
+            alpha = both[:, :, 0] - np.einsum("pms,ps->pm", columns, back[stack.block])
+            inverse, less = all_inverses(half.factor), np.matmul(columns, inner[stack.block])
+            for k, mine, own in stack.sources:
+                if own.ndim == 2:
+                    diagonal = np.einsum("pii->pi", inverse)[mine] - np.sum(less[mine] * columns[mine], 2)
+                    trace, pull = np.sum(diagonal * own), np.sum(alpha[mine] ** 2 * own)
                 else:
-                    both_halves = 2 * np.vdot(source.across(inverse), own) - diagonal[at] @ np.diag(own)
-                    trace[k] += float(both_halves - np.vdot(less[at], own @ columns[at]))
-                    pull[k] += float(alpha[at] @ own @ alpha[at])
-        return trace, pull
+                    trace = np.vdot(inverse[mine], own) - np.vdot(less[mine], np.matmul(own, columns[mine]))
+                    pull = np.vdot(alpha[mine], np.matmul(own, alpha[mine][:, :, None])[:, :, 0])
+                slope[k] += 0.5 * float(trace - pull)
+        return value, slope
+
+    def _solved(self, variance: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, list[_Half]]:
+        """The value, M^-1 (B, S, S), M^-1 p (B, S), and the stacks whitened."""
+        count, states = len(self.tied.trace), self.tied.states
+        inner, pull = np.tile(np.eye(states), (count, 1, 1)), np.zeros((count, states))
+        halves = [self._half(n, variance) for n in range(len(self.residual))]
+        for stack, half in zip(self.tied.stacks, halves, strict=True):
+            np.add.at(inner, stack.block, half.product)
+            np.add.at(pull, stack.block, half.pull)
+        value = sum(half.value for half in halves)
+        if not states:
+            return value, inner, pull, halves
+        inverse = np.linalg.inv(inner)
+        back = np.einsum("bst,bt->bs", inverse, pull)
+        value += 0.5 * float(np.linalg.slogdet(inner)[1].sum() - np.sum(pull * back))
+        return value, inverse, back, halves
+
+    def _half(self, number: int, variance: np.ndarray) -> _Half:
+        """A stack whitened with sources of these variances."""
+        stack = self.tied.stacks[number]
+        key = tuple(float(variance[k]) for k, _, _ in stack.sources)
+        return latest(self.kept[number], key, lambda: _half(stack, self.residual[number], variance), LATEST)
 
 
-def _labels(block: Block) -> np.ndarray:
-    """The part (n,) of each row: what shares a source is one part."""
+@dataclass(frozen=True)
+class _Half:
+    """A stack's factors (P, m, m), the residual and the start (P, m, 1 + S) whitened by them, the start's
+    products (P, S, S) and those with the residual (P, S), and what the value has without M."""
+
+    factor: np.ndarray
+    white: np.ndarray
+    product: np.ndarray
+    pull: np.ndarray
+    value: float
+
+
+def _half(stack: _Stack, residual: np.ndarray, variance: np.ndarray) -> _Half:
+    factor = np.linalg.cholesky(stack.covariance(variance))
+    white = all_solved_by(factor, np.concatenate([residual[:, :, None], stack.start], 2))
+    left, start = white[:, :, 0], white[:, :, 1:]
+    value = float(np.log(np.einsum("pii->pi", factor)).sum()) + 0.5 * float(np.sum(left**2))
+    product = np.matmul(start.transpose(0, 2, 1), start)
+    return _Half(factor, white, product, np.einsum("pms,pm->ps", start, left), value)
+
+
+def _stack(
+    blocks: Sequence[Block],
+    parts: Sequence[tuple[int, np.ndarray]],
+    names: Sequence[str],
+    size: int,
+    states: int,
+) -> _Stack:
+    """Parts of blocks, each by its block's number and its rows in it, filled up to a size."""
+    rows = np.full((len(parts), size), -1)
+    variance, start = np.ones(rows.shape), np.zeros((*rows.shape, states))
+    found: dict[tuple[int, int], list[tuple[int, np.ndarray]]] = {}
+    for p, (number, mine) in enumerate(parts):
+        block, n = blocks[number], mine.size
+        rows[p, :n], variance[p, :n] = block.rows[mine], block.variance[mine]
+        start[p, :n, : block.start.shape[1]] = block.start[mine]
+        place = np.full(block.rows.size, -1)
+        place[mine] = np.arange(n)
+        for k, name in enumerate(names):
+            if name in block.sources and _reaches(block.sources[name], mine):
+                found.setdefault((k, block.sources[name].covariance.ndim), []).append(
+                    (p, _filled(block.sources[name], place, size))
+                )
+    sources = tuple(
+        (k, np.array([p for p, _ in each]), np.stack([own for _, own in each]))
+        for (k, _), each in found.items()
+    )
+    return _Stack(rows, np.array([number for number, _ in parts]), variance, start, sources)
+
+
+def _parts(block: Block) -> list[np.ndarray]:
+    """A block's rows by part: what shares a source that ties them is one."""
     label = np.arange(block.rows.size)
     for source in block.sources.values():
         if source.covariance.ndim == 2 and source.rows.size:
             label[np.isin(label, np.unique(label[source.rows]))] = label[source.rows].min()
-    return label
+    return [np.flatnonzero(label == number) for number in np.unique(label)]
+
+
+def _reaches(source: Source, rows: np.ndarray) -> bool:
+    return bool(np.isin(source.rows, rows).any())
+
+
+def _filled(source: Source, place: np.ndarray, size: int) -> np.ndarray:
+    """A source's covariance in a part that is filled up to a size; `place` (n,) of a block's rows in it."""
+    here = place[source.rows] >= 0
+    at = place[source.rows[here]]
+    whole = np.zeros((size,) * source.covariance.ndim)
+    if whole.ndim == 1:
+        whole[at] = source.covariance[here]
+    else:
+        whole[np.ix_(at, at)] = source.covariance[np.ix_(here, here)]
+    return whole

@@ -20,6 +20,8 @@ from simgap.robots.explained import Explained
 from simgap.robots.scatter import over_numerics, scattering
 from simgap.robots.stand_ins import StandIn
 
+OPEN = 0.1  # chosen: share of what is left without a small cause that may be left with it
+
 
 @dataclass(frozen=True)
 class RobotVerdict(Verdict):
@@ -69,7 +71,10 @@ def verdict_on(
     names = [c.name for c in f.gap.candidates]
     models = rivals(f, causes)
     # Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it.
-    least = np.where(explains.part >= LEAST, explains.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
+    # A small one may stand in for an error in the form of a large one, unless it takes nearly all that there
+    # is besides: what stands in leaves much.
+    large = (explains.part >= LEAST) | (explains.open_without <= OPEN)
+    least = np.where(large, explains.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
     kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
     left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
     value = _beside_numerics(sensor, causes, () if {*kept} & {*numerics} else numerics)

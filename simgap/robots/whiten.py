@@ -22,30 +22,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from simgap.robots.blocks import NONE, Block, Discrepancy, Source
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
+from simgap.robots.tied import Tied
 from simgap.robots.triangular import factored, solved_by
 from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
 
 TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
+ENOUGH = 40  # learned: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
-
-
-@dataclass(frozen=True)
-class Discrepancy:
-    """`scale`: s by channel [unit / s^2, unit / s or unit]."""
-
-    scale: Mapping[str, float]
-
-    def __bool__(self) -> bool:
-        return bool(self.scale)
-
-
-NONE = Discrepancy({})
 
 
 @dataclass(frozen=True)
@@ -74,62 +65,23 @@ class Whitener:
 
 
 @dataclass(frozen=True)
-class Source:
-    """A discrepancy's covariance (k, k) at s = 1, or its variances (k,) where it ties no rows, and which rows
-    of the block it is of (k,)."""
-
-    rows: np.ndarray
-    covariance: np.ndarray
-
-    @property
-    def trace(self) -> float:
-        """The sum of its variances."""
-        own = self.covariance
-        return float(own.sum() if own.ndim == 1 else np.trace(own))
-
-    def add(self, total: np.ndarray, variance: float) -> None:
-        """Add it to a block's covariance, in place."""
-        total[self._where] += variance * self.covariance
-
-    def across(self, matrix: np.ndarray) -> np.ndarray:
-        """What a block's matrix (n, n) has where this has its covariance."""
-        return matrix[self._where]
-
-    @property
-    def _where(self) -> tuple:
-        if self.covariance.ndim == 1:
-            return self.rows, self.rows
-        first, end = int(self.rows[0]), int(self.rows[-1]) + 1
-        if end - first == self.rows.size:  # rows ascend: a part of the matrix, which needs no copy
-            return slice(first, end), slice(first, end)
-        return self.rows[:, None], self.rows
-
-
-@dataclass(frozen=True)
-class Block:
-    """Rows (n,) of one window that belong together: the noise's `variance` (n,), `start` (n, S) by which each
-    state of the uncertain start moves them at one standard deviation, and sources of discrepancy by name."""
-
-    rows: np.ndarray
-    window: int
-    variance: np.ndarray
-    start: np.ndarray
-    sources: Mapping[str, Source]
-
-    def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
-        """The rows' covariance (n, n)."""
-        out = np.diag(self.variance) + self.start @ self.start.T
-        for name, s in discrepancy.scale.items():
-            if name in self.sources:
-                self.sources[name].add(out, s**2)
-        return out
-
-
-@dataclass(frozen=True)
 class Covariances:
     """Of all blocks of rows."""
 
     blocks: tuple[Block, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all sources."""
+        return tuple(dict.fromkeys(n for b in self.blocks for n in b.sources))
+
+    @cached_property
+    def tied(self) -> Tied:
+        """What discrepancies are learned from: blocks, evenly chosen, of as many rows as about ENOUGH large
+        ones have."""
+        rows = sum(b.rows.size for b in self.blocks) / max(len(self.blocks), 1)
+        every = max(1, int(len(self.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
+        return Tied.of(self.blocks[::every], self.names)
 
     def whitener(self, discrepancy: Discrepancy = NONE) -> Whitener:
         """The whitener of all rows."""

@@ -11,12 +11,13 @@ from simgap_swing import Swing, log
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting, delayed
 from simgap.robot_effects.readout_lowpass import lowpass
+from simgap.robots.blocks import NONE
 from simgap.robots.discrepancy import learned
 from simgap.robots.identifiable import identifiability
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises, resolution
-from simgap.robots.whiten import NONE, covariances
+from simgap.robots.whiten import covariances
 from simgap.robots.windows import REACH, smoothed
 from simgap.simulators.user import checked
 
