@@ -195,12 +195,20 @@ def _concluded(
     every = s if whole is composed else _every(whole, linear.point, ended.best, phases)
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
     numerics = tuple(j for j, n in enumerate(ended.names) if composed.numeric(n))
-    rng = np.random.default_rng(seed)
     causes = ended.models[0].effects
-    verdict = verdict_on(ended.forms, s, causes, null, rng, explains, every, fold[rows], forced, numerics)
+
+    def concluded(large_alone: Sequence[str] = ()) -> RobotVerdict:
+        alone = tuple(j for j in causes if ended.names[j] in large_alone)
+        given = (null, np.random.default_rng(seed), explains, every, fold[rows], forced, numerics, alone)
+        return verdict_on(ended.forms, s, causes, *given)
+
+    verdict = concluded()
     if not verdict.causes or len(composed.recordings) < 3 or forced:
         return verdict
     others = stand_ins(composed, phases, ended, wanted, verdict.causes, fold, twins.factor)
+    # A small cause that goes with one way to explain the large ones, and not with another, is none.
+    verdict = concluded([n for n in verdict.causes for one in others if n not in (*one.bear, one.place)])
+    others = tuple(one for one in others if one.place in verdict.causes)
     wider = over_rivals(ended.forms, verdict.model, [(one.forms, one.model) for one in others])
     return replace(verdict.beside(one.name for one in others), stand_ins=others, model=wider)
 

@@ -19,6 +19,7 @@ from simgap.robots.windows import REGIMES, STRIKES
 from simgap.simulators.protocol import Channels
 
 STEP = 0.05  # numerics: of a parameter's standard deviation: the finite difference
+HUGE = 1e100  # numerics: units, beyond which a simulation counts as diverged: squares must add up
 START_STEP = 0.3  # numerics: of a start's
 
 
@@ -189,14 +190,19 @@ def vary(
         columns.append((there - rows) / move)
     jacobian = np.stack(columns, 1)
     fine = np.isfinite(base.rows)
-    if not (np.isfinite(jacobian[fine]).all() and np.isfinite(shift[fine]).all()):
+    if not (_bounded(jacobian[fine]) and _bounded(shift[fine])):
         return None
     point = np.array([here[n] for n in effect.parameters])
     if name in base.point and shifted and not effect.fitted:
         shift = base.rows - _rows_at(composed, base, starts, name, neutral)
-        if not np.isfinite(shift[fine]).all():  # a straight line back, where nothing else leads there
+        if not _bounded(shift[fine]):  # a straight line back, where nothing else leads there
             shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
     return Moved(point, shift, jacobian)
+
+
+def _bounded(values: np.ndarray) -> bool:
+    """Whether a simulation stays finite and within what its squares can be told of."""
+    return bool((np.abs(values) < HUGE).all())
 
 
 def wobbling(composed: Composed, linear: Linear) -> Composed:

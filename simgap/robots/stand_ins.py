@@ -20,7 +20,7 @@ import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.verdict import MOST, RULED_OUT
-from simgap.robots.borne_out import BORNE_OUT, chance_of, held_out_scores
+from simgap.robots.borne_out import BORNE_OUT, borne_out, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
 from simgap.robots.fit import moved_to, reached
 from simgap.robots.gap import fitted_along, gap_of
@@ -37,21 +37,25 @@ TRIED = 6  # numerics: effects that are tried in a cause's place: those that gai
 
 @dataclass(frozen=True)
 class StandIn:
-    """An effect in a cause's place: the gap where it acts, and the set with it there."""
+    """An effect in a cause's `place`: the gap where it acts, the set with it there, and what held-out logs
+    `bear` out of that set."""
 
     name: str
+    place: str
     forms: Forms
     model: Model
+    bear: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """A set at its own best: where that is, the gap linear about it, its log likelihood by fold, and what it
-    leaves: squares by the sensors' noise alone, less the noise's own."""
+    """A set at its own best: where that is, the gap linear about it with the fold (n,) of its rows, its log
+    likelihood by fold, and what it leaves: squares by the sensors' noise alone, less the noise's own."""
 
     point: Point
     forms: Forms
     model: Model
+    fold: np.ndarray
     held_out: np.ndarray
     left: float
 
@@ -88,9 +92,10 @@ class _Asked:
         f = forms(gap_of(self.composed, linear, self.whiten, self.phases, causes))
         every = tuple(range(len(causes)))
         rows = np.flatnonzero(np.isfinite(linear.residual))
-        score = held_out_scores(f.gap, [every], self.fold[rows])[:, 0]
+        fold = self.fold[rows]
+        score = held_out_scores(f.gap, [every], fold)[:, 0]
         left = float(np.sum(self.sensor(np.nan_to_num(linear.residual)) ** 2)) - rows.size
-        return _Fit(point, f, fitted(f, every), score, max(left, 0.0))
+        return _Fit(point, f, fitted(f, every), fold, score, max(left, 0.0))
 
     def likely(self, point: Point, out: str, wanted: Sequence[str]) -> list[tuple[str, tuple[Point, ...]]]:
         """Effects that gain most in the place of one that acts at a point, `out`, or that do most nearly what
@@ -172,7 +177,7 @@ def stand_ins(
     if len(few) < len(composed.windows) and np.unique(fold[np.isin(composed.rows.window, few)]).size > 2:
         asked.insert(0, asked[0].among(few, point))
     best = [one.fit(point, acting) for one in asked]
-    found: dict[str, StandIn] = {}
+    found: list[StandIn] = []
     for out in causes:
         fewer = [n for n in acting if n != out]
         without = {n: values for n, values in point.items() if n != out}
@@ -181,9 +186,15 @@ def stand_ins(
             for begin in starts:
                 fit = _alike(asked, best, bare, begin, [*fewer, name])
                 if fit is not None:
-                    found[name] = StandIn(name, fit.forms, fit.model)
+                    bear = borne_out(fit.forms.gap, range(len(acting)), fit.fold)
+                    found.append(StandIn(name, out, fit.forms, fit.model, tuple(causes_of(fit.forms, bear))))
                     break
-    return tuple(found.values())
+    return tuple(found)
+
+
+def causes_of(f: Forms, effects: Sequence[int]) -> list[str]:
+    """Names of candidates."""
+    return [f.gap.candidates[j].name for j in effects]
 
 
 def _alike(

@@ -59,22 +59,20 @@ def verdict_on(
     fold: np.ndarray,
     forced: bool = False,
     numerics: tuple[int, ...] = (),
+    large_alone: tuple[int, ...] = (),
 ) -> RobotVerdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
     `causes` were borne out by held-out rows, and explain what `explains` says, in that order; `every` is the
     gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
-    statistics; `fold` (n,) of each row; `numerics` are candidates of the solver's own.
+    statistics; `fold` (n,) of each row; `numerics` are candidates of the solver's own; those of `large_alone`
+    are no causes where they are small.
 
     A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
     channels that it moves, and the gap of these is the one that it explains. What is left in others is the
     remainder, which is told."""
     names = [c.name for c in f.gap.candidates]
     models = rivals(f, causes)
-    # Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it.
-    # A small one may stand in for an error in the form of a large one, unless it takes nearly all that there
-    # is besides: what stands in leaves much.
-    large = (explains.part >= LEAST) | (explains.open_without <= OPEN)
-    least = np.where(large, explains.where_it_acts, 1.0).min(1) if causes else np.zeros(0)
+    least = open_where(explains, np.array([j not in large_alone for j in causes], bool))
     kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
     left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
     value = _beside_numerics(sensor, causes, () if {*kept} & {*numerics} else numerics)
@@ -104,6 +102,17 @@ def verdict_on(
         model=scattering(f, over_numerics(f, causes, numerics), fold),
         chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
     )
+
+
+def open_where(explains: Explained, small_too: np.ndarray) -> np.ndarray:
+    """Share (J,) of its gap that is left where each cause acts, 1 where it is too small to be told;
+    `small_too` (J,): which may be told though they are small.
+
+    Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it. A
+    small one may stand in for an error in the form of a large one, unless it takes nearly all that there is
+    besides: what stands in leaves much."""
+    large = (explains.part >= LEAST) | (small_too[:, None] & (explains.open_without <= OPEN))
+    return np.where(large, explains.where_it_acts, 1.0).min(1) if small_too.size else np.zeros(0)
 
 
 def _beside_numerics(f: Forms, causes: tuple[int, ...], numerics: tuple[int, ...]) -> float:

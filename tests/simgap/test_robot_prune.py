@@ -16,6 +16,7 @@ from simgap.robots.explained import Explained, explained
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises
+from simgap.robots.verdict import open_where
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import FLIES, REGIMES, STRIKES
 from simgap.simulators.user import checked
@@ -95,6 +96,17 @@ def test_a_cause_is_judged_by_the_channels_in_which_it_acts():
     assert found.left == pytest.approx([(109 + 9000 - 20) / (10000 - 20)])
     assert found.where_it_acts[0] == pytest.approx([0.1], abs=1e-3)
     assert found.where_it_acts[1, 0] == pytest.approx((200 * 0.1 + 8000) / 8200, abs=2e-3)
+
+
+@pytest.mark.parametrize(("left", "expected"), [(0.0, [0.0, 0.0]), (50.0, [0.005, 1.0])])
+def test_a_small_cause_is_told_where_it_takes_nearly_all_that_there_is_besides(left, expected):
+    """It takes 100 of 10 000, within an error in the form of the large one, of which as much is left."""
+    floor = np.array([[10.0]])
+    before, after = floor + 10_000.0, floor + left
+    without = np.stack([before, after + 100.0])
+    found = Explained(("large", "small"), ("whole",), before, after, without, floor, np.ones(1, bool))
+    assert open_where(found, np.array([True, True])) == pytest.approx(expected, abs=1e-3)
+    assert open_where(found, np.array([True, False]))[1] == 1.0
 
 
 def test_what_each_log_has_of_its_own_is_fitted_to_the_logs_held_out():

@@ -8,9 +8,16 @@ import numpy as np
 
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows
+from simgap.robot_effects import candidates
+from simgap.robot_effects.base import Setting
 from simgap.robots.describe import body
 from simgap.robots.diagnose import diagnose
-from simgap.robots.stand_ins import _Fit, _told_apart
+from simgap.robots.linear import base_at, linearise
+from simgap.robots.model import Composed
+from simgap.robots.noise import noises
+from simgap.robots.phases import phases_of
+from simgap.robots.stand_ins import _Asked, _Fit, _Place, _told_apart
+from simgap.robots.whiten import covariances
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
@@ -70,6 +77,50 @@ def test_two_that_do_the_same_are_a_set_wherever_the_search_ended():
         assert abs(width["mean"] - WIDTH) < 0.2 * WIDTH, name
 
 
+class Geared(Servo):
+    """The same, or a joint that lags behind its motor by half of a play."""
+
+    parameters = Servo.parameters | {"play": Servo.parameters["band"]}
+
+    def simulate(self, parameters, recording, start=None):
+        """Positions."""
+        pos, play = super().simulate(parameters, recording, start)["pos"], parameters["play"]
+        if not play:
+            return {"pos": pos}
+        begin, out = start["pos"] if start else 0.0, np.empty(pos.size)
+        motor = follow(0.0, recording["cmd"], float(np.clip(recording["cmd"][0], begin - play, begin + play)))
+        joint = begin
+        for i, at in enumerate(motor):
+            out[i] = joint = min(max(joint, at - play), at + play)
+        return {"pos": out}
+
+
+def test_an_effect_is_begun_where_it_does_what_the_cause_does():
+    """Straight lines from no play at all, about which a play moves little, do not lead there."""
+    simulator, recorded = checked(Geared(), "geared"), logs()
+    noise = noises(simulator, recorded)
+    composed = Composed.of(
+        simulator, recorded, candidates(Setting(simulator, recorded)), noise, length=Geared.window
+    )
+    linear = linearise(composed, {}, ["play"])
+    sensor = covariances(composed, linear).whitener()
+    asked = _Asked(
+        composed,
+        phases_of(simulator, recorded),
+        linear.rows.log,
+        np.ones(linear.rows.log.size),
+        sensor,
+        sensor,
+        0,
+    )
+    place = _Place.of(asked, {"band": {"band": WIDTH}}, linear)
+    point = place.nearest("play")
+    assert abs(point["play"]["play"] - WIDTH) < 0.2 * WIDTH
+    target = place.linear.rows.observed
+    left = np.sum((target - base_at(composed, point).rows) ** 2)
+    assert left < 0.1 * np.sum((target - base_at(composed, {}).rows) ** 2)
+
+
 def fit(left: float, size: float = 1.0, held_out: float = 0.0) -> _Fit:
     rows = Rows(*(np.zeros(4, int),) * 3, np.arange(4.0), ("a",), ("y",), ("whole",))
     one, none, far = np.ones(1), np.zeros(1), np.full(1, 1e3)
@@ -77,7 +128,7 @@ def fit(left: float, size: float = 1.0, held_out: float = 0.0) -> _Fit:
     made = Candidate("c", ("size",), none, none, one, np.zeros(4), column, -far, far)
     f = forms(Gap(rows, size * column[:, 0], np.zeros((4, 0)), (made,)))
     model = replace(fitted(f, (0,)), x=np.array([size]))
-    return _Fit({}, f, model, held_out + np.array([0.0, 0.1, -0.1, 0.05]), left)
+    return _Fit({}, f, model, np.arange(4), held_out + np.array([0.0, 0.1, -0.1, 0.05]), left)
 
 
 def test_what_is_told_apart():
