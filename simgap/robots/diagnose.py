@@ -198,7 +198,7 @@ def _concluded(
     causes = ended.models[0].effects
 
     def concluded(large_alone: Sequence[str] = ()) -> RobotVerdict:
-        alone = tuple(j for j in causes if ended.names[j] in large_alone)
+        alone = (*numerics, *(j for j in causes if ended.names[j] in large_alone))
         given = (null, np.random.default_rng(seed), explains, every, fold[rows], forced, numerics, alone)
         return verdict_on(ended.forms, s, causes, *given)
 
