@@ -202,11 +202,13 @@ def _concluded(
         given = (null, np.random.default_rng(seed), explains, every, fold[rows], forced, numerics, alone)
         return verdict_on(ended.forms, s, causes, *given)
 
-    verdict = concluded()
-    if not verdict.causes or len(composed.recordings) < 3 or forced:
+    # A small cause that goes with one way to explain the large ones, and not with another, is none: few logs
+    # cannot tell.
+    few = len(composed.recordings) < 3
+    verdict = concluded(ended.names if few else ())
+    if not verdict.causes or few or forced:
         return verdict
     others = stand_ins(composed, phases, ended, wanted, verdict.causes, fold, twins.factor)
-    # A small cause that goes with one way to explain the large ones, and not with another, is none.
     verdict = concluded([n for n in verdict.causes for one in others if n not in (*one.bear, one.place)])
     others = tuple(one for one in others if one.place in verdict.causes)
     wider = over_rivals(ended.forms, verdict.model, [(one.forms, one.model) for one in others])
