@@ -82,6 +82,15 @@ def test_sets_are_weighed_as_enumeration_does():
         assert told == pytest.approx(truth, abs=0.06)
 
 
+def test_a_search_among_some_candidates_scores_as_one_among_all():
+    f = forms(gap_of({0: 1.5, 2: 0.8}), Background.plain())
+    every = {m.effects: m.score for m in sought(f)}
+    some = {m.effects: m.score for m in sought(f, among=(0, 3))}
+    assert {j for effects in some for j in effects} <= {0, 3} and (0,) in some
+    assert all(some[e] == pytest.approx(every[e]) for e in some.keys() & every.keys())
+    assert [c.name for c in f.gap.only((2, 0)).candidates] == [f.gap.candidates[j].name for j in (2, 0)]
+
+
 def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
     values = np.array([statistic(forms(gap_of({}, seed=s))) for s in range(30)])
     assert np.mean(np.exp(-np.maximum(values, 0)) < 0.05) <= 0.1
