@@ -122,7 +122,7 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Processes of this machine, or a cluster's workers."""
     if scheduler is None:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare) as pool:
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=keep_freed_memory) as pool:
             yield pool
         return
     try:
@@ -141,10 +141,3 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
                          "an address as tcp://host:8786, or local") from error  # fmt: skip
     with client:
         yield client.get_executor()
-
-
-def _prepare() -> None:
-    """Before NumPy is imported in a worker: as many threads as there are workers are enough."""
-    keep_freed_memory()
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")

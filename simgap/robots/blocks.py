@@ -39,10 +39,6 @@ class Source:
         """Add it to a block's covariance, in place."""
         total[self._where] += variance * self.covariance
 
-    def across(self, matrix: np.ndarray) -> np.ndarray:
-        """What a block's matrix (n, n) has where this has its covariance."""
-        return matrix[self._where]
-
     @property
     def _where(self) -> tuple:
         if self.covariance.ndim == 1:

@@ -209,7 +209,8 @@ def _concluded(
     if not verdict.causes or few or forced:
         return verdict
     others = stand_ins(composed, phases, ended, wanted, verdict.causes, fold, twins.factor)
-    verdict = concluded([n for n in verdict.causes for one in others if n not in (*one.bear, one.place)])
+    doubtful = [n for n in verdict.causes for one in others if n not in (*one.bear, one.place)]
+    verdict = concluded(doubtful) if doubtful else verdict
     others = tuple(one for one in others if one.place in verdict.causes)
     wider = over_rivals(ended.forms, verdict.model, [(one.forms, one.model) for one in others])
     return replace(verdict.beside(one.name for one in others), stand_ins=others, model=wider)

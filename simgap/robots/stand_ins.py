@@ -32,7 +32,7 @@ from simgap.robots.search import LEADERS, Found
 from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
 
-TRIED = 6  # numerics: effects that are tried in a cause's place: those that gain most there
+TRIED = 6  # numerics: effects that are tried in a cause's place
 
 
 @dataclass(frozen=True)
@@ -186,15 +186,12 @@ def stand_ins(
             for begin in starts:
                 fit = _alike(asked, best, bare, begin, [*fewer, name])
                 if fit is not None:
-                    bear = borne_out(fit.forms.gap, range(len(acting)), fit.fold)
-                    found.append(StandIn(name, out, fit.forms, fit.model, tuple(causes_of(fit.forms, bear))))
+                    gap = fit.forms.gap
+                    bear = borne_out(gap, range(len(acting)), fit.fold)
+                    names = tuple(gap.candidates[j].name for j in bear)
+                    found.append(StandIn(name, out, fit.forms, fit.model, names))
                     break
     return tuple(found)
-
-
-def causes_of(f: Forms, effects: Sequence[int]) -> list[str]:
-    """Names of candidates."""
-    return [f.gap.candidates[j].name for j in effects]
 
 
 def _alike(

@@ -106,9 +106,8 @@ class Likelihood:
         value, inner, back, halves = self._solved(variance)
         slope = np.zeros(variance.size)
         for stack, half in zip(self.tied.stacks, halves, strict=True):
-            both = all_solved_by(
-                half.factor, half.white, transposed=True
-            )  # B^-1 of the residual and the start
+            # B^-1 of the residual and the start.
+            both = all_solved_by(half.factor, half.white, transposed=True)
             columns = both[:, :, 1:]
             alpha = both[:, :, 0] - np.einsum("pms,ps->pm", columns, back[stack.block])
             inverse, less = all_inverses(half.factor), np.matmul(columns, inner[stack.block])

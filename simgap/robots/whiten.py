@@ -35,7 +35,7 @@ from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
 
 TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
-ENOUGH = 40  # learned: windows from which discrepancies are learned
+ENOUGH = 40  # numerics: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
 
 
