@@ -122,7 +122,7 @@ class Forms:
 def forms(gap: Gap, background: Background | None = None) -> Forms:
     """The quadratic forms that all sets of candidates share."""
     s = spectrum(gap)
-    count = np.bincount(s.group).astype(float)
+    count = np.bincount(s.group, gap.told).astype(float)
     product = products(s.columns, s.group)
     if gap.carried is not None:
         product -= of_noise(gap, s)

@@ -103,7 +103,8 @@ class Gap:
     `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
     trials tell nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
     from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
-    of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same.
+    of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same. `told` (n,):
+    the mean square of a row if nothing acts, 1 where it is not given: repeats of one motion share an error.
     """
 
     rows: Rows
@@ -115,13 +116,15 @@ class Gap:
     carried: Float[np.ndarray, "d n m"] | None = None
     tolerance: Float[np.ndarray, " n"] | None = None
     usual: bool = False
+    told: Float[np.ndarray, " n"] | None = None
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
         return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
                    tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
                    None if self.carried is None else self.carried[:, rows],
-                   None if self.tolerance is None else self.tolerance[rows], self.usual)  # fmt: skip
+                   None if self.tolerance is None else self.tolerance[rows], self.usual,
+                   None if self.told is None else self.told[rows])  # fmt: skip
 
     def only(self, effects: Sequence[int]) -> Gap:
         """The gap with some of its candidates alone, in this order."""

@@ -52,13 +52,15 @@ class Source:
 @dataclass(frozen=True)
 class Block:
     """Rows (n,) of one window that belong together: the noise's `variance` (n,), `start` (n, S) by which each
-    state of the uncertain start moves them at one standard deviation, and sources of discrepancy by name."""
+    state of the uncertain start moves them at one standard deviation, and sources of discrepancy by name;
+    `repeats`: in how many logs the same motion is made."""
 
     rows: np.ndarray
     window: int
     variance: np.ndarray
     start: np.ndarray
     sources: Mapping[str, Source]
+    repeats: int = 1
 
     def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
         """The rows' covariance (n, n)."""

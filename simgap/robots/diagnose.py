@@ -31,6 +31,7 @@ from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import sought
+from simgap.robots.repeats import motions
 from simgap.robots.scatter import over_rivals
 from simgap.robots.search import Asked, Found
 from simgap.robots.settle import settled
@@ -94,6 +95,7 @@ def diagnose(
     whole = Composed.of(
         simulator, recordings, effects, noise, **({} if length is None else {"length": length})
     )
+    whole = replace(whole, motion=motions(whole))
     # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.
     if not forced and (calm := whole.calm()) is not whole:

@@ -11,6 +11,7 @@ from simgap.attribution.problem import Rows as GapRows
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
 from simgap.robots.phases import Phases
+from simgap.robots.whiten import Whitener
 
 
 def fitted_along(composed: Composed) -> tuple[str, ...]:
@@ -29,22 +30,22 @@ def gap_of(
     takes rows (N,) or columns (N, k)."""
     finite = np.isfinite(linear.residual)
     residual = whiten(np.where(finite, linear.residual, 0.0))
-    along, own = [], []
-    for name in fitted_along(composed):
-        moved, effect = linear.moved[name], composed.effects[name]
-        sd = np.array([p.sd for p in effect.parameters.values()])
-        neutral = np.array([p.nominal for p in effect.parameters.values()])
-        columns = whiten(_finite(moved.jacobian)) * sd
-        own += [effect.by_log] * sd.size
-        along.append(columns)
-        residual = residual + columns @ ((moved.at - neutral) / sd)
+    along = fitted_along(composed)
+    known = [p for n in along for p in composed.effects[n].parameters.values()]
+    sd, neutral = np.array([p.sd for p in known]), np.array([p.nominal for p in known])
+    at = np.array([v for n in along for v in linear.moved[n].at])
+    own = [composed.effects[n].by_log for n in along for _ in composed.effects[n].parameters]
+    # Columns are whitened together: there are hundreds of blocks, and time goes into the calls.
+    columns = [np.zeros((finite.size, 0)), *(_finite(linear.moved[n].jacobian) for n in along)]
+    nuisance = whiten(np.concatenate(columns, 1)) * sd
+    residual = residual + nuisance @ ((at - neutral) / sd)
     made = []
     for name in candidates:
         moved, effect = linear.moved[name], composed.effects[name]
         known = list(effect.parameters.values())
-        shift = whiten(_finite(moved.shift))
+        both = whiten(_finite(np.column_stack([moved.shift, moved.jacobian])))
         if name in linear.point:
-            residual = residual + shift
+            residual = residual + both[:, 0]
         made.append(
             Candidate(
                 name,
@@ -52,8 +53,8 @@ def gap_of(
                 moved.at,
                 np.array([p.nominal for p in known]),
                 np.array([p.sd for p in known]),
-                shift,
-                whiten(_finite(moved.jacobian)),
+                both[:, 0],
+                both[:, 1:],
                 np.array([p.low for p in known]),
                 np.array([p.high for p in known]),
             )
@@ -69,8 +70,10 @@ def gap_of(
         phases.names,
         BANDS,
     )
-    nuisance = np.concatenate([*along, np.zeros((rows.log.size, 0))], 1)
-    whole = Gap(mine, residual, nuisance, tuple(made), own=tuple(int(k) for k in np.flatnonzero(own)))
+    told = whiten.counted(finite.size) if isinstance(whiten, Whitener) else None
+    whole = Gap(
+        mine, residual, nuisance, tuple(made), own=tuple(int(k) for k in np.flatnonzero(own)), told=told
+    )
     return whole if finite.all() else whole.taken(np.flatnonzero(finite))
 
 

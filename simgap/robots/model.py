@@ -25,7 +25,8 @@ class Composed:
     """A simulator with effects around it, along the windows of recordings.
 
     `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
-    move in contact; None where there is none.
+    move in contact; None where there is none. `motion`: a number for every log's motion, the same in repeats
+    (see `repeats`); none where no logs are.
     """
 
     simulator: Simulator
@@ -35,6 +36,7 @@ class Composed:
     noise: Mapping[str, float]
     rows: Rows
     wobble: np.ndarray | None = None
+    motion: tuple[int, ...] = ()
 
     @classmethod
     def of(
@@ -73,6 +75,13 @@ class Composed:
         return replace(
             self, windows=windows, rows=rows_of(self.recordings, windows, self.noise), wobble=wobble
         )
+
+    def repeats(self) -> list[int]:
+        """In how many of these logs each window's motion is made."""
+        if not self.motion:
+            return [1] * len(self.windows)
+        made = [self.motion[log] for log in {w.log for w in self.windows}]
+        return [made.count(self.motion[w.log]) for w in self.windows]
 
     def thinned(self) -> list[int]:
         """Numbers of windows that a search begins with: of every regime evenly chosen ones, about FIRST."""

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.verdict import LEAST
 from simgap.progress import Progress, say
 from simgap.robots.blocks import NONE, Discrepancy
 from simgap.robots.borne_out import BORNE_OUT, EVEN, chance_of, held_out_scores
@@ -198,11 +199,12 @@ def _better(place: _Place, now: _Place) -> Step | None:
 
 def _exchanged(place: _Place, asked: Sequence[str]) -> Step | None:
     """A set with others in the place of one effect, if that is better: sought about the point without it, for
-    what it does to the model changes what others seem to do."""
+    what it does to the model changes what others seem to do. What is small is not told where something is
+    left, whatever is in its place."""
     ask = place.ask
     if ask.last or not place.here.discrepancy:
         return None
-    for out in place.held:
+    for out in place.large:
         rest = tuple(n for n in place.held if n != out)
         left = {n: values for n, values in place.linear.point.items() if n != out}
         point = settled(ask.composed, left, ask.factor).point
@@ -242,6 +244,14 @@ class _Place:
         there = tuple(n for n in names if n in held)
         judge = Judge(ask.composed, ask.phases, linear, cov, off, every[0].log_odds)
         return cls(ask, linear, scales, every, tuple(names), there, judge, judge(there))
+
+    @property
+    def large(self) -> tuple[str, ...]:
+        """Those of the set without which more comes back than an error in the largest one's form would be."""
+        sensor, left = self.judge.covariances.whitener(), np.nan_to_num(self.linear.residual)
+        without = {n: left + np.nan_to_num(self.linear.moved[n].shift) for n in self.held}
+        lost = {n: np.sum(sensor(rows) ** 2) - np.sum(sensor(left) ** 2) for n, rows in without.items()}
+        return tuple(n for n in self.held if lost[n] >= LEAST * max(lost.values()))
 
     def found(self) -> Found:
         """What is known there, the set the best."""

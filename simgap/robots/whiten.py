@@ -41,10 +41,13 @@ BLOCK = 100  # numerics: samples of a channel that are whitened together, where 
 
 @dataclass(frozen=True)
 class Whitener:
-    """Lower Cholesky factors of blocks of rows."""
+    """Lower Cholesky factors of blocks of rows; by block half the log determinant of their covariance, and
+    the mean square of a row, whitened: less than 1 where repeats tell one thing together."""
 
     blocks: tuple[np.ndarray, ...]
     factors: tuple[np.ndarray, ...]
+    half_logs: tuple[float, ...]
+    told: tuple[float, ...]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Rows (N,) or columns (N, k), whitened; rows of diverged windows become 0."""
@@ -56,12 +59,18 @@ class Whitener:
     @property
     def half_log_det(self) -> float:
         """Half the log determinant of all rows' covariance."""
-        return sum(float(np.log(np.diag(factor)).sum()) for factor in self.factors)
+        return sum(self.half_logs)
 
     def half_log_dets(self, group: np.ndarray) -> np.ndarray:
         """The same by group of rows; `group` (N,), blocks are within groups."""
-        own = [float(np.log(np.diag(factor)).sum()) for factor in self.factors]
-        return np.bincount(group[[block[0] for block in self.blocks]], own, group.max() + 1)
+        return np.bincount(group[[block[0] for block in self.blocks]], self.half_logs, group.max() + 1)
+
+    def counted(self, rows: int) -> np.ndarray:
+        """By how much each of so many rows counts (N,)."""
+        out = np.ones(rows)
+        for block, told in zip(self.blocks, self.told, strict=True):
+            out[block] = told
+        return out
 
 
 @dataclass(frozen=True)
@@ -85,15 +94,36 @@ class Covariances:
 
     def whitener(self, discrepancy: Discrepancy = NONE) -> Whitener:
         """The whitener of all rows."""
-        factors = [factored(block.covariance(discrepancy)) for block in self.blocks]
-        return Whitener(tuple(block.rows for block in self.blocks), tuple(factors))
+        made = [_whitened(block, discrepancy) for block in self.blocks]
+        factors, half_logs, told = (tuple(one[k] for one in made) for k in range(3))
+        return Whitener(tuple(block.rows for block in self.blocks), factors, half_logs, told)
+
+
+def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float, float]:
+    """A block's factor, half log determinant, and the mean square of its whitened rows.
+
+    Of G repeats with one discrepancy d of covariance K between them, what they tell together of anything that
+    they have in common is what each tells by N + G K, added up: (N / G + K)^-1 = G (N + G K)^-1. The mean has
+    the log determinant of N + G K, what differs between them that of N.
+    """
+    again = block.repeats if discrepancy else 1
+    shared = Discrepancy({n: s * again**0.5 for n, s in discrepancy.scale.items()})
+    factor = factored(block.covariance(shared))
+    half = float(np.log(np.diag(factor)).sum())
+    if again == 1:
+        return factor, half, 1.0
+    plain = block.covariance()
+    apart = factored(plain)
+    own = float(np.sum(solved_by(factor, apart) ** 2)) / len(plain)
+    share = 1 / again
+    return factor, share * half + (1 - share) * float(np.log(np.diag(apart)).sum()), share + (1 - share) * own
 
 
 def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = None) -> Covariances:
     """Covariances of all windows that did not diverge; `factor` (N,) multiplies the noise's sd."""
     kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     blocks = []
-    free = bool(linear.starts)
+    free, repeats = bool(linear.starts), composed.repeats()
     for number, mine in enumerate(linear.rows.of):
         if mine.stop == mine.start or not np.isfinite(linear.residual[mine]).all():
             continue
@@ -102,7 +132,8 @@ def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = 
             moved = [linear.starts[n][rows] * doubt for n, doubt in composed.windows[number].doubt.items()]
             start = np.array(moved).reshape(-1, rows.size).T
             variance = linear.rows.variance[rows] * scale**2
-            blocks.append(Block(rows, number, variance, start, _sources(linear, rows, kinds, free)))
+            sources = _sources(linear, rows, kinds, free)
+            blocks.append(Block(rows, number, variance, start, sources, repeats[number]))
     return Covariances(tuple(blocks))
 
 
