@@ -16,6 +16,8 @@ from simgap.robots.explained import Explained, explained
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises
+from simgap.robots.phases import phases_of
+from simgap.robots.search import Asked, _Place
 from simgap.robots.verdict import open_where
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import FLIES, REGIMES, STRIKES
@@ -71,6 +73,16 @@ def test_a_planted_effect_explains_the_gap_and_another_does_not(damped):
     found = told(damped, there, tuple(there))
     assert found.left[0] < 0.02
     assert found.part[:, 0] == pytest.approx([1.0, 0.0], abs=0.02)
+
+
+def test_only_what_is_large_enough_to_be_told_is_exchanged(damped):
+    there = {"viscous": {"viscous": 0.02}, "readout:angle.bias": {"bias": 1e-5}}
+    names, count = tuple(there), damped.rows.log.size
+    plain = linearise(damped, {}, names)
+    parts = phases_of(damped.simulator, damped.recordings)
+    ask = Asked(damped, parts, names, (), np.ones(count), damped.rows.log, plain)
+    place = _Place.of(ask, there, names, names)
+    assert {*place.held} == {*names} and place.large == ("viscous",)
 
 
 def test_what_contacts_leave_does_not_deny_what_flight_bears_out(damped):
