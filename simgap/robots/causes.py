@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from simgap.attribution.posterior import fitted, forms
+from simgap.robots.asked import Asked
 from simgap.robots.blocks import NONE
 from simgap.robots.discrepancy import learned
 from simgap.robots.gap import fitted_along, gap_of
 from simgap.robots.linear import linearise
 from simgap.robots.model import Point
-from simgap.robots.search import Asked, Found
+from simgap.robots.search import Found
 from simgap.robots.whiten import covariances
 
 

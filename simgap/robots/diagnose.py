@@ -17,6 +17,7 @@ from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.progress import Progress, silent
 from simgap.robot_effects import candidates as candidates_of
 from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robots.asked import Asked
 from simgap.robots.borne_out import folds_of
 from simgap.robots.causes import about
 from simgap.robots.experiments import NextLog, next_log
@@ -33,7 +34,7 @@ from simgap.robots.phases import Phases, phases_of
 from simgap.robots.prune import sought
 from simgap.robots.repeats import motions
 from simgap.robots.scatter import over_rivals
-from simgap.robots.search import Asked, Found
+from simgap.robots.search import Found
 from simgap.robots.settle import settled
 from simgap.robots.stand_ins import stand_ins
 from simgap.robots.twins import Twins, healthy_twins

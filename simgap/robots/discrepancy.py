@@ -7,7 +7,7 @@ which a cause shows would count for little, and where a search ends would hang o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,7 @@ def learned(
 ) -> Discrepancy:
     """The discrepancy of a residual (N,); channels for which it gains nothing have none. `near`: that of a
     residual of which this one is a part, with which to begin; what that has none of, this has none of.
-    `begin`: sizes to begin with in the place of those."""
+    `begin`: sizes to begin with in the place of those, or of a first guess."""
     names = cov.names
     if not names:
         return NONE
@@ -37,7 +37,7 @@ def learned(
     if near is not None:
         x = np.array([2 * np.log({**near.scale, **begin.scale}[names[k]]) for k in kept])
     else:
-        x = sizes.first_guess()
+        x = sizes.first_guess({names.index(n): 2 * np.log(s) for n, s in begin.scale.items() if n in names})
     plain = sizes.value(np.zeros(0), [])
     while kept:
         bounds = [(v - 25.0, v + 12.0) for v in x]
@@ -73,16 +73,18 @@ class _Sizes:
         value, slope = self.likelihood.slope(variance)
         return value, (variance * slope)[list(kept)]
 
-    def first_guess(self) -> np.ndarray:
-        """Log variances (K,) found one after another: at most what alone would explain the residual."""
-        x = np.zeros(0)
+    def first_guess(self, known: Mapping[int, float]) -> np.ndarray:
+        """Log variances (K,): those that are known by number, and the others found one after another, each at
+        most what alone would explain the residual."""
+        numbers = [*known, *(k for k in range(self.count) if k not in known)]
+        x = np.array([*known.values()], float)
         squares, trace = self.likelihood.squares, self.likelihood.tied.trace
-        for k in range(self.count):
-            there = trace[:, k] > 0
-            most = max(float(np.median(squares[there] / trace[there, k])), 1e-30) if there.any() else 1e-26
+        for at in range(len(known), self.count):
+            mine, taken = trace[:, numbers[at]], trace[:, numbers[at]] > 0
+            most = max(float(np.median(squares[taken] / mine[taken])), 1e-30) if taken.any() else 1e-26
             trial = [np.append(x, v) for v in np.log(most) - np.arange(0.0, 19.0, 3.0)]
-            x = min(trial, key=lambda v, k=k: self.value(v, range(k + 1)))
-        return x
+            x = min(trial, key=lambda v, at=at: self.value(v, numbers[: at + 1]))
+        return x[np.argsort(numbers)]
 
     def _variance(self, x: np.ndarray, kept: Sequence[int]) -> np.ndarray:
         """Variances (K,) of all sources, 0 for those that are not kept."""

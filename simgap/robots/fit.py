@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from simgap.progress import say
+from simgap.robots.blocks import NONE, Discrepancy
 from simgap.robots.linear import STEP, Base, Linear, base_at, numeric_at, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.whiten import Whitener
@@ -23,10 +24,12 @@ FINEST = 1e-4  # numerics: usual sizes: the least one
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a set fits best, and what that `gained` over where the fit began [nats]."""
+    """Where a set fits best, what that `gained` over where the fit began [nats], and the `discrepancy` that
+    it leaves, where that was learned."""
 
     point: Point
     gained: float
+    discrepancy: Discrepancy = NONE
 
 
 def moved_to(

@@ -11,13 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from simgap.progress import Progress
+from simgap.robots.asked import Asked
 from simgap.robots.borne_out import weakest
 from simgap.robots.discrepancy import learned
 from simgap.robots.gap import fitted_along
 from simgap.robots.kept import Kept
 from simgap.robots.linear import linearise
 from simgap.robots.model import Point
-from simgap.robots.search import Asked, Found, exchanged, search
+from simgap.robots.search import Found, exchanged, search
 from simgap.robots.settle import settled
 from simgap.robots.whiten import covariances
 
@@ -28,6 +29,7 @@ def pruned(ask: Asked, found: Found) -> tuple[tuple[str, ...], Point]:
     """The effects that are left, and the point of their best fit."""
     composed, along = ask.composed, fitted_along(ask.composed)
     kept, point, linear, whiten = found.best, found.linear.point, found.linear, found.whiten
+    off = found.discrepancy
     while kept:
         f = ask.forms(linear, whiten, kept)
         out = weakest(f.gap, range(len(kept)), ask.fold[np.isfinite(linear.residual)])
@@ -35,10 +37,12 @@ def pruned(ask: Asked, found: Found) -> tuple[tuple[str, ...], Point]:
             break
         kept = tuple(n for j, n in enumerate(kept) if j != out)
         left = {n: values for n, values in point.items() if n in along or n in kept}
-        point = settled(composed, left, ask.factor).point
+        there = settled(composed, left, ask.factor, begin=off)
+        point = there.point
         linear = linearise(composed, point, [*along, *kept])
         cov = covariances(composed, linear, ask.factor)
-        whiten = cov.whitener(learned(cov, linear.residual))
+        off = learned(cov, linear.residual, begin=there.discrepancy)
+        whiten = cov.whitener(off)
     return kept, point
 
 

@@ -14,24 +14,23 @@ from functools import cached_property
 
 import numpy as np
 
-from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.posterior import Forms, Model, fitted
 from simgap.attribution.verdict import LEAST
 from simgap.progress import Progress, say
+from simgap.robots.asked import ROUNDS, Asked, Step
 from simgap.robots.blocks import NONE, Discrepancy
 from simgap.robots.borne_out import BORNE_OUT, EVEN, chance_of, held_out_scores
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import reached
-from simgap.robots.gap import fitted_along, gap_of
+from simgap.robots.fit import Fit, reached
+from simgap.robots.gap import fitted_along
 from simgap.robots.judged import Judge, Judged
 from simgap.robots.kept import NOWHERE, Kept
 from simgap.robots.linear import Linear, linearise
-from simgap.robots.model import Composed, Point
-from simgap.robots.phases import Phases
+from simgap.robots.model import Point
 from simgap.robots.proposals import leaders, nearest, one_more, point_of, two_more
 from simgap.robots.settle import SETTLED, settled
 from simgap.robots.whiten import Covariances, Whitener, covariances
 
-ROUNDS = 10  # numerics: of an iteration that settles sooner
 LEADERS = 24  # numerics: candidates that a search goes on with
 PROPOSED = 4  # numerics: sets by each scale that are judged by the discrepancy that they leave
 TRIED = 3  # numerics: sets that are fitted exactly until one is better
@@ -55,62 +54,6 @@ class Found:
         return tuple(c.name for c in self.forms.gap.candidates)
 
 
-@dataclass(frozen=True)
-class Step:
-    """Where a search stands: about which point it goes on, and the best set so far, which settled there;
-    `field`: the candidates that came near when all were asked; `whole`: all are asked next."""
-
-    point: Point
-    best: tuple[str, ...] = ()
-    ended: bool = False
-    field: tuple[str, ...] = ()
-    whole: bool = True
-
-
-@dataclass(frozen=True)
-class Asked:
-    """In which windows which candidates are asked, which of them are `forced`, the `factor` (N,) on the
-    noise's sd and the `fold` (N,) of each row; `plain`: all candidates' sensitivities in these windows where
-    what is fitted along fits best without them; `last`: what takes long was tried in some of the windows."""
-
-    composed: Composed
-    phases: Phases
-    candidates: tuple[str, ...]
-    forced: tuple[str, ...]
-    factor: np.ndarray
-    fold: np.ndarray
-    plain: Linear
-    last: bool = False
-
-    @cached_property
-    def few(self) -> Asked:
-        """The same in some of the windows, or this where they are few anyway."""
-        numbers = self.composed.thinned()
-        if len(numbers) >= len(self.composed.windows):
-            return self
-        part, mine = self.composed.among(numbers), np.isin(self.composed.rows.window, numbers)
-        plain = self.plain.among(part, mine)
-        return replace(self, composed=part, factor=self.factor[mine], fold=self.fold[mine], plain=plain)
-
-    def asked(self, step: Step, number: int) -> tuple[str, ...]:
-        """The candidates that a round asks: all in the last one."""
-        near = {*step.field, *step.best}
-        if step.whole or self.forced or number == ROUNDS - 1:
-            return self.candidates
-        return tuple(n for n in self.candidates if n in near)
-
-    def linearised(self, point: Point, names: Sequence[str]) -> Linear:
-        """All about a point; what is known there is not worked out again."""
-        names, known = [*fitted_along(self.composed), *names], self.plain
-        if known.point == point and {*names} <= {*known.moved, *known.diverged}:
-            return known
-        return linearise(self.composed, point, names)
-
-    def forms(self, linear: Linear, whiten: Whitener, names: Sequence[str]) -> Forms:
-        """The gap about a point, of these candidates."""
-        return forms(gap_of(self.composed, linear, whiten, self.phases, names))
-
-
 def search(ask: Asked, tell: Progress, kept: Kept = NOWHERE, begin: Step | None = None) -> Found:
     """Search until the best set stays: where there are many windows in some of them first, from which all are
     gone on with. `begin`: a set to go on from, found in some of the windows."""
@@ -120,8 +63,8 @@ def search(ask: Asked, tell: Progress, kept: Kept = NOWHERE, begin: Step | None 
 
         def ended() -> Step:
             last = _searched(few, start, tell, kept.of("some windows"))[1]
-            point = settled(ask.composed, last.point, ask.factor).point
-            return Step(point, last.best, field=last.field, whole=False)
+            there = settled(ask.composed, last.point, ask.factor, begin=last.off)
+            return Step(there.point, last.best, field=last.field, whole=False, off=there.discrepancy)
 
         start, ask = kept("some windows", ended), replace(ask, last=True)
     return _searched(ask, start, tell, kept)[0]
@@ -157,10 +100,11 @@ def _round(ask: Asked, step: Step, number: int) -> tuple[Found, Step]:
     """One round: the sets that promise most about the step's point, and where the first that keeps what it
     promised settles."""
     asked = ask.asked(step, number)
-    place = _Place.of(ask, step.point, ask.forced or step.best, asked)
+    place = _Place.of(ask, step.point, ask.forced or step.best, asked, step.off)
     found = place.found()
     if not {*place.held} <= {*step.point}:
-        return found, Step(place.settled(place.here), place.held)
+        there = place.settled(place.here)
+        return found, Step(there.point, place.held, off=there.discrepancy)
     if not ask.forced and number < ROUNDS - 1:
         better = _better(place, place) or _exchanged(place, asked)
         if better is not None:
@@ -186,11 +130,11 @@ def _better(place: _Place, now: _Place) -> Step | None:
         promising = sorted(map(place.judge, sorted(sets - tried)), key=lambda one: -one.score)
         for one in [p for p in promising if p.score > place.here.score + SETTLED][:TRIED]:
             say(f"trying {' + '.join(one.names) or 'nothing'}")
-            point = place.settled(one)
-            score, held_out = place.tried(point, one.names)
+            there = place.settled(one)
+            score, held_out = place.tried(there, one.names)
             most = EVEN if place is now and one_more in proposals else BORNE_OUT
             if score > now.here.score + SETTLED and chance_of(held_out - now.held_out) < most:
-                return Step(point, one.names)
+                return Step(there.point, one.names, off=there.discrepancy)
         tried |= sets
         if not place.here.discrepancy:  # nothing is left for what helps only together
             break
@@ -207,8 +151,9 @@ def _exchanged(place: _Place, asked: Sequence[str]) -> Step | None:
     for out in place.large:
         rest = tuple(n for n in place.held if n != out)
         left = {n: values for n, values in place.linear.point.items() if n != out}
-        point = settled(ask.composed, left, ask.factor).point
-        better = _better(_Place.of(ask, point, rest, [n for n in asked if n != out]), place)
+        there = settled(ask.composed, left, ask.factor, begin=place.here.discrepancy)
+        others = [n for n in asked if n != out]
+        better = _better(_Place.of(ask, there.point, rest, others, there.discrepancy), place)
         if better is not None:
             return better
     return None
@@ -230,12 +175,14 @@ class _Place:
     here: Judged
 
     @classmethod
-    def of(cls, ask: Asked, point: Point, held: Sequence[str], asked: Sequence[str]) -> _Place:
-        """About a point, with these candidates."""
+    def of(
+        cls, ask: Asked, point: Point, held: Sequence[str], asked: Sequence[str], begin: Discrepancy = NONE
+    ) -> _Place:
+        """About a point, with these candidates; `begin`: about what discrepancy is left there."""
         linear = ask.linearised(point, asked)
         usable = [n for n in asked if n in linear.moved]
         cov = covariances(ask.composed, linear, ask.factor)
-        off = learned(cov, linear.residual)
+        off = learned(cov, linear.residual, begin=begin)
         # What a cause does is hidden by the discrepancy that is left without it, and what is none of the
         # causes' doing misleads without one: what comes near by either is asked.
         scales = tuple(cov.whitener(d) for d in ((off, NONE) if off else (NONE,)))
@@ -249,8 +196,8 @@ class _Place:
     def large(self) -> tuple[str, ...]:
         """Those of the set without which more comes back than an error in the largest one's form would be."""
         sensor, left = self.judge.covariances.whitener(), np.nan_to_num(self.linear.residual)
-        without = {n: left + np.nan_to_num(self.linear.moved[n].shift) for n in self.held}
-        lost = {n: np.sum(sensor(rows) ** 2) - np.sum(sensor(left) ** 2) for n, rows in without.items()}
+        shift = {n: np.nan_to_num(self.linear.moved[n].shift) for n in self.held}
+        lost = {n: np.sum(sensor(left + rows) ** 2) - np.sum(sensor(left) ** 2) for n, rows in shift.items()}
         return tuple(n for n in self.held if lost[n] >= LEAST * max(lost.values()))
 
     def found(self) -> Found:
@@ -268,27 +215,27 @@ class _Place:
             found |= {tuple(self.names[j] for j in m.effects) for m in models}
         return found
 
-    def settled(self, one: Judged) -> Point:
+    def settled(self, one: Judged) -> Fit:
         """Where a set settles that was judged here."""
         f = self.ask.forms(self.linear, one.whiten, one.names)
         begin = point_of(self.ask.composed, f, tuple(range(len(one.names))), self.linear.point)
         first = reached(self.ask.composed, self.linear, one.whiten, begin)
-        return settled(self.ask.composed, first, self.ask.factor).point
+        return settled(self.ask.composed, first, self.ask.factor, begin=one.discrepancy)
 
     @cached_property
     def held_out(self) -> np.ndarray:
         """Log likelihood of each fold's rows (folds,), fitted to the others."""
         return self._held_out(self.linear, self.here)
 
-    def tried(self, point: Point, names: tuple[str, ...]) -> tuple[float, np.ndarray]:
+    def tried(self, there: Fit, names: tuple[str, ...]) -> tuple[float, np.ndarray]:
         """Of a set where it has settled its score, minus infinity where the simulator diverges more than it
         did, and its log likelihood of each fold's rows (folds,)."""
         ask = self.ask
-        linear = linearise(ask.composed, point, [*fitted_along(ask.composed), *names])
+        linear = linearise(ask.composed, there.point, [*fitted_along(ask.composed), *names])
         if linear.dropped > self.linear.dropped or linear.diverged:
             return -np.inf, np.zeros(np.unique(ask.fold).size)
         cov = covariances(ask.composed, linear, ask.factor)
-        off = learned(cov, linear.residual)
+        off = learned(cov, linear.residual, begin=there.discrepancy)
         one = Judge(ask.composed, ask.phases, linear, cov, off, self.judge.log_odds)(names)
         return one.score, self._held_out(linear, one)
 

@@ -95,8 +95,12 @@ class Covariances:
     def whitener(self, discrepancy: Discrepancy = NONE) -> Whitener:
         """The whitener of all rows."""
         made = [_whitened(block, discrepancy) for block in self.blocks]
-        factors, half_logs, told = (tuple(one[k] for one in made) for k in range(3))
-        return Whitener(tuple(block.rows for block in self.blocks), factors, half_logs, told)
+        return Whitener(
+            tuple(block.rows for block in self.blocks),
+            tuple(factor for factor, _, _ in made),
+            tuple(half for _, half, _ in made),
+            tuple(told for _, _, told in made),
+        )
 
 
 def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float, float]:

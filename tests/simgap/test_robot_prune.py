@@ -11,13 +11,14 @@ from simgap_swing import Swing, log
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
+from simgap.robots.asked import Asked
 from simgap.robots.borne_out import borne_out, held_out_scores, weakest
 from simgap.robots.explained import Explained, explained
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises
 from simgap.robots.phases import phases_of
-from simgap.robots.search import Asked, _Place
+from simgap.robots.search import _Place
 from simgap.robots.verdict import open_where
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import FLIES, REGIMES, STRIKES
