@@ -28,26 +28,30 @@ SIZES = 8  # numerics: parts are filled up to a multiple of so many rows, with r
 @dataclass(frozen=True)
 class _Stack:
     """Parts (P,) of one size m and the same sources, filled up: which of the gap's `rows` (P, m), -1 where
-    there is none, and of which `block` (P,); their `variance` (P, m), `start` (P, m, S), and by source its
-    number, its parts (p,) and its covariance (p, m, m) in these, or variances (p, m) where it ties none."""
+    there is none, and of which `block` (P,); their `variance` (P, m), `start` (P, m, S), and the numbers of
+    sources with their covariances: of those that tie rows `ties` (K, P, m, m), of those that tie none, which
+    have variances alone, `frees` (L, P, m)."""
 
     rows: np.ndarray
     block: np.ndarray
     variance: np.ndarray
     start: np.ndarray
-    sources: tuple[tuple[int, np.ndarray, np.ndarray], ...]
+    tying: np.ndarray
+    ties: np.ndarray
+    freeing: np.ndarray
+    frees: np.ndarray
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Of all its sources."""
+        return np.concatenate([self.tying, self.freeing])
 
     def covariance(self, variance: np.ndarray) -> np.ndarray:
         """Of the parts (P, m, m) with sources of these variances (K,)."""
-        parts, size = self.variance.shape
-        out = np.zeros((parts, size, size))
+        # By far the most numbers: one pass over them, and no copies.
+        out = np.tensordot(variance[self.tying], self.ties, 1)
         diagonal = np.einsum("pii->pi", out)  # a view
-        diagonal += self.variance
-        for k, mine, own in self.sources:
-            if variance[k] > 0 and own.ndim == 2:
-                diagonal[mine] += variance[k] * own
-            elif variance[k] > 0:
-                out[mine] += variance[k] * own
+        diagonal += self.variance + np.tensordot(variance[self.freeing], self.frees, 1)
         return out
 
 
@@ -111,14 +115,12 @@ class Likelihood:
             columns = both[:, :, 1:]
             alpha = both[:, :, 0] - np.einsum("pms,ps->pm", columns, back[stack.block])
             inverse, less = all_inverses(half.factor), np.matmul(columns, inner[stack.block])
-            for k, mine, own in stack.sources:
-                if own.ndim == 2:
-                    diagonal = np.einsum("pii->pi", inverse)[mine] - np.sum(less[mine] * columns[mine], 2)
-                    trace, pull = np.sum(diagonal * own), np.sum(alpha[mine] ** 2 * own)
-                else:
-                    trace = np.vdot(inverse[mine], own) - np.vdot(less[mine], np.matmul(own, columns[mine]))
-                    pull = np.vdot(alpha[mine], np.matmul(own, alpha[mine][:, :, None])[:, :, 0])
-                slope[k] += 0.5 * float(trace - pull)
+            free = np.einsum("pii->pi", inverse) - np.sum(less * columns, 2) - alpha**2
+            slope[stack.freeing] += 0.5 * np.tensordot(stack.frees, free, 2)
+            left = np.concatenate([less, alpha[:, :, None]], 2)
+            right = np.concatenate([columns, alpha[:, :, None]], 2)
+            inverse -= np.matmul(left, right.transpose(0, 2, 1))
+            slope[stack.tying] += 0.5 * np.tensordot(stack.ties, inverse, 3)
         return value, slope
 
     def _solved(self, variance: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, list[_Half]]:
@@ -140,7 +142,7 @@ class Likelihood:
     def _half(self, number: int, variance: np.ndarray) -> _Half:
         """A stack whitened with sources of these variances."""
         stack = self.tied.stacks[number]
-        key = tuple(float(variance[k]) for k, _, _ in stack.sources)
+        key = tuple(variance[stack.numbers].tolist())
         return latest(self.kept[number], key, lambda: _half(stack, self.residual[number], variance), LATEST)
 
 
@@ -172,26 +174,28 @@ def _stack(
     size: int,
     states: int,
 ) -> _Stack:
-    """Parts of blocks, each by its block's number and its rows in it, filled up to a size."""
+    """Parts of blocks that have the same sources, each by its block's number and its rows in it, filled up to
+    a size."""
     rows = np.full((len(parts), size), -1)
     variance, start = np.ones(rows.shape), np.zeros((*rows.shape, states))
-    found: dict[tuple[int, int], list[tuple[int, np.ndarray]]] = {}
+    first, first_rows = blocks[parts[0][0]], parts[0][1]
+    here = [k for k, n in enumerate(names) if n in first.sources and _reaches(first.sources[n], first_rows)]
+    tying = np.array([k for k in here if first.sources[names[k]].covariance.ndim == 2], int)
+    freeing = np.array([k for k in here if first.sources[names[k]].covariance.ndim == 1], int)
+    ties = np.zeros((tying.size, len(parts), size, size))
+    frees = np.zeros((freeing.size, len(parts), size))
     for p, (number, mine) in enumerate(parts):
         block, n = blocks[number], mine.size
         rows[p, :n], variance[p, :n] = block.rows[mine], block.variance[mine]
         start[p, :n, : block.start.shape[1]] = block.start[mine]
         place = np.full(block.rows.size, -1)
         place[mine] = np.arange(n)
-        for k, name in enumerate(names):
-            if name in block.sources and _reaches(block.sources[name], mine):
-                found.setdefault((k, block.sources[name].covariance.ndim), []).append(
-                    (p, _filled(block.sources[name], place, size))
-                )
-    sources = tuple(
-        (k, np.array([p for p, _ in each]), np.stack([own for _, own in each]))
-        for (k, _), each in found.items()
+        for numbers, whole in ((tying, ties), (freeing, frees)):
+            for k, number_of in enumerate(numbers):
+                whole[k, p] = _filled(block.sources[names[number_of]], place, size)
+    return _Stack(
+        rows, np.array([number for number, _ in parts]), variance, start, tying, ties, freeing, frees
     )
-    return _Stack(rows, np.array([number for number, _ in parts]), variance, start, sources)
 
 
 def _parts(block: Block) -> list[np.ndarray]:
