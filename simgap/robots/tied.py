@@ -191,8 +191,8 @@ def _stack(
         place = np.full(block.rows.size, -1)
         place[mine] = np.arange(n)
         for numbers, whole in ((tying, ties), (freeing, frees)):
-            for k, number_of in enumerate(numbers):
-                whole[k, p] = _filled(block.sources[names[number_of]], place, size)
+            for k, source in enumerate(numbers.tolist()):
+                whole[k, p] = _filled(block.sources[names[source]], place, size)
     return _Stack(
         rows, np.array([number for number, _ in parts]), variance, start, tying, ties, freeing, frees
     )
