@@ -191,7 +191,7 @@ def _stack(
         place = np.full(block.rows.size, -1)
         place[mine] = np.arange(n)
         for numbers, whole in ((tying, ties), (freeing, frees)):
-            for k, source in enumerate(numbers.tolist()):
+            for k, source in enumerate(map(int, numbers)):
                 whole[k, p] = _filled(block.sources[names[source]], place, size)
     return _Stack(
         rows, np.array([number for number, _ in parts]), variance, start, tying, ties, freeing, frees
