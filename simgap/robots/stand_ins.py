@@ -228,14 +228,18 @@ def _told_apart(causing: _Fit, other: _Fit, lacking: _Fit) -> bool:
     worse = other.left - causing.left
     if worse > MOST * (lacking.left - causing.left):
         return True
+    # Sizes that are unusual tell against a set, and held-out logs may outweigh them.
     strange = log_prior(causing.forms, causing.model) - log_prior(other.forms, other.model)
-    if strange > np.log(RULED_OUT):
-        return True
     gain = causing.held_out - other.held_out
+    if strange > np.log(RULED_OUT):
+        return strange + float(gain.sum()) > float(np.log(RULED_OUT))
     return float(gain.sum()) > float(np.log(RULED_OUT)) and chance_of(gain) <= BORNE_OUT
 
 
 def log_prior(f: Forms, model: Model) -> float:
-    """Log prior of a set's parameters at its mode, constants left out (Cauchy; see `Candidate`)."""
+    """Log prior of how far each effect of a set is from neutral at its mode, along the line to there.
+
+    On a line a Cauchy prior (see `Candidate`) is one of a single parameter: a density of two is no measure of
+    one."""
     each = [model.x[mine] for mine in coordinates(f, model.effects).values()]
-    return -sum(0.5 * (1 + x.size) * float(np.log1p(x @ x)) for x in each)
+    return -sum(float(np.log1p(x @ x)) for x in each)
