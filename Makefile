@@ -138,7 +138,8 @@ robots-models: $(INSTALLED)  ## models of robots by others out of packages, in b
 	cd $(ROBOTS) && for wheel in *.whl; do ../../$(BIN)/python -m zipfile -e $$wheel .; done
 
 robots-check: robots-models  ## seeded faults in these models, diagnosed (in build/robots_check; resumable) and scored; fills docs/robots_results.md
-	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 48213 --cases 24 --robots pendulum reacher acrobot --out build/robots_check
+	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 30977 --cases 24 --robots pendulum reacher acrobot --out build/robots_check
+	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 64901 --cases 3 --robots ur5e manipulator --out build/robots_check
 	$(BIN)/python -m experiments.robots_check $(ROBOTS) --score build/robots_check
 	$(BIN)/python -m experiments.write_tables
 

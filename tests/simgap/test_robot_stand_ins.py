@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows
@@ -16,7 +17,7 @@ from simgap.robots.linear import base_at, linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises
 from simgap.robots.phases import phases_of
-from simgap.robots.stand_ins import _Asked, _Fit, _Place, _told_apart
+from simgap.robots.stand_ins import _Asked, _Fit, _Place, _told_apart, log_prior
 from simgap.robots.whiten import covariances
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -139,6 +140,21 @@ def test_what_is_told_apart():
     assert not _told_apart(cause, fit(250.0, held_out=50.0), lacking)
     assert _told_apart(cause, fit(600.0), lacking)  # most of what the cause explains is left
     assert _told_apart(cause, fit(100.0, size=200.0), lacking)  # two hundred usual sizes
+    assert not _told_apart(cause, fit(100.0, size=200.0, held_out=10.0), lacking)  # but held-out logs
+
+
+def test_how_far_out_an_effect_lies_does_not_hang_on_how_many_parameters_it_has():
+    one, none, far = np.ones(1), np.zeros(1), np.full(1, 1e3)
+    rows = Rows(*(np.zeros(4, int),) * 3, np.arange(4.0), ("a",), ("y",), ("whole",))
+    priors = []
+    for k in (1, 3):
+        made = Candidate("c", ("size",) * k, *(np.repeat(v, k) for v in (none, none, one)), np.zeros(4),
+                         np.ones((4, k)), np.repeat(-far, k), np.repeat(far, k))  # fmt: skip
+        f = forms(Gap(rows, np.zeros(4), np.zeros((4, 0)), (made,)))
+        x = np.zeros(k)
+        x[0] = 7.0
+        priors.append(log_prior(f, replace(fitted(f, (0,)), x=x)))
+    assert priors == pytest.approx([-np.log(50.0)] * 2)
 
 
 class Stepped:
