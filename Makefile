@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: then-and-now untidy robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers before-after help setup demo test lint typecheck tests slow wheel docs constants results paper sweeps check-gap calibrate fuzz
+.PHONY: robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -40,15 +40,8 @@ wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
 	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs
 
-constants: $(INSTALLED)  ## docs/constants.md: every numeric constant with its kind and reason
+constants: $(INSTALLED)  ## docs/tables/constants.csv: every numeric constant with its kind and reason
 	$(BIN)/python -m experiments.constants
-
-BEFORE := build/before
-before-after: $(INSTALLED)  ## published numbers of release 0.1.0's code and of this code, on RECORDINGS (default recordings)
-	test -d $(BEFORE) || git worktree add $(BEFORE) c02f51d
-	$(BIN)/python -m experiments.before_after measure before --root $(BEFORE) --package commands $(or $(RECORDINGS),recordings)
-	$(BIN)/python -m experiments.before_after measure after $(or $(RECORDINGS),recordings)
-	$(BIN)/python -m experiments.write_tables
 
 bench: $(INSTALLED)  ## kernels beside hmmlearn and dynamax, stages of the commands; fills docs/benchmarks.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
@@ -94,9 +87,7 @@ gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; f
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
 	$(BIN)/python -m experiments.blind_check diagnose --cases $(SET)/cases --out $(SET)/results
 	$(BIN)/python -m experiments.blind_check score --sealed $(SET) --results $(SET)/results --json experiments/results/blind_check.json
-	$(BIN)/python -m experiments.spent_sets
 	$(BIN)/python -m paper_figs.gap_reliability
-	$(BIN)/python -m experiments.stamps
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)
@@ -109,7 +100,6 @@ real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECOR
 	$(BIN)/python -m experiments.real.robot_gap so101 $(REAL)/so101 --seconds 10 --figures docs/figures
 	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
 	$(BIN)/python -m experiments.real.collins $(REAL)/collins
-	$(BIN)/python -m experiments.real.collins_alike $(REAL)/collins
 	$(BIN)/python -m experiments.real.collins_push $(REAL)/collins --figures docs/figures
 	$(BIN)/python -m paper_figs.hiro_gap
 	$(BIN)/python -m paper_figs.way_eeg_gal
@@ -121,13 +111,10 @@ wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and o
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
 	$(BIN)/python -m experiments.readme_figures
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
-	$(BIN)/python -m experiments.stamps
 
-results: $(INSTALLED)  ## scores, calibration, ablation and benchmarks; fills the tables of README and docs/
+results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
 	$(BIN)/python -m experiments.calibration recordings
-	$(BIN)/python -m experiments.ablation
-	$(BIN)/python -m experiments.misfits recordings
 	$(BIN)/python -m experiments.benchmarks.moves
 	$(BIN)/python -m experiments.benchmarks.identify
 	$(BIN)/python -m experiments.write_tables
@@ -153,36 +140,18 @@ calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds 
 	$(BIN)/python -m experiments.reference_posteriors
 	$(BIN)/python -m experiments.write_tables
 
-boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/segmentation_results.md
+boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/tables
 	$(BIN)/python -m experiments.calibration_boundaries
-	$(BIN)/python -m experiments.table_boundaries
-
-untidy: $(INSTALLED)  ## misfits found and false alarms in worlds that differ; untidy contact by both simulators; fills docs/calibration.md
-	$(BIN)/python -m experiments.misfit_worlds
-	$(BIN)/python -m experiments.untidy_contacts
-	$(BIN)/python -m experiments.write_tables
-
-then-and-now: $(INSTALLED)  ## what was reported of earlier code beside what holds now; RECORDINGS: folder with towers, 1 kHz and misfits
-	$(BIN)/python -m experiments.then_and_now $(RECORDINGS)
 	$(BIN)/python -m experiments.write_tables
 
 sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL, PANDA, HANDS: folders; fills docs/sequences.md
 	$(BIN)/python -m experiments.sequences check $(if $(REAL),--real $(REAL)) $(if $(PANDA),--panda $(PANDA)) $(if $(HANDS),--hands $(HANDS))
 	$(BIN)/python -m experiments.write_tables
 
-paper: $(INSTALLED)  ## the paper's tables and figures, a small sweep; fills docs/reproduction.md
+paper: $(INSTALLED)  ## the paper's tables and figures; fills docs/reproduction.md
 	$(BIN)/python -m experiments.paper
 	$(BIN)/python -m paper_figs
 	$(BIN)/python -m experiments.paper.write_docs
-	$(BIN)/python -m experiments.sweeps --small --workers 2
-	$(BIN)/python -m experiments.stamps
-
-sweeps: $(INSTALLED)  ## robustness sweeps in full (half an hour on 2 cores), resumable; tables and figures
-	$(BIN)/python -m experiments.sweeps --workers 2
-	$(BIN)/python -m paper_figs.sweep_plane
-	$(BIN)/python -m paper_figs.sweep_lines
-	$(BIN)/python -m paper_figs.sweep_coverage
-	$(BIN)/python -m experiments.stamps
 
 CHECKED := build/check_gap
 SEALED := experiments/blind_check/sealed_small

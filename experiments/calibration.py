@@ -14,10 +14,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.bank import SEED, simulated_cases
 from experiments.estimates import estimate, summarise_estimates
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
+from experiments.worlds import SEED, simulated_cases
 from hmmseg.io.rig import Systematic
 
 RESULTS = Path(__file__).parent / "results"

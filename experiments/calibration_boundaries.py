@@ -17,12 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.estimates import KINDS
 from experiments.recordings import list_cases, read_case
 from experiments.saving import save
 from experiments.scoring import boundaries_covered, boundary_residuals
-from experiments.sweeps.trials import scene
+from experiments.worlds import WORLDS, scene, trials_of
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.spans import Segmentation
 

@@ -20,11 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.bank import deviated, draw_deviations
 from experiments.saving import save
-from experiments.sweeps.cells import Cell
-from experiments.sweeps.trials import GRASP_SPREAD, disturbed, recording_rig, scene
 from experiments.world_scores import Replicate, line, score, summary
+from experiments.worlds import GRASP_SPREAD, Cell, deviated, disturbed, draw_deviations, recording_rig, scene
 from hmmseg.io.rig import Fingertip, Noise, Rig, Systematic
 from hmmseg.io.task import BlockTask, parse_task
 from hmmseg.io.trial import Trial
@@ -39,6 +37,10 @@ FIRST, REPLICATES = 116_000, 32
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
 BIAS = 0.02  # N, what [systematic] admits where a row has biases
 PADS = 0.3  # share, likewise of pads
+PANELS = (
+    ("95", "properties, 95 %", (92, 97)), ("68", "properties, 68 %", (63, 73)),
+    ("90", "boundaries, 90 %", (86, 94)),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,36 @@ def _told(row: Row, sensors: Rig) -> Rig:
     return told.model_copy(update={"systematic": HAND}) if row.deviating else told
 
 
+def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
+    """A panel for each level, a line for each world; grey is what is to be reached."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(10, 0.26 * len(rows) + 1.2), sharey=True, layout="constrained")
+    names = list(rows)
+    for ax, (key, title, (low, high)) in zip(axes, PANELS, strict=True):
+        ax.axvspan(low, high, color="0.88", lw=0)
+        for y, name in enumerate(names):
+            share, error = rows[name][f"coverage_{key}"], rows[name][f"se_{key}"]
+            if share is None:
+                continue
+            inside = low - 200 * error <= 100 * share <= high + 200 * error
+            ax.errorbar(100 * share, y, xerr=100 * error, fmt="o", ms=3.5, lw=1,
+                        color="C0" if inside else "C3")  # fmt: skip
+        ax.set_title(title, fontsize=9)
+        ax.set_xlim(30 if key == "68" else 55, 101)
+        ax.tick_params(labelsize=8)
+        ax.set_xlabel("true values inside [%]", fontsize=8)
+        ax.grid(axis="x", lw=0.3)
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of this experiment."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -190,8 +222,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             document["rows"] = {n: document["rows"][n] for n in ROWS if n in document["rows"]}
             save(options.output, document)
         print(line(name, document["rows"][name]), flush=True)
-    from experiments.figure_calibration import draw
-
     draw(document["rows"], HERE.parent / "docs" / "figures" / "calibration_worlds.png")
 
 

@@ -1,4 +1,4 @@
-"""Every numeric constant of the product: its kind and reason, read from its comment, into docs/constants.md.
+"""Every numeric constant with its kind and reason, from its comment, into docs/tables/constants.csv.
 
     python -m experiments.constants
 
@@ -10,6 +10,7 @@ look or chosen. A test wants a kind and a reason of each.
 from __future__ import annotations
 
 import ast
+import csv
 import io
 import re
 import tokenize
@@ -130,40 +131,12 @@ def every() -> list[Constant]:
     return [constant for path in paths for constant in constants(path)]
 
 
-def page(found: list[Constant]) -> str:
-    """docs/constants.md."""
-    counts = Counter(constant.kind for constant in found)
-    out = [
-        "# Constants",
-        "",
-        f"The {len(found)} numeric constants of the product, by kind. `make constants` writes this page",
-        "from the comments in the code.",
-        "",
-        "| kind | what it means | how many |",
-        "|---|---|---|",
-    ]
-    out += [f"| {kind} | {means} | {counts[kind]} |" for kind, means in KINDS.items() if counts[kind]]
-    for kind in KINDS:
-        mine = [constant for constant in found if constant.kind == kind]
-        if not mine:
-            continue
-        out += [
-            "",
-            f"## {kind.capitalize()}",
-            "",
-            "| constant | value | file | reason |",
-            "|---|---|---|---|",
-        ]
-        for c in mine:
-            value = c.value if len(c.value) <= 60 else c.value[:57] + "..."
-            reason = c.reason.replace("|", "\\|")
-            out.append(f"| `{c.name}` | `{value.replace('|', '/')}` | `{c.file}` | {reason} |")
-    return "\n".join(out) + "\n"
-
-
 def main() -> None:
-    found = every()
-    (ROOT / "docs/constants.md").write_text(page(found), encoding="utf-8")
+    found = sorted(every(), key=lambda c: list(KINDS).index(c.kind))
+    with (ROOT / "docs/tables/constants.csv").open("w", encoding="utf-8", newline="") as file:
+        write = csv.writer(file, lineterminator="\n")
+        write.writerow(["kind", "constant", "value", "file", "reason"])
+        write.writerows([c.kind, c.name, c.value, c.file, c.reason] for c in found)
     print(", ".join(f"{n} {kind}" for kind, n in Counter(c.kind for c in found).most_common()))
 
 

@@ -28,7 +28,6 @@ from estimation.posterior import posterior
 from estimation.sampler import sample
 from estimation.unknowns import PROPERTIES, Unknown
 from experiments.saving import save
-from experiments.stamps import save_figure
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "sbc.json"
@@ -170,7 +169,7 @@ def draw(document: dict[str, Any], path: Path) -> None:
         ax.set_xlabel("rank of the true value", fontsize=8)
     axes[0].set_ylabel("data sets", fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_figure(figure, path)
+    figure.savefig(path, dpi=110)
     plt.close(figure)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from experiments.stamps import save_figure
 from experiments.table_text import load, markdown, percent
 
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "sequences.png"
@@ -63,5 +62,5 @@ def _draw(groups: dict[str, Any], path: Path) -> None:
     ax.set_ylabel("share that were true")
     ax.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_figure(figure, path)
+    figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.stamps import save_figure
 from experiments.table_text import load, markdown, percent
 
 LENGTHS = Path(__file__).parents[1] / "docs" / "figures" / "long_recordings.png"
@@ -184,7 +183,7 @@ def _draw_lengths(rows: list[dict]) -> None:
         ax.set_ylabel(label)
         ax.grid(lw=0.3, which="both")
     axes[0].legend(fontsize=8)
-    save_figure(figure, LENGTHS)
+    figure.savefig(LENGTHS, dpi=110)
     plt.close(figure)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +21,18 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table with its first column to the left, the others to the right."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def as_csv(text: str) -> str:
+    """The tables of a text as comma-separated values; what stands between them are lines of one cell."""
+    out = io.StringIO()
+    write = csv.writer(out, lineterminator="\n")
+    for line in filter(None, map(str.strip, text.splitlines())):
+        if not line.startswith("|"):
+            write.writerow([line.lstrip("# ")])
+        elif not set(line) <= set("|-: "):
+            write.writerow([cell.strip().replace("`", "") for cell in line[1:-1].split("|")])
+    return out.getvalue()
 
 
 def percent(value: float, digits: int = 1) -> str:

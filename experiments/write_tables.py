@@ -2,8 +2,7 @@
 
     python -m experiments.write_tables
 
-Text between <!-- name --> and <!-- /name --> is replaced; what has no result yet stays as it is. Figures that
-were drawn on the way get the commit that drew them.
+Text between <!-- name --> and <!-- /name --> is replaced; what has no result yet stays as it is.
 """
 
 from __future__ import annotations
@@ -13,36 +12,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments import (
-    before_after,
     gap_arm,
     gap_drawn,
     patch_heldout,
-    provenance,
-    spent_sets,
-    stamps,
-    table_blind_check,
     table_calibration,
     table_gap,
     table_robots,
     table_sequences,
     table_speed,
-    then_and_now,
     wrist,
 )
-from experiments.table_misfits import by_world, misfits, untidy
 from experiments.table_real import real
-from experiments.table_text import covered, load, markdown, milliseconds, percent
+from experiments.table_text import as_csv, covered, load, markdown, milliseconds, percent
 from hmmseg.contact.identifiability import PROPERTIES
 
 ROOT = Path(__file__).parents[1]
 PAPER = {"weight": "3 %", "width": "7 %", "height": "10 %"}
 TARGET = {"weight": "<= 0.5 %", "width": "<= 0.1 %", "height": "<= 0.2 %"}
-
-SETS = {
-    "bank": "Virtual model, fresh seeds",
-    "recordings": "Stand-in recordings, healthy",
-    "systematic": "Hands that deviate as [systematic] says",
-}
 
 
 def results() -> str | None:
@@ -95,96 +81,27 @@ def rivals() -> str | None:
     return markdown(head, rows)
 
 
-def ablation() -> str | None:
-    """docs/calibration.md: errors and coverages with one part left out."""
-    found = load("ablation")
-    if found is None:
-        return None
-    rows = []
-    for v in found["variants"]:
-        b, p = v["boundaries"]["all"], v["properties"]
-        times = [milliseconds(b["median"]), milliseconds(b["percentile_95"]), percent(b["coverage_90"])]
-        rms = [percent(p[k]["rms"], 3) for k in PROPERTIES]
-        rows.append([v["name"], *times, *rms, percent(p["all"]["coverage_95"])])
-    head = [
-        "",
-        "boundary, median",
-        "95th percentile",
-        "90 % intervals cover",
-        *PROPERTIES,
-        "95 % intervals cover",
-    ]
-    note = (f"{found['cases']} cases of four pooled trials; weight, width and height: rms relative error. "
-            "Knocked: 2 % of all force samples are off by up to 0.5 N.")  # fmt: skip
-    return f"{markdown(head, rows)}\n\n{note}"
-
-
-def calibration() -> str | None:
-    """docs/calibration.md: coverages by kind of boundary and property, and Laplace beside sampling."""
-    found = load("calibration")
-    if found is None:
-        return None
-    parts = []
-    for name, title in SETS.items():
-        if name not in found:
-            continue
-        for size, of in (("pooled", "four trials pooled"), ("single", "single trials")):
-            s = found[name][size]
-            parts.append(f"### {title}: {of} ({s['estimates']} estimates)")
-            head = ["boundary", "number", "shift", "median error", "95th percentile", "90 % intervals cover"]
-            rows = []
-            for kind, b in s["boundaries"].items():
-                times = [milliseconds(b[k]) for k in ("bias", "median", "percentile_95")]
-                rows.append([kind, f"{b['count']}", *times, covered(b, "coverage_90")])
-            parts.append(markdown(head, rows))
-            head = ["property", "number", "rms error", "68 % cover", "Laplace", "95 % cover", "Laplace"]
-            rows = []
-            for key, p in s["properties"].items():
-                shares = ("coverage_68", "laplace_68", "coverage_95", "laplace_95")
-                rows.append([key, f"{p['count']}", percent(p["rms"], 3), *(covered(p, c) for c in shares)])
-            parts.append(markdown(head, rows))
-    return "\n\n".join(parts)
-
-
-def moves() -> str | None:
-    """docs/calibration.md: the sampler's moves."""
-    found = load("benchmark_moves")
-    if found is None:
-        return None
-    rows = []
-    for size, of in found["trials"].items():
-        for name, row in of.items():
-            tau, speed = f"{row['autocorrelation_time']:.1f}", f"{row['ess_per_second']:.0f}"
-            rows.append([name, size, f"{row['acceptance']:.2f}", tau, speed])
-    head = ["moves", "trials", "acceptance", "autocorrelation time", "effective samples a second"]
-    return markdown(head, rows)
-
-
-# Page, name of the table on it, what writes it, and the make target that makes its numbers anew.
+# Page, name of the table on it (none: it is the whole file), what writes it, and the target of its numbers.
 TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("README.md", "results", results, "results"),
     ("docs/results.md", "results", results, "results"),
     ("docs/results.md", "rivals", rivals, "results"),
     ("docs/results.md", "real", real, "real"),
-    ("docs/calibration.md", "ablation", ablation, "results"),
-    ("docs/calibration.md", "calibration", calibration, "results"),
-    ("docs/calibration.md", "identified", table_calibration.identified, "identified"),
-    ("docs/calibration.md", "identified_boundaries", table_calibration.boundaries, "identified"),
-    ("docs/calibration.md", "worlds", table_calibration.worlds, "calibrate"),
-    ("docs/calibration.md", "sbc", table_calibration.sbc, "calibrate"),
-    ("docs/calibration.md", "reference", table_calibration.reference, "calibrate"),
-    ("docs/calibration.md", "moves", moves, "results"),
-    ("docs/calibration.md", "misfits", misfits, "results"),
-    ("docs/calibration.md", "misfits_by_world", by_world, "untidy"),
-    ("docs/calibration.md", "untidy", untidy, "untidy"),
-    ("docs/calibration.md", "then_and_now", then_and_now.table, "then-and-now"),
+    ("docs/tables/calibration.csv", "", table_calibration.calibration, "results"),
+    ("docs/tables/identified.csv", "", table_calibration.identified, "identified"),
+    ("docs/tables/identified_boundaries.csv", "", table_calibration.identified_boundaries, "identified"),
+    ("docs/tables/boundaries.csv", "", table_calibration.boundaries, "boundaries"),
+    ("docs/tables/boundaries_by_kind.csv", "", table_calibration.boundaries_by_kind, "boundaries"),
+    ("docs/tables/worlds.csv", "", table_calibration.worlds, "calibrate"),
+    ("docs/tables/sbc.csv", "", table_calibration.sbc, "calibrate"),
+    ("docs/tables/reference.csv", "", table_calibration.reference, "calibrate"),
+    ("docs/tables/moves.csv", "", table_calibration.moves, "results"),
     ("docs/results.md", "gap", table_gap.summary, "gap-results"),
     ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
     ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
     ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
-    ("docs/gap_results.md", "blind", table_blind_check.table, "blind-check"),
-    ("docs/history.md", "blind_sets", spent_sets.table, "blind-check"),
+    ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("README.md", "kernels", table_speed.kernels_short, "bench"),
     ("docs/benchmarks.md", "kernels", table_speed.kernels, "bench"),
     ("docs/benchmarks.md", "smoothing", table_speed.smoothing, "bench"),
@@ -199,13 +116,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/robots_results.md", "robots_check", table_robots.check, "robots-check"),
     ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
     ("docs/sequences.md", "sequences", table_sequences.table, "sequences"),
-    ("docs/before_after.md", "before_after", before_after.table, "before-after"),
 )
-
-
-def targets() -> str:
-    """docs/architecture.md: what each make target makes."""
-    return provenance.table((page, name, target) for page, name, _, target in TABLES)
 
 
 def fill(text: str, name: str, table: str) -> str:
@@ -217,13 +128,12 @@ def fill(text: str, name: str, table: str) -> str:
 
 
 def main() -> None:
-    pages = [(page, name, make) for page, name, make, _ in TABLES]
-    for file, name, make in [*pages, ("docs/architecture.md", "targets", targets)]:
+    for file, name, make, _ in TABLES:
         table, path = make(), ROOT / file
         if table is not None:
-            path.write_text(fill(path.read_text(encoding="utf-8"), name, table), encoding="utf-8")
+            whole = fill(path.read_text(encoding="utf-8"), name, table) if name else as_csv(table)
+            path.write_text(whole, encoding="utf-8")
             print(f"{file}: {name}")
-    stamps.main()
 
 
 if __name__ == "__main__":

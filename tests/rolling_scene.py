@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from experiments.boundary_worlds import WORLDS, trials_of
+from experiments.worlds import WORLDS, trials_of
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Noise, Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, ROLL, Trial

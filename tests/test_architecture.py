@@ -12,7 +12,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TREES = ("hmmseg", "estimation", "simgap", "hmmseg_cli", "experiments", "paper_figs", "tests")
 PATH = re.compile(rf"(?<![\w/.])((?:{'|'.join(TREES)})/[\w/]+\.(?:py|json|toml|j2|html))\b")
-HISTORY = {"history.md"}  # tells of files as they were
 
 
 def defined(path: Path) -> set[str]:
@@ -40,8 +39,7 @@ def test_every_type_stands_where_the_page_says(name, file):
     assert name in defined(ROOT / file)
 
 
-# History tells of files as they were.
-@pytest.mark.parametrize("page", [p for p in PAGES if p.name not in HISTORY], ids=lambda path: path.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_files_that_pages_name_are_there(page):
     named = set(PATH.findall(page.read_text(encoding="utf-8")))
     assert {file for file in named if "NAME" not in file and not (ROOT / file).exists()} == set()

@@ -30,9 +30,9 @@ from estimation.sampler import (
     independence_move,
     split_rhat,
 )
-from experiments.bank import SEED, simulated_cases
 from experiments.recordings import Case
 from experiments.saving import save
+from experiments.worlds import SEED, simulated_cases
 from hmmseg.segmentation.align import align
 
 RESULTS = Path(__file__).parents[1] / "results"

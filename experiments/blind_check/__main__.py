@@ -1,7 +1,6 @@
 """The blind check of `hmmseg diagnose` on a second simulator's recordings.
 
     python -m experiments.blind_check generate --cases 300 --seed S --out DIR [--outside FILE.py]
-    python -m experiments.blind_check untidy --trials 4 --seed S --out DIR
     python -m experiments.blind_check open --cases 40 --seed S --out DIR [--tiers healthy single ...]
     python -m experiments.blind_check diagnose --cases DIR/cases --out RESULTS
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
@@ -38,10 +37,6 @@ def main(args: Sequence[str] | None = None) -> int:
     make.add_argument("--seed", type=int, required=True)
     make.add_argument("--out", type=Path, required=True)
     make.add_argument("--fastest", type=float, default=float("inf"), help="no world samples faster [Hz]")
-    hands = steps.add_parser("untidy")
-    hands.add_argument("--trials", type=int, default=4)
-    hands.add_argument("--seed", type=int, required=True)
-    hands.add_argument("--out", type=Path, required=True)
     plain = steps.add_parser("open")
     plain.add_argument("--cases", type=int, default=40)
     plain.add_argument("--tiers", nargs="+", default=["healthy"], choices=sorted(TIERS))
@@ -58,7 +53,7 @@ def main(args: Sequence[str] | None = None) -> int:
     judge.add_argument("--json", type=Path, default=RESULTS)
     judge.add_argument("--only", nargs="+", default=[], help="cases FROM:TO only: a run that was cut short")
     given = parser.parse_args(args)
-    step = {"generate": _generate, "untidy": _untidy, "open": _open, "diagnose": _diagnose, "score": _score}
+    step = {"generate": _generate, "open": _open, "diagnose": _diagnose, "score": _score}
     return step[given.step](given)
 
 
@@ -73,13 +68,6 @@ def _generate(given: argparse.Namespace) -> int:
     print(
         generate(given.cases, given.seed, given.out, tell, outside_of(given.outside), fastest=given.fastest)
     )
-    return 0
-
-
-def _untidy(given: argparse.Namespace) -> int:
-    from experiments.blind_check.untidy_trials import write_untidy
-
-    print("\n".join(write_untidy(given.out, given.trials, given.seed)))
     return 0
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.blind_check import untidy
 from experiments.blind_check.profiles import PROFILES, Profile
 from experiments.blind_check.scene import PAD, PIVOT, STEP, TIP, Block, Servo, World
 from experiments.blind_check.tasks import GROUND, Task
@@ -28,9 +27,8 @@ class Style:
     [s] by which one finger closes and opens before the other; the fingers' heights differ by `uneven` [m].
 
     Of the lab: `profile` of motions, servo `stiffness` [N/m], whether the task is worked to the left
-    (`mirrored`). `roll` [rad], rms, turns both fingers about the grip while they carry. `untidy` names what
-    else happens (untidy.py). The first names and meanings are those of the operator settings that a next
-    experiment carries.
+    (`mirrored`). `roll` [rad], rms, turns both fingers about the grip while they carry. The first names
+    and meanings are those of the operator settings that a next experiment carries.
     """
 
     pace: tuple[float, float] = (0.9, 1.15)
@@ -49,7 +47,6 @@ class Style:
     profile: str = "minimum_jerk"
     mirrored: bool = False
     roll: float = 0.0
-    untidy: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -210,20 +207,16 @@ def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffnes
     k.to(u(0.5, 0.65) / pace, early=0.1 / pace, x=start[0] + u(-0.0006, 0.0006))
     k.add("left", k.now, 0.4 / pace, wide / 2)
     k.add("right", k.now, 0.4 / pace, wide / 2)
-    untidy.before_grip(k, style, start[1] + grasp, pace)
     k.to(u(0.45, 0.6) / pace, early=0.02 / pace, y=start[1] + grasp)
     k.wait(u(*style.dwell))
     grip = u(*style.grip)
     inwards = grip * (1 / stiffness + 1 / world.normal_stiffness)
-    untidy.tap(k, style, block.width, wide, inwards, pace)
     closed = k.now
     way = float(k.rng.choice([-1.0, 1.0]))
     k.fingers(u(0.2, 0.28) / pace, block.width - 2 * inwards, way * u(*style.stagger))
     k.wait(u(*style.hold) / pace)
-    untidy.held_on_ground(k, style)
     clear = max(start[1], top + block.height / 2) + CLEAR - 0.004 + grasp
     k.to(u(0.42, 0.55) / pace, y=clear)
-    untidy.carried(k, style, block.width, inwards)
     k.to(u(0.5, 0.65) / pace, early=u(0.0, 0.08) / pace, x=end[0])
     sag = block.weight / 2 * (1 / stiffness + 1 / world.shear_stiffness)
     touch = end[1] + grasp + sag

@@ -58,7 +58,6 @@ class World:
     mass_offset: float = 0.0
     cable: tuple[float, float, float] = (0.0, 0.0, 0.0)
     drag: float = 0.0
-    touches_table: bool = False
 
     def pads(self) -> tuple[float, float, float, float]:
         """Stiffnesses [N/m]: normal and shear of finger 1, then of finger 2."""
@@ -97,8 +96,6 @@ def mjcf(
                 # The wider of two blocks stands with its face on the other's upper corners.
                 pairs += [_pair(f"top{k}_{other}", f"box_{n}", rubs) for k in (1, 2)]
         pairs += [_pair(f"tip{i}{e}", f"box_{n}", world.pad_friction) for i in (1, 2) for e in "ab"]
-    if world.touches_table:
-        pairs += [_pair(f"tip{i}b", "table", 0.5) for i in (1, 2)]
     motors = "".join(
         f'<position joint="{axis}{i + 1}" kp="{s.stiffness:.12g}" kv="{s.damping:.12g}"/>'
         for i, s in enumerate(servos)

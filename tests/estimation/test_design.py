@@ -11,7 +11,7 @@ from estimation.moments import unexpected_bias
 from estimation.nuisance import UNLIKE
 from estimation.observations import aligned_weights
 from estimation.posterior import posterior
-from experiments.bank import simulated_cases
+from experiments.worlds import simulated_cases
 from hmmseg.io.rig import Fingertip, Rig, Systematic
 from hmmseg.segmentation.align import align
 

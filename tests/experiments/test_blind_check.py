@@ -21,7 +21,6 @@ from experiments.blind_check.scene import PIVOT, STEP, Block, Servo, World, mjcf
 from experiments.blind_check.sealing import BrokenSeal, unseal  # noqa: E402
 from experiments.blind_check.signals import Sampling, sample, sense  # noqa: E402
 from experiments.blind_check.tasks import TASKS  # noqa: E402
-from experiments.blind_check.untidy_trials import rows as untidy_rows  # noqa: E402
 from experiments.blind_check.worlds import draw_world, world_of  # noqa: E402
 from hmmseg.io.rig import read_rig  # noqa: E402
 from hmmseg.io.task import read_task  # noqa: E402
@@ -215,19 +214,6 @@ def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
         assert both[touch + 1] and not both[: touch - 1].any()
     pushed = lambda m: abs(m.centres[np.searchsorted(m.t, m.boundaries[0]), 0, 0] - m.centres[0, 0, 0])  # noqa: E731
     assert pushed(together) < 3e-4 < 8e-4 < pushed(apart)
-
-
-def test_untidy_hands_do_what_their_row_says():
-    rng = np.random.default_rng(2)
-    found = {}
-    for kind in ("tap", "still"):
-        lab, style, world = untidy_rows()[kind]
-        w = world(lab.world())
-        found[kind] = perform(plan(TASK, BLOCKS, w, style(lab.style()), rng), BLOCKS, w)
-    tapped = found["tap"]
-    early = tapped.t < tapped.boundaries[0] - 0.05
-    assert tapped.force[early, 0].max() > 0.1  # touched before the grip that counts
-    assert found["still"].boundaries[2] - found["still"].boundaries[1] > 10.0
 
 
 def test_sets_are_drawn_alike_and_keep_their_shares():

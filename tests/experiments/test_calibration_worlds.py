@@ -6,8 +6,8 @@ import pytest
 from experiments.calibration_worlds import BIAS, ROWS, _coloured, _told, task_of
 from experiments.sbc import DRAWS, design_of, drawn
 from experiments.sbc import summary as rank_summary
-from experiments.sweeps.trials import scene
 from experiments.world_scores import clustered, summary
+from experiments.worlds import scene
 from hmmseg.contact.decompose import decompose
 from hmmseg.io.trial import Trial
 

@@ -1,11 +1,8 @@
 """Other robots' logs: verdicts that the docs show, on a small sample of them."""
 
-import numpy as np
-import pandas as pd
 import pytest
 
-from experiments.real import collins_alike, contactnets, robot_gap
-from simgap.robot_effects.readout_pose import rotated
+from experiments.real import contactnets, robot_gap
 
 FOUR = [
     "xl330_kp100_sin_sin",
@@ -43,29 +40,3 @@ def test_tosses_tell_the_scale_on_which_they_are_read(shared):
     assert -0.026 < low < high < -0.017
     assert found["remainder"]["regimes"]["bodies move in contact"] > 0.2
     assert found["shrinkage"]["rms"]["z"]["after"] < 0.4 * found["shrinkage"]["rms"]["z"]["before"]
-
-
-@pytest.mark.slow
-def test_real_trials_show_no_gap_against_real_trials(shared):
-    """Random halves of an arm's trials, each begun by hand: no false alarm."""
-    found = collins_alike.run(shared / "real/collins")
-    assert found["false_alarms"] == 0 and len(found["p_values"]) == found["splits"] == 20
-
-
-def test_shifts_and_offsets_of_trials_are_found():
-    """The same course, started at other times and seen through markers set elsewhere, becomes one course."""
-    t, rng = np.arange(0.2, 24.0, 0.05), np.random.default_rng(1)
-    frames, begun = [], rng.uniform(-0.3, 0.3, 4)
-    for shift in begun:
-        angle = 0.5 * np.sin(0.7 * (t - shift))
-        turn = np.array([np.cos(angle / 2), 0 * t, 0 * t, np.sin(angle / 2)])
-        place = np.array([np.cos(angle), np.sin(angle), 0.1 * np.cos(angle)])
-        place = place + rotated(turn, rng.normal(0, 0.004, 3))
-        frames.append(
-            pd.DataFrame(
-                {"t": t, **dict(zip(collins_alike.PLACE + collins_alike.TURN, [*place, *turn], strict=True))}
-            )
-        )
-    places, _, shifts = collins_alike.aligned(frames)
-    assert np.std(np.array(places), 0).max() < 2e-4
-    np.testing.assert_allclose(shifts - shifts.mean(), begun - begun.mean(), atol=2e-3)

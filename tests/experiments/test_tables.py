@@ -1,17 +1,21 @@
 """Tables written into documents; the bank's deviating hands and the summaries of estimates."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from experiments.bank import Deviations, deviated, nominal, simulated_cases
 from experiments.estimates import Estimates, summarise_estimates
 from experiments.patch_heldout import table as patched
-from experiments.table_blind_check import fresh
-from experiments.table_misfits import misfits
+from experiments.table_gap import fresh
 from experiments.table_real import real
-from experiments.table_text import covered, markdown
-from experiments.write_tables import fill
+from experiments.table_text import as_csv, covered, markdown
+from experiments.worlds import Deviations, deviated, scene, simulated_cases
+from experiments.write_tables import TABLES, fill
 from hmmseg.hand.signals import task_space
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_fill_replaces_what_stands_between_the_markers():
@@ -21,6 +25,32 @@ def test_fill_replaces_what_stands_between_the_markers():
     assert fill(once, "x", "| new \\1 |") == once
     with pytest.raises(ValueError, match="no markers <!-- z -->"):
         fill(text, "z", "table")
+
+
+def test_every_table_has_what_writes_it_and_a_target():
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    marked = {
+        (str(page.relative_to(ROOT)), name)
+        for page in pages
+        for name in re.findall(r"^<!-- (\w+) -->$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert marked - {("docs/reproduction.md", "results")} == {
+        (page, name) for page, name, *_ in TABLES if name
+    }
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in {target for *_, target in TABLES}:
+        assert re.search(rf"^{target}: ", makefile, re.MULTILINE), target
+    for module in re.findall(r"python -m ((?:experiments|paper_figs)[\w.]*)", makefile):
+        path = ROOT / Path(*module.split("."))
+        assert path.with_suffix(".py").is_file() or (path / "__main__.py").is_file(), module
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
+    shown = [*(ROOT / "docs/figures").iterdir(), *(ROOT / "docs/tables").iterdir()]
+    assert [path.name for path in shown if f"{path.parent.name}/{path.name}" not in text] == []
+
+
+def test_a_table_becomes_comma_separated_values():
+    text = "### Pooled\n\n" + markdown(["a", "b"], [["1, 2", "`c`"]]) + "\n\nnote"
+    assert as_csv(text) == 'Pooled\na,b\n"1, 2",c\nnote\n'
 
 
 def test_markdown_and_coverage():
@@ -55,17 +85,6 @@ def test_real_recordings_stand_beside_the_predictor_without_ears(monkeypatch):
     assert real() is None
 
 
-def test_misfits_say_alarms_and_shares_found(monkeypatch):
-    quiet = {"trials": 50, "false_alarms": 1, "false_alarms_pooled": 0}
-    edit = {"trials": 46, "alone": {"detected": 1.0, "right_subtask": 0.9}, "pooled": None}
-    found = {"recordings": quiet, "simulated": {"tower": {"trials": 24, "false_alarms": 2}},
-             "edits": {"swapped": edit}, "edits_simulated": {"swapped": edit}}  # fmt: skip
-    monkeypatch.setattr("experiments.table_misfits.load", {"misfits": found}.get)
-    table = misfits() or ""
-    assert "| recordings, each alone | 50 | 1 |" in table and "| simulated: tower | 24 | 2 |" in table
-    assert "| block 2 before block 1 | 46 | 100 %, 90 % |  | 100 %, 90 % |" in table
-
-
 def test_coverages_have_clusters_as_their_units():
     names = (("block", "weight"), ("block", "width"))
 
@@ -95,14 +114,14 @@ def trial():
 
 
 def test_a_hand_without_deviations_records_the_same(trial):
-    rig, _ = nominal()
+    rig, _ = scene()
     again = deviated(trial, rig, hand())
     for name, values in trial.channels.items():
         np.testing.assert_allclose(again.channels[name], values, atol=1e-9)
 
 
 def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):
-    rig, _ = nominal()
+    rig, _ = scene()
     changed = deviated(trial, rig, hand(link_length=0.01, joint_offset=0.002))
     true = {
         i: f.model_copy(update={"links": tuple(1.01 * x for x in f.links)}) for i, f in rig.fingers.items()
@@ -115,7 +134,7 @@ def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):
 
 
 def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
-    rig, _ = nominal()
+    rig, _ = scene()
     changed = deviated(trial, rig, hand(force_gain=0.1, force_bias=0.05, pad_stiffness=1.0))
     np.testing.assert_allclose(changed.channels["fx1"], 1.1 * trial.channels["fx1"] + 0.05)
     before, after = task_space(trial, rig), task_space(changed, rig)
@@ -126,7 +145,7 @@ def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
 
 def test_a_spent_blind_set_is_no_result(monkeypatch):
     seals = {"blind_check": {"seal": {"sha256": "a"}}, "blind_sets": {"sets": [{"seal": "a"}]}}
-    monkeypatch.setattr("experiments.table_blind_check.load", seals.get)
+    monkeypatch.setattr("experiments.table_gap.load", seals.get)
     assert fresh() is None
     seals["blind_sets"] = {"sets": [{"seal": "b"}]}
     assert fresh() is seals["blind_check"]

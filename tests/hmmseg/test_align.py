@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.bank import nominal, simulated_cases
-from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.recordings import read_case
-from experiments.sweeps.trials import scene
+from experiments.worlds import WORLDS, scene, simulated_cases, trials_of
 from hmmseg.io.rig import Fingertip, Noise, Rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
@@ -113,7 +111,7 @@ def test_pooling_shares_parameters_and_keeps_trials_apart():
 
 
 def test_one_object_picked_and_placed():
-    rig, _ = nominal()
+    rig, _ = scene()
     task = BlockTask({"block": "ground"}, (Move("block", "ground"),))
     s = simulate_trials(task, rig, [random_properties(task, 20_960)], [20_960])[0]
     segmentation = segment([s.trial], task, rig)[0]

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from experiments import calibration_worlds
-from experiments.boundary_worlds import WORLDS, World, trials_of
 from experiments.calibration_worlds import ROWS, replicates
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import list_cases, read_case
-from experiments.sweeps.cells import Cell
-from experiments.sweeps.trials import scene
+from experiments.worlds import WORLDS, Cell, World, scene, trials_of
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move

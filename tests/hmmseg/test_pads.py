@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.boundary_worlds import WORLDS, World, trials_of
-from experiments.sweeps.cells import Cell
-from experiments.sweeps.trials import scene
+from experiments.worlds import WORLDS, Cell, World, scene, trials_of
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import Parameters

@@ -12,9 +12,8 @@ from rolling_scene import rolling_trial
 import estimation.identification
 import hmmseg.segmentation.posteriors
 from estimation import identify
-from experiments.boundary_worlds import WORLDS, trials_of
 from experiments.scoring import boundaries_covered, boundary_residuals
-from experiments.sweeps.trials import scene
+from experiments.worlds import WORLDS, scene, trials_of
 from hmmseg.contact.decompose import subtasks
 from hmmseg.contact.equations import corner_drop, pads_of, rolled_offset, turned
 from hmmseg.errors import InputError
