@@ -10,7 +10,7 @@ WRONG = 0.05  # prior: share by which a measured property may be off
 
 
 def _wrong(given, push: np.ndarray) -> list:
-    """A candidate for each property that was measured apart, where it shows in the residual."""
+    """A candidate for each property that was measured apart."""
     from simgap.attribution.problem import Candidate
     from simgap.gap.tolerance import properties_tolerated
 
@@ -18,7 +18,7 @@ def _wrong(given, push: np.ndarray) -> list:
     for o, name in enumerate(given.frame.task.objects):
         for k, kind in enumerate(("weight", "width", "height")):
             column = push[:, 3 * o + k]
-            if given.measured[o, k] and (column**2).sum() > 1.0:
+            if given.measured[o, k]:
                 usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.sd[o, k])
                 out.append(Candidate(EFFECT.name, (f"{name}.{kind}",), nothing, nothing, usual,
                                      np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),

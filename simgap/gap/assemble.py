@@ -20,6 +20,8 @@ from simgap.gap.tolerance import tolerated
 from simgap.gap.trial_arrays import CHANNELS
 from simgap.phases import Phase
 
+SHOWN = 1.0  # chosen: squared residual [noise's] of a measured property's sd, above which it shows at all
+
 
 def rows_of(given: Problem) -> Rows:
     """What each residual is, cells in the order of time."""
@@ -43,14 +45,15 @@ def gap_of(
     rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
     usual = given.frame.rig.tolerance == Tolerance()
     scattering, tolerance = [_scattering(s, rows) for s in scatters], tolerated(given)
+    # Which properties show is decided here alone: with more noise on the recordings others might.
+    seen = {c.parameters for c in _measured(given, healthy) if np.square(c.jacobian).sum() > SHOWN}
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
         k = problem.num_properties
         start = healthy.residual - healthy.push @ healthy.u[:k]
         nuisance = np.concatenate([-healthy.push, problem.nuisances.columns], 1)
         shifting = [_shifting(problem, f, start, healthy.push) for f in fits]
-        wrong = [e.wrong for e in catalogue().values() if e.wrong is not None]
-        measured = [c for candidates in wrong for c in candidates(problem, healthy.push)]
+        measured = [c for c in _measured(problem, healthy) if c.parameters in seen]
         every = (*shifting, *scattering, *measured)
         return Gap(rows, start, nuisance, every, tolerance=tolerance, usual=usual)
 
@@ -63,6 +66,12 @@ def gap_of(
         lambda other: at(other, on_other(other, healthy), [on_other(other, f) for f in fits]).raw_columns,
     )
     return replace(gap, carried=noise)
+
+
+def _measured(given: Problem, healthy: Fitted) -> list[Candidate]:
+    """A candidate for each property that was measured apart."""
+    wrong = [e.wrong for e in catalogue().values() if e.wrong is not None]
+    return [c for candidates in wrong for c in candidates(given, healthy.push)]
 
 
 def together(

@@ -15,6 +15,7 @@ from hmmseg.segmentation.align import align
 from simgap.attribution.noise_products import of_noise, products
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, Rows, spectrum
+from simgap.gap.assemble import SHOWN, gap_of
 from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
@@ -136,6 +137,22 @@ def test_pads_that_swallow_noise_gain_what_they_swallow(given):
     others = redrawn(given)
     assert noise_gained(others, healthy, stiff) > 1.0
     assert noise_gained(others, healthy, healthy) == 0.0
+
+
+@double_precision
+@pytest.mark.parametrize("shown", [0.9999, 1.0001])
+def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(given, shown):
+    """Each is as visible as one may be without being a candidate, or as one must be."""
+    healthy = fit(given, Start((), neutral(given)))
+    size = np.sqrt(SHOWN * shown / np.square(healthy.push).sum(0)).reshape(given.sd.shape)
+    measured = replace(given, sd=given.sd * size, measured=np.ones_like(given.measured))
+    healthy = fit(measured, Start((), healthy.u))
+    size = np.sqrt(SHOWN * shown / np.square(healthy.push).sum(0)).reshape(given.sd.shape)
+    measured = replace(measured, sd=measured.sd * size)
+    gap = gap_of(measured, replace(healthy, push=healthy.push * size.ravel()), [], (), redrawn(measured))
+    names = [p for c in gap.candidates for p in c.parameters]
+    assert gap.carried is not None and gap.carried.shape[2] == gap.raw_columns.shape[1]
+    assert len(names) == (given.sd.size if shown > 1 else 0)
 
 
 def test_where_noise_does_not_act_in_proportion_nothing_is_said():
