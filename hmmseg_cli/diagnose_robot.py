@@ -106,7 +106,8 @@ def diagnose_robot(
 
         simulator = load_simulator(own.simulator)
         wanted = list(simulator.channels)
-        recordings = [read_recording(path, wanted) for path in paths]
+        commands = [name for name, channel in simulator.channels.items() if channel.kind == "command"]
+        recordings = [read_recording(path, wanted, commands=commands) for path in paths]
         at_risk = simulator
         inputs = [own.simulator.encode(), *modules_beside(Path(own.simulator.rpartition(":")[0]))]
     else:
@@ -119,6 +120,9 @@ def diagnose_robot(
         inputs = [loaded.digest, *(name.encode() for name in own.candidates)]
         more = loaded.effects(recordings)
         for warning in loaded.warnings:
+            out.warn(warning)
+    for recording in recordings:
+        for warning in recording.warnings:
             out.warn(warning)
     phases = None
     if task is not None:

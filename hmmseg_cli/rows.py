@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.formats.delimited import units_of
-from hmmseg.io.units import LARGEST, si_factor
+from hmmseg.io.units import LARGEST, LATEST, si_factor
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
@@ -90,8 +90,10 @@ class Rows:
         if not self._plain:
             values = [s * v + o for v, (s, o) in zip(values, self._scales, strict=True)]
         for i, value in enumerate(values):
-            if i and abs(value) > LARGEST:
+            if abs(value) > (LARGEST if i else LATEST):
                 where = f"{WHERE}: row {self._number}, column {self._names[self._picked[i]]}"
+                if not i:
+                    raise InputError(where, f"{value:.3g} is no time", "a time in s")
                 problem = f"{value:.3g} is no reading of a hand's sensor"
                 raise InputError(where, problem, f"at most {LARGEST:.0g} in SI units")
         return values[0], values[1:]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hmmseg.errors import InputError
 from hmmseg.hand.axes import check_axes
 from hmmseg.hand.force_units import check_noise
 from hmmseg.hand.gripper_signs import check_gripper
@@ -17,6 +16,7 @@ from hmmseg.io.plausibility import (
     check_forces,
     check_lengths,
     check_velocities,
+    judged,
 )
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
@@ -44,10 +44,4 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
 
 def check(trial: Trial, rig: Rig) -> tuple[str, ...]:
     """Warnings about a trial; InputError for what cannot be."""
-    warnings = []
-    for finding in findings(trial, rig):
-        where = f"{trial.file}: column {finding.channel}"
-        if finding.certain:
-            raise InputError(where, finding.problem, finding.remedy)
-        warnings.append(f"{where} {finding.problem}; expected {finding.remedy}")
-    return tuple(warnings)
+    return judged(trial, findings(trial, rig))

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.io.columns import Column
 from hmmseg.io.formats import parts_of, read_table
 from hmmseg.io.propose import as_toml, mended, propose
 from hmmseg.io.propose_gripper import propose_gripper
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table, numbers, times
-from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS
+from hmmseg.io.table import Table, numbers
+from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS, mapped_times
 from hmmseg.io.units import unit_in_name
 from hmmseg.levels import GAP
 
@@ -71,6 +72,7 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
     entries, said = mended(table, entries, rig)
+    said = [*table.notes, *_lengths(table), *said]
     toml = as_toml(entries, table) if entries else ""
     if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
         toml = propose_gripper(table, entries) or toml
@@ -90,25 +92,25 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     )  # fmt: skip
 
 
+def _lengths(table: Table) -> list[str]:
+    """What is said of columns of another length than most."""
+    by_length: dict[int, list[str]] = {}
+    for name, values in table.columns.items():
+        by_length.setdefault(len(values), []).append(name)
+    return [f"{', '.join(names)}: {length} rows, not {table.rows.size} as the others: not read together"
+            for length, names in by_length.items() if length != table.rows.size]  # fmt: skip
+
+
 def _clock(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None
            ) -> tuple[np.ndarray | None, int | None]:  # fmt: skip
     """Times [s] as the proposal or the rig has them; None where the file has none that can be used."""
-    from hmmseg.io.columns import Column
-    from hmmseg.io.units import si_factor
-
-    mapped = Column.model_validate(entries["t"]) if "t" in entries else None
-    if mapped is None and rig is not None and not table.messages:
-        mapped = rig.columns.get("t")
-    source = "t" if mapped is None or mapped.source is None else mapped.source
-    if source not in table.columns:
-        return None, None
+    rig = rig or Rig()
+    if "t" in entries:
+        rig = rig.model_copy(update={"columns": {**rig.columns, "t": Column.model_validate(entries["t"])}})
     try:
-        t, origin = times(table, source)
+        return mapped_times(table, rig)
     except InputError:
         return None, None
-    unit = mapped.unit if mapped is not None and mapped.unit is not None else table.units.get(source, 1.0)
-    t = t * si_factor(unit) + (0.0 if mapped is None else mapped.offset)
-    return t[np.isfinite(t)], origin
 
 
 def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
@@ -117,7 +119,7 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
     try:
         values = numbers(table, name)
     except InputError:
-        return Channel(name, unit, None, table.rows.size, 0, 0, None, None, (), text=True)
+        return Channel(name, unit, None, len(table.columns[name]), 0, 0, None, None, (), text=True)
     there = values[np.isfinite(values)]
     rate = table.rates.get(name)
     if rate is None and t is not None and t.size > 2 and t[-1] > t[0]:

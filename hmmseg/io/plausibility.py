@@ -14,11 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from hmmseg.errors import InputError
 from hmmseg.io.columns import Column
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
+FASTEST = 2e4  # limit: [Hz]; of what a hand's or a robot's sensors are read at
+ANY_FASTEST = 1e7  # limit: [Hz]; of any recording of things that move
 REACH = 3.0  # limit: [m]
 WEAKEST, STRONGEST = 0.02, 1000.0  # limit: [N] of a grip
 STILL = 2e-4  # limit: [m]: travel of a hand that moved nothing
@@ -86,26 +89,55 @@ def all_changed(channels: Iterable[str], rig: Rig | None, **change: Any) -> dict
     return {name: fields for each in channels for name, fields in changed(each, rig, **change).items()}
 
 
-def check_clock(trial: Trial, rig: Rig | None) -> list[Finding]:
-    """Times in ms, us or ns: by `rate` of the rig, or because no hand is sampled so slowly."""
+def check_clock(trial: Trial, rig: Rig | None, moving: bool = True) -> list[Finding]:
+    """Times in ms, us or ns: by `rate` of the rig, by a date, or because no hand is sampled so slowly.
+
+    `moving`: of a hand or a robot; other recordings may be slow, and are warned of where times are whole.
+    """
     period = float(np.median(np.diff(trial.t)))
     stated = None if rig is None else rig.rate
-    unit = None
+    unit, certain = None, True
     for name, size in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
         if stated is not None and 0.5 < period * size * stated < 2:
             unit = name
+        if YEAR_1990 < trial.t[0] * size < YEAR_2100:
+            unit = name
     if unit is None and period > 1 / SLOWEST:
         unit = "ms" if period < 500 else "us" if period < 5e5 else "ns"
+        certain = moving
+        if not moving and (trial.t != np.round(trial.t)).any():
+            unit = None
+    if unit is None and 1 / period > (FASTEST if moving else ANY_FASTEST):
+        problem = f"is sampled at {1 / period:.2g} Hz if it is in s, and nothing moves so fast"
+        size = 1e3 ** np.ceil(np.log(1 / FASTEST / period) / np.log(1e3))
+        return [Finding("t", problem, changed("t", rig, unit=float(size)))]
     if unit is not None:
         problem = f"is sampled at {1 / period:.2g} Hz if it is in s"
         if stated is not None:
             problem += f", but rate = {stated:g} in rig.toml"
-        return [Finding("t", f"{problem}: it looks like {unit}", changed("t", rig, unit=unit))]
-    if YEAR_1990 < trial.t[0] < YEAR_2100:
+        return [Finding("t", f"{problem}: it looks like {unit}", changed("t", rig, unit=unit), certain)]
+    found = []
+    if stated is not None and abs(np.log(period * stated)) > SAME:
+        problem = f"is sampled at {1 / period:.4g} Hz, but rate = {stated:g} in rig.toml, which is not used"
+        found.append(Finding("t", problem, {}, certain=False))
+    if moving and YEAR_1990 < trial.t[0] < YEAR_2100:
         date = np.datetime64(int(trial.t[0]), "s")
         problem = f"counts seconds since 1970 (from {date}), and so will all results"
-        return [Finding("t", problem, changed("t", rig, offset=-float(np.floor(trial.t[0]))), certain=False)]
-    return []
+        change = changed("t", rig, offset=-float(np.floor(trial.t[0])))
+        found.append(Finding("t", problem, change, certain=False))
+    return found
+
+
+def judged(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
+    """Warnings about a trial; InputError for what cannot be."""
+    warnings = []
+    for finding in findings:
+        where = f"{trial.file}: column {finding.channel}"
+        if finding.certain:
+            raise InputError(where, finding.problem, finding.remedy)
+        remedy = f"; expected {finding.remedy}" if finding.changes else ""
+        warnings.append(f"{where} {finding.problem}{remedy}")
+    return tuple(warnings)
 
 
 def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:

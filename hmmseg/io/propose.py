@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from hmmseg.io.columns import Column
 from hmmseg.io.plausibility import entry_text
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers
-from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, trial_of
+from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial, mapped_times, trial_of
 from hmmseg.io.units import UNITS, known_unit, measures, unit_in_name
 
 TIME = ("t", "time", "timestamp", "stamp", "timestamps", "sec", "seconds", "clock", "times", "zeit",
@@ -71,6 +72,7 @@ def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = N
     judged only with its rig.
     """
     from hmmseg.hand.plausibility import findings  # which reads trials itself
+    from hmmseg.io.plausibility import check_clock
 
     rig = rig or Rig()
     said: list[str] = []
@@ -79,10 +81,13 @@ def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = N
         where = "topics" if table.messages else "columns"
         hand = rig.model_copy(update={where: {**getattr(rig, where), **mapping}})
         try:
-            trial = trial_of(table, hand, None)
-        except InputError:
-            return entries, said  # not a hand's recording, or not all of it
-        found = findings(trial, hand)
+            found = findings(trial_of(table, hand, None), hand)
+        except InputError:  # not a hand's recording, or not all of it: its clock alone
+            try:
+                clock = Trial(table.file, mapped_times(table, hand)[0], {})
+            except InputError:
+                return entries, said
+            found = [replace(f, certain=True) for f in check_clock(clock, hand, moving=False) if f.changes]
         said += [line for f in found if (line := f"{f.channel} {f.problem}") not in said]
         fresh = {k: v for f in found if f.certain or f.channel == "t" for k, v in f.changes.items()}
         if not fresh or all(entries.get(name) == fields for name, fields in fresh.items()):

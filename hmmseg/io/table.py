@@ -19,7 +19,8 @@ class Table:
     `names` are all that the file has; `rows` (num_rows,) numbers the rows as an editor does;
     `units` are those that the file itself states. `origin` is where t = 0 lies in ns since 1970
     (logs), `interpolated` marks by column what lies between two messages, and `rates` [Hz] are
-    those of the messages.
+    those of the messages. `notes` say what of the file was left out. Columns may differ in length, as a
+    demonstration has more states than actions; `rows` are those of most.
     """
 
     file: str
@@ -31,17 +32,14 @@ class Table:
     interpolated: dict[str, np.ndarray] = field(default_factory=dict)
     messages: bool = False
     rates: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def plain_table(file: str, columns: dict[str, np.ndarray], names: Sequence[str] | None = None) -> Table:
-    """A table whose rows count from 1; InputError where columns differ in length."""
+    """A table whose rows count from 1, as many as most of its columns have."""
     columns = flat(columns)
-    lengths = {name: len(values) for name, values in columns.items()}
-    if len(set(lengths.values())) > 1:
-        other = min(lengths, key=lambda name: sum(n == lengths[name] for n in lengths.values()))
-        usual = max(set(lengths.values()), key=list(lengths.values()).count)
-        raise InputError(f"{file}: column {other}", f"has {lengths[other]} rows", f"{usual} as in the others")
-    count = next(iter(lengths.values()), 0)
+    lengths = [len(values) for values in columns.values()]
+    count = max(lengths, key=lengths.count, default=0)
     return Table(file, tuple(names if names is not None else columns), columns, np.arange(1, count + 1))
 
 

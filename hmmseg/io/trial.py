@@ -16,14 +16,13 @@ from hmmseg.io.frames import frame_table
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers, times
 from hmmseg.io.task import SequenceTask, Task
-from hmmseg.io.units import LARGEST, si_factor
+from hmmseg.io.units import LARGEST, LATEST, measures, si_factor, unwrapped
 from hmmseg.tables import Tabled
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
 CARTESIAN_OPTIONAL = ("vx1", "vy1", "vx2", "vy2")
 ROLL = "hand_roll"  # of a Cartesian hand whose fingers turn together [rad]; optional
-LATEST = 1e25  # limit: of times before anything is known of their unit; ns since 1970 are 1e18
 MIN_SAMPLES = 8  # limit: fewer show no task
 MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
@@ -119,7 +118,10 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     table = read(source, theirs)
     trial = trial_of(table, rig, task)
     if task is not None or rig is None:
-        return trial
+        from hmmseg.io.plausibility import check_clock, judged
+
+        warnings = judged(trial, check_clock(trial, rig, moving=False))
+        return replace(trial, warnings=(*trial.warnings, *warnings))
     from hmmseg.hand.plausibility import check  # which read trials themselves
     from hmmseg.hand.roll import levelled
     from hmmseg.hand.wrist import from_halves, halved, two_fingers
@@ -130,7 +132,7 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
         trial = two_fingers(trial, rig)
     elif halved(trial):
         trial = from_halves(trial, rig)
-    return replace(trial, warnings=(*warnings, *trial.warnings))
+    return replace(trial, warnings=(*trial.warnings, *warnings))
 
 
 def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:
@@ -140,10 +142,9 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
     """
     names, optional = channels_of(rig, task)
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
+    _check_lengths(table)
     _check_names(table, columns, names, optional, task is not None)
-    stamps, origin = times(table, source_of("t", columns))
-    t = _mapped(stamps, "t", columns, table)
-    _check_times(t, table)
+    t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
     for name in names if names is not None else _every(table, columns):
         theirs_name = source_of(name, columns)
@@ -153,14 +154,26 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
         if task is None:
             _check_size(values, theirs_name, table)
         if not whole or np.isfinite(values).any():
-            channels[name] = values
+            channels[name] = unwrapped(values) if measures(name) == "angle" and task is None else values
         elif name not in optional:  # an optional one without values is as good as absent
             raise InputError(f"{table.file}: column {theirs_name}", "has no values", "at least one number")
     between = {
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
-    return Trial(table.file, t, channels, origin, between)
+    return Trial(table.file, t, channels, origin, between, warnings=table.notes)
+
+
+def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]:
+    """Times (num_rows,) [s], and where their zero lies in ns since 1970; InputError where they cannot be."""
+    columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
+    name = source_of("t", columns)
+    if name not in table.columns:
+        raise InputError(f"{table.file}: column {name}", "missing", f"a column of times in s, {MAPPED}")
+    stamps, origin = times(table, name)
+    t = _mapped(stamps, "t", columns, table)
+    _check_times(t, table)
+    return t, origin
 
 
 def _check_size(values: np.ndarray, name: str, table: Table) -> None:
@@ -215,6 +228,13 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
         raise InputError(f"{where}: column {theirs}", "missing", expected)
     if names is None and len(table.names) < 2:
         raise InputError(where, "has no columns but t", "at least one channel")
+
+
+def _check_lengths(table: Table) -> None:
+    for name, values in table.columns.items():
+        if len(values) != table.rows.size:
+            raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
+                             f"{table.rows.size} as in the others")  # fmt: skip
 
 
 def _mapped(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 from hmmseg.errors import nearest
 
 LARGEST = 1e9  # physics: m, N or rad; no hand's sensor reads as much, and squares of it are far from overflow
+LATEST = 1e25  # limit: of times before anything is known of their unit; ns since 1970 are 1e18
 
 # name: (what it measures, its size in SI)
 UNITS: dict[str, tuple[str, float]] = {
@@ -67,11 +69,21 @@ def measures(channel: str) -> str | None:
 def unit_in_name(name: str) -> str | None:
     """Unit that a column's name ends in: `left_x_mm`, `force [N]`, `t (ms)`."""
     bracketed = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
-    if bracketed:
-        return known_unit(bracketed.group(1))
+    if bracketed:  # `[0]` is the entry of a vector
+        return None if bracketed.group(1).isdigit() else known_unit(bracketed.group(1))
     last = re.split(r"[_. ]", name)
     if len(last) < 2:
         return None
     unit = known_unit(last[-1])
     # a bare letter is rather a name (`joint_s`, `tip_m`) unless it is one that is written so
     return unit if unit is not None and (len(unit) > 1 or unit in ("s", "m", "N")) else None
+
+
+def unwrapped(angles: Any) -> Any:
+    """Angles (num_timesteps,) [rad] without jumps by a whole turn; missing ones stay NaN."""
+    import numpy as np  # which `hmmseg --help` does without
+
+    there = np.isfinite(angles)
+    out = angles.copy()
+    out[there] = np.unwrap(angles[there])
+    return out

@@ -2,8 +2,8 @@
 
 Tables (CSV, Parquet) get columns: `subtask_index` (from 0), `subtask`, `object`, `state`, and
 `boundary_sd`, the standard deviation [s] of the nearer boundary of the sample's span. An MCAP
-gets the topic `/hmmseg/subtask`, one JSON message a boundary. A LeRobot data set gets the feature
-`subtask_index` and `meta/subtasks.parquet`, as its own tools have them.
+gets the topic `/hmmseg/subtask`, one JSON message a boundary. A LeRobot data set gets rows of style
+`subtask` in its `language_persistent`, as its own tools have them, and the feature `boundary_sd`.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def write_mcap(path: Path, source: str | Path, trial: Trial, spans: Sequence[Spa
         writer = Writer(out)
         writer.start(profile="", library="hmmseg")
         file, _ = split_part(source)
-        if kind_of(file) == "mcap":
+        if file.is_file() and kind_of(file) == "mcap":
             with file.open("rb") as original:
                 _copy(make_reader(original), writer)
         schema = writer.register_schema("hmmseg.Subtask", "jsonschema", json.dumps(SCHEMA).encode())
@@ -124,17 +124,15 @@ def _copy(reader: Any, writer: Any) -> None:
 def lerobot_files(folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]]) -> dict[Path, Any]:
     """Files of an annotated copy by their place below its folder, each a function that writes it to a path.
 
-    Episodes that are not labelled have `subtask_index` -1. Videos are not copied.
+    Episodes that are not labelled have no subtasks. Videos are not copied.
     """
-    from hmmseg.io.formats.lerobot import data_files, read_info
+    from hmmseg.io.formats.lerobot import EVENTS, PERSISTENT, data_files, read_info, read_subtasks
 
     info = read_info(folder)
-    names = list(dict.fromkeys(s.label for _, spans in labelled.values() for s in spans))
-    indices = {name: i for i, name in enumerate(names)}
-    feature = {"dtype": "int64", "shape": [1], "names": None}
-    if "subtask_index" in info["features"]:
-        raise InputError(f"{folder}/meta/info.json", "has a feature subtask_index already", "no labels yet")
-    info["features"]["subtask_index"] = feature
+    if "boundary_sd" in info["features"] or read_subtasks(folder):
+        raise InputError(f"{folder}/meta/info.json", "has subtasks already", "no labels yet")
+    for name in (PERSISTENT, EVENTS):
+        info["features"].setdefault(name, {"dtype": "language", "shape": [1], "names": None})
     info["features"]["boundary_sd"] = {"dtype": "float32", "shape": [1], "names": None}
     out: dict[Path, Any] = {}
     for file in sorted((folder / "meta").rglob("*")):
@@ -142,34 +140,25 @@ def lerobot_files(folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Spa
             out[file.relative_to(folder)] = lambda path, file=file: shutil.copyfile(file, path)
     text = json.dumps(info, indent=4)
     out[Path("meta/info.json")] = lambda path: path.write_text(text, encoding="utf-8")
-    out[Path("meta/subtasks.parquet")] = lambda path: _write_names(path, names)
     for file in data_files(folder):
-        out[file.relative_to(folder)] = lambda path, file=file: _write_episodes(path, file, labelled, indices)
+        out[file.relative_to(folder)] = lambda path, file=file: _write_episodes(path, file, labelled)
     return out
 
 
-def _write_names(path: Path, names: Sequence[str]) -> None:
-    import pandas as pd
-
-    frame = pd.DataFrame({"subtask_index": np.arange(len(names))}, index=pd.Index(names, name="subtask"))
-    frame.to_parquet(path)
-
-
-def _write_episodes(path: Path, file: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]],
-                    indices: Mapping[str, int]) -> None:  # fmt: skip
+def _write_episodes(path: Path, file: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    from hmmseg.io.formats.lerobot import EPISODE, with_subtasks
+
     table = pq.read_table(file)
-    episodes = table.column("episode_index").to_numpy()
-    index = np.full(len(episodes), -1, dtype=np.int64)
+    episodes = table.column(EPISODE).to_numpy()
     sd = np.full(len(episodes), np.nan, dtype=np.float32)
+    subtasks = {}
     for number, (trial, spans) in labelled.items():
         rows = episodes == number
-        if rows.sum() != trial.t.size:
-            continue
-        labels = label(trial.t, spans)
-        codes = np.array([*(indices[span.label] for span in labels.spans), -1])
-        index[rows], sd[rows] = codes[labels.index], labels.boundary_sd
-    table = table.append_column("subtask_index", pa.array(index)).append_column("boundary_sd", pa.array(sd))
+        if rows.sum() == trial.t.size:
+            sd[rows] = label(trial.t, spans).boundary_sd
+            subtasks[number] = [(span.start, span.label) for span in spans]
+    table = with_subtasks(table, subtasks).append_column("boundary_sd", pa.array(sd))
     pq.write_table(table, path)

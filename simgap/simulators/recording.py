@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.io.columns import Column
+from hmmseg.io.formats import read_table
+from hmmseg.io.formats.logs import interpolated
+from hmmseg.io.plausibility import check_clock
+from hmmseg.io.rig import Rig
 from hmmseg.io.task import SequenceTask
-from hmmseg.io.trial import read_trial
+from hmmseg.io.trial import MIN_SAMPLES, trial_of
 
 
 @dataclass(frozen=True)
 class Recording:
     """Times `t` (num_timesteps,) [s] and `columns` by name, of the rows `first` and up of a whole log.
 
-    NaN is a missing sample. `recording["q1"]` is a column.
+    NaN is a missing sample. `recording["q1"]` is a column; `warnings` say what its file left out.
     """
 
     name: str
     t: np.ndarray
     columns: Mapping[str, np.ndarray]
     first: int = 0
+    warnings: tuple[str, ...] = ()
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]
@@ -41,32 +48,57 @@ class Recording:
         return replace(self, columns={**self.columns, **columns})
 
 
-def read_recording(path: Path, wanted: Iterable[str], times: str = "t") -> Recording:
-    """Recording from a .csv, .parquet or .npz file with the columns that a simulator needs.
+def read_recording(
+    path: Path, wanted: Iterable[str], times: str = "t", unit: float = 1.0, commands: Collection[str] = ()
+) -> Recording:
+    """Recording from a file of any kind with the columns that a simulator needs.
 
-    `times` is the name of the time column. InputError names the file and the row or column at fault: a
-    column that is missing, a cell that is no number, a clock that goes back.
+    `times` is the name of the time column, `unit` its size [s]; `commands` are held from sample to sample.
+    Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept.
+    InputError names the file and the row or column at fault: a column that is missing, a cell that is no
+    number, a clock that goes back or cannot be in this unit.
     """
     names = tuple(dict.fromkeys(wanted))
-    if times != "t":
-        return _renamed(path, names, times)
-    trial = read_trial(path, task=SequenceTask(("all",), channels=names))
-    return Recording(path.name, trial.t, trial.channels)
+    clock = {"t": Column.model_validate({"from": times, "unit": unit})}
+    rig = Rig.model_construct(columns=clock, topics=clock if times != "t" else {})
+    table = read_table(path, [times, *names])
+    trial = trial_of(table, rig, SequenceTask(("all",), channels=names))
+    for finding in check_clock(trial, None):
+        if finding.certain:
+            remedy = f'{{column = "{times}", unit = {json.dumps(finding.changes["t"]["unit"])}}}'
+            raise InputError(f"{path}: column {times}", finding.problem, f"time = {remedy} in map.toml")
+    found = Recording(path.name, trial.t, trial.channels, warnings=trial.warnings)
+    return _on_one_clock(found, commands)
 
 
-def _renamed(path: Path, names: tuple[str, ...], times: str) -> Recording:
-    import pandas as pd
+def _on_one_clock(log: Recording, commands: Collection[str]) -> Recording:
+    """The rows of the column that is read most often; slower ones are interpolated there as topics of a log
+    are, and commands count as they are held on average until the next row."""
+    rows = {name: np.flatnonzero(np.isfinite(values)) for name, values in log.columns.items()}
+    if all(np.median(np.diff(each)) <= 1 for each in rows.values() if each.size > 1):
+        return log
+    kept = max((each for name, each in rows.items() if name not in commands), key=len, default=None)
+    if kept is None or kept.size < MIN_SAMPLES:
+        return log
+    t = log.t[kept]
+    columns = {}
+    for name, values in log.columns.items():
+        seen = rows[name]
+        if name not in commands:
+            columns[name] = interpolated(t, log.t[seen], values[seen])[0]
+            continue
+        until = np.append(t, 2 * t[-1] - t[-2])
+        steady = held(values)
+        area = np.concatenate([[0.0], np.cumsum(steady[:-1] * np.diff(log.t))])
+        last = np.clip(np.searchsorted(log.t, until, side="right") - 1, 0, log.t.size - 1)
+        done = area[last] + steady[last] * (until - log.t[last])
+        columns[name] = np.diff(done) / np.diff(until)
+    return Recording(log.name, t, columns, log.first, log.warnings)
 
-    readers = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
-    if path.suffix.lower() not in readers:
-        raise InputError(str(path), f"its times are in column {times!r}", "a .csv or .parquet file")
-    frame = readers[path.suffix.lower()](path)
-    if times not in frame.columns:
-        raise InputError(f"{path}: column {times}", "missing", "the column of times in s")
-    frame = frame.drop(columns=[c for c in ("t",) if c in frame.columns]).rename(columns={times: "t"})
-    try:
-        trial = read_trial(frame, task=SequenceTask(("all",), channels=names))
-    except InputError as error:
-        where = error.where.replace("DataFrame", str(path)).replace("column t", f"column {times}")
-        raise InputError(where, error.problem, error.expected) from None
-    return Recording(path.name, trial.t, trial.channels)
+
+def held(values: np.ndarray) -> np.ndarray:
+    """A column (num_timesteps,) whose missing samples hold the one before, the first ones the next."""
+    there = np.flatnonzero(np.isfinite(values))
+    if not there.size:
+        return values
+    return values[there[np.maximum(np.searchsorted(there, np.arange(values.size), side="right") - 1, 0)]]

@@ -23,7 +23,7 @@ from file_writers import (
 
 from hmmseg.errors import InputError
 from hmmseg.io.formats import kind_of, parts_of, read_table, split_part
-from hmmseg.io.formats.messages import interpolated
+from hmmseg.io.formats.logs import interpolated
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import read_trial
@@ -143,14 +143,21 @@ def test_a_missing_extra_says_what_to_install(tmp_path, monkeypatch, kind, libra
 
 
 @pytest.mark.parametrize("kind", ["mcap", "ROS 1 bag"])
-def test_a_log_cut_off_is_one_line(tmp_path, kind):
+def test_a_log_cut_off_is_read_as_far_as_it_goes_or_is_one_line(tmp_path, kind):
     path = LOGS[kind](tmp_path)
-    whole = path.read_bytes()
-    for length in (0, 7, 100, len(whole) // 2, len(whole) - 3):
-        path.write_bytes(whole[:length])
-        with pytest.raises(InputError) as caught:
-            read_trial(path, TOPICS, LOGGED)
-        assert "\n" not in str(caught.value)
+    whole, sizes = path.read_bytes(), []
+    for share in (0.0, 0.0005, 0.3, 0.7, 0.9999):
+        path.write_bytes(whole[: int(share * len(whole))])
+        try:
+            trial = read_trial(path, TOPICS, LOGGED)
+        except InputError as error:
+            assert "\n" not in str(error)
+            sizes.append(0)
+            continue
+        assert any("broken off" in each or "breaks off" in each for each in trial.warnings)
+        np.testing.assert_allclose(trial.channels["push"], -force(FAST[: trial.t.size]), rtol=1e-12)
+        sizes.append(trial.t.size)
+    assert sizes == sorted(sizes) and sizes[1] == 0 and sizes[-1] == FAST.size
 
 
 def test_a_topic_that_is_not_there(tmp_path):

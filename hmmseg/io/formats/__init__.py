@@ -44,7 +44,9 @@ def kind_of(path: Path) -> str:
     if path.is_dir():
         if (path / "meta/info.json").is_file():
             return "lerobot"
-        if (path / "metadata.yaml").is_file():
+        if any(path.glob("*.mcap")):
+            return "mcap"
+        if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
             return "bag"
         raise InputError(str(path), "is a folder", A_TRIAL)
     if not path.exists():
@@ -54,8 +56,6 @@ def kind_of(path: Path) -> str:
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise InputError(str(path), f"unknown kind of file {path.suffix!r}", ", ".join(KINDS))
-    if kind == "mcap" and (path.parent / "metadata.yaml").is_file() and not path.stat().st_size:
-        raise InputError(str(path), "is empty", A_TRIAL)
     return kind
 
 
@@ -123,7 +123,7 @@ def _module(kind: str, path: str | Path) -> ModuleType:
             extra = EXTRAS[kind]
             raise InputError(str(path), f"needs {library}, which is not installed",
                              f"pip install 'hmmseg[{extra}]'") from None  # fmt: skip
-    return importlib.import_module(f"hmmseg.io.formats.{kind}")
+    return importlib.import_module(f"hmmseg.io.formats.{'logs' if kind in LOGS else kind}")
 
 
 def _told(error: Exception) -> str:

@@ -1,8 +1,9 @@
 """Tables in text as labs write them.
 
-Separators are commas, semicolons, tabs or runs of spaces; decimals have points, or commas where
-cells are not separated by them; lines that begin with #, % or // are comments, and a comment
-may be the header (as `numpy.savetxt` writes it); a row of units may follow the header.
+Separators are commas, semicolons, tabs or runs of spaces, or what a first line `sep=;` says; decimals have
+points, or commas where cells are not separated by them; lines that begin with #, % or // are comments, and a
+comment may be the header; a row of units may follow the header. A last line that is cut off is left out, and
+so are zero bytes at the end: what a recorder leaves that was broken off.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from hmmseg.io.units import known_unit
 
 COMMENTS = ("#", "%", "//")
 SPACES = r"\s+"
+SAID_SEPARATOR = re.compile(r"sep=(.)", re.IGNORECASE)  # first line of a spreadsheet's CSV
 TEXT = frozenset(range(256)) - set(range(9)) - set(range(14, 32)) - {127}  # bytes that a text may have
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|NaN|inf|")
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -28,7 +30,10 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Layout:
-    """How one text file is laid out; line numbers count from 0."""
+    """How one text file is laid out; line numbers count from 0.
+
+    `most`: cells of the longest row, of which those beyond the names are empty. `notes`: what was left out.
+    """
 
     encoding: str
     separator: str
@@ -37,6 +42,8 @@ class Layout:
     units: dict[str, str]
     skipped: frozenset[int]
     rows: np.ndarray
+    most: int
+    notes: tuple[str, ...]
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -45,13 +52,11 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
 
     layout = find_layout(path)
     names = [name for name in layout.names if name]
-    if len(names) != len(set(names)):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: column {twice}", "appears twice", "one of each name")
+    check_unique(names, str(path))
     chosen = [i for i, name in enumerate(layout.names) if name and (wanted is None or name in wanted)]
     frame = pd.read_csv(
         path, sep=layout.separator, decimal=layout.decimal, encoding=layout.encoding, header=None,
-        names=list(range(len(layout.names))), usecols=chosen, index_col=False, skipinitialspace=True,
+        names=list(range(layout.most)), usecols=chosen, index_col=False, skipinitialspace=True,
         skiprows=layout.skipped.__contains__, skip_blank_lines=False, low_memory=False,
     ) if chosen else pd.DataFrame(index=range(layout.rows.size))  # fmt: skip
     if len(frame) != layout.rows.size:
@@ -61,7 +66,14 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     rows = layout.rows[kept] + 1
     if layout.decimal == ",":
         _no_points(columns, rows, str(path))
-    return Table(str(path), tuple(names), columns, rows, layout.units)
+    return Table(str(path), tuple(names), columns, rows, layout.units, notes=layout.notes)
+
+
+def check_unique(names: Sequence[str], where: str) -> None:
+    """InputError where two columns have one name."""
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
 
 
 def _plain(column) -> np.ndarray:
@@ -93,48 +105,83 @@ def find_layout(path: Path) -> Layout:
 
 
 def _layout(path: Path, encoding: str) -> Layout:
-    separator, header, comment = "", None, ""
+    separator, header = "", None
+    comments: list[str] = []
     units: dict[str, str] = {}
     skipped: list[int] = []
     rows: list[int] = []
-    decimal = "."
+    notes: list[str] = []
+    decimal, most, line = ".", 0, ""
+    decimals: set[int] = set()  # how many stand at the ends of rows
     with path.open(encoding=encoding, newline="") as file:
         for number, line in enumerate(file):
-            line = line.rstrip("\r\n")
-            if not line.strip() or line.lstrip().startswith(COMMENTS):
+            text = line.rstrip("\r\n").replace("\0", " ")
+            said = SAID_SEPARATOR.fullmatch(text.strip()) if header is None else None
+            if said or not text.strip() or text.lstrip().startswith(COMMENTS):
+                separator = said.group(1) if said else separator
                 skipped.append(number)
-                comment = line if line.strip() and header is None else comment
+                comments += [text] if header is None and text.strip() and not said else []
                 continue
             if header is None:
-                separator = _separator(line)
-                header = _cells(line, separator)
-                said = _cells(comment.lstrip().lstrip("#%/").strip(), separator)
-                if len(said) == len(header) and _numeric(header) and not _numeric(said):
-                    header = said  # a header in a comment; this line is the first row
-                else:
+                separator = separator or separator_of(text)
+                header = header_of(text, comments, separator)
+                if header is None:
+                    header = cells_of(text, separator)
+                    skipped.append(number)
+                while header and not header[-1].strip():  # separators at the ends of lines
+                    header.pop()
+                most = len(header)
+                if number in skipped[-1:]:
+                    continue
+            if text.count('"') % 2:
+                raise InputError(f"{path}: row {number + 1}", "a quoted cell does not end", "one line a row")
+            quick = '"' not in text and separator != SPACES
+            cells = None if quick else cells_of(text, separator)
+            found = text.count(separator) + 1 if cells is None else len(cells)
+            if found != len(header):
+                cells = cells_of(text, separator) if cells is None else cells
+                cut = found < len(header) and not line.endswith(("\n", "\r"))
+                if cut or not any(cell.strip() for cell in cells):
+                    notes += [f"{path}: row {number + 1}, the last, is cut off and left out"] * cut
                     skipped.append(number)
                     continue
-            if line.count('"') % 2:
-                raise InputError(f"{path}: row {number + 1}", "a quoted cell does not end", "one line a row")
-            quick = '"' not in line and separator != SPACES
-            found = line.count(separator) + 1 if quick else len(_cells(line, separator))
-            if found != len(header):
-                if line.replace(separator, "").strip():
+                if found < len(header) or any(cell.strip() for cell in cells[len(header) :]):
                     raise InputError(f"{path}: row {number + 1}", f"has {found} cells",
                                      f"{len(header)} as in the header")  # fmt: skip
+                most = max(most, found)
+            if not rows and not units and units_of(header, cells_of(text, separator)[: len(header)]):
+                units = units_of(header, cells_of(text, separator)[: len(header)])
                 skipped.append(number)
                 continue
-            if not rows and not units and units_of(header, _cells(line, separator)):
-                units = units_of(header, _cells(line, separator))
-                skipped.append(number)
-                continue
-            if decimal == "." and separator != "," and "," in line and _comma_numbers(line, separator):
+            if decimal == "." and separator != "," and "," in text and _comma_numbers(text, separator):
                 decimal = ","
+            last = len(text) - max(text.rfind(each) for each in ".,; \t")
+            if not line.endswith(("\n", "\r")) and len(decimals) == 1 < len(rows) and last < min(decimals):
+                notes.append(f"{path}: row {number + 1}, the last, ends within a number and is left out")
+                skipped.append(number)
+                continue
+            decimals.add(last)
             rows.append(number)
+    if "\0" in line:
+        notes.append(f"{path}: ends in zero bytes, which are left out: the recording was broken off")
     names = tuple(name.strip() for name in header or ())
-    return Layout(
-        encoding, separator or ",", decimal, names, units, frozenset(skipped), np.array(rows, dtype=int)
-    )
+    return Layout(encoding, separator or ",", decimal, names, units, frozenset(skipped),
+                  np.array(rows, dtype=int), most, tuple(notes))  # fmt: skip
+
+
+def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
+    """The header, where a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row.
+
+    Signs of a comment before it and before its first name are no part of the name.
+    """
+    cells = cells_of(line, separator)
+    if not _numeric(cells):
+        return None
+    for comment in reversed(comments):
+        names = cells_of(comment.lstrip("#%/ \t"), separator)
+        if len(names) == len(cells) and not _numeric(names):
+            return names
+    return None
 
 
 def _encoding(path: Path) -> str:
@@ -143,14 +190,16 @@ def _encoding(path: Path) -> str:
     return "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
-def _separator(line: str) -> str:
+def separator_of(line: str) -> str:
+    """What separates the cells of a header."""
     for separator in ("\t", ";", ","):
         if separator in line:
             return separator
     return SPACES if len(line.split()) > 1 else ","
 
 
-def _cells(line: str, separator: str) -> list[str]:
+def cells_of(line: str, separator: str) -> list[str]:
+    """Cells of a line, quotes taken off."""
     if separator == SPACES:
         return line.split()
     if '"' in line:
@@ -163,7 +212,7 @@ def _numeric(cells: list[str]) -> bool:
 
 
 def _comma_numbers(line: str, separator: str) -> bool:
-    return any(COMMA_NUMBER.fullmatch(cell.strip()) for cell in _cells(line, separator))
+    return any(COMMA_NUMBER.fullmatch(cell.strip()) for cell in cells_of(line, separator))
 
 
 def units_of(header: list[str], cells: list[str]) -> dict[str, str]:

@@ -49,12 +49,13 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         }  # fmt: skip
         columns = flat({name: each[()] for name, each in chosen.items()})
         rate = _control_rate(file)
-        length = next((each.shape[0] for each in datasets.values()), 0)
     if wanted is not None:
         columns = {name: values for name, values in columns.items() if name in wanted}
     rest = [name for name in datasets if name not in chosen]
     if rate is not None and "t" not in datasets and (wanted is None or "t" in wanted):
-        columns = {"t": np.arange(length) / rate, **columns}
+        lengths = [len(values) for values in columns.values()]
+        lengths = lengths or [each.shape[0] for each in datasets.values()]
+        columns = {"t": np.arange(max(lengths, key=lengths.count, default=0)) / rate, **columns}
     return plain_table(f"{path}#{part}" if part else str(path), columns, [*columns, *rest])
 
 

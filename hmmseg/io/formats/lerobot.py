@@ -1,17 +1,20 @@
 """LeRobot data sets, v2 (a file an episode) and v3 (many in a file): Parquet and meta/info.json.
 
 A folder's episodes are its recordings, `dataset#3`. A feature's entries carry the names that
-info.json gives them, `observation.state.left_x`, or their number, `observation.state[0]`.
+info.json gives them, `observation.state.left_x`, or their number, `observation.state[0]`. Rows of language
+(version 3.1: LeRobot's `lerobot.datasets.language`) become one column of text a style, `language.subtask`:
+what holds at each sample.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hmmseg.errors import InputError
@@ -19,6 +22,7 @@ from hmmseg.io.formats.parquet import to_columns
 from hmmseg.io.table import Table, plain_table
 
 EPISODE = "episode_index"
+PERSISTENT, EVENTS = "language_persistent", "language_events"
 
 
 def read_info(folder: Path) -> dict[str, Any]:
@@ -64,7 +68,9 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     for file in data_files(path):
         table = pq.read_table(file, filters=[(EPISODE, "==", int(part))])
         if table.num_rows:
-            columns = _named(to_columns(table), info)
+            said = spoken(table)
+            table = table.drop_columns([name for name in (PERSISTENT, EVENTS) if name in table.column_names])
+            columns = _named(to_columns(table), info) | said
             break
     else:
         raise InputError(f"{path}#{part}", "has no samples", "an episode")
@@ -72,6 +78,67 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     if wanted is not None:
         columns = {name: values for name, values in columns.items() if name in wanted}
     return plain_table(f"{path}#{part}", columns, names)
+
+
+def language_rows(table: pa.Table) -> list[dict[str, Any]]:
+    """Rows of language that hold from a time on, of one episode: every sample repeats all of them."""
+    if PERSISTENT not in table.column_names:
+        return []
+    return next((rows for rows in table.column(PERSISTENT).to_pylist() if rows), [])
+
+
+def read_subtasks(folder: Path) -> bool:
+    """Whether any episode of a data set has rows of language of style `subtask`."""
+    for file in data_files(folder):
+        if PERSISTENT not in pq.read_schema(file).names:
+            continue
+        column = pq.read_table(file, columns=[PERSISTENT]).column(PERSISTENT)
+        if "subtask" in column.combine_chunks().flatten().field("style").unique().to_pylist():
+            return True
+    return False
+
+
+def spoken(table: pa.Table) -> dict[str, np.ndarray]:
+    """By style, the text (num_timesteps,) that holds at each sample of an episode; None before the first."""
+    out: dict[str, np.ndarray] = {}
+    rows = language_rows(table)
+    t = table.column("timestamp").to_numpy() if "timestamp" in table.column_names else np.arange(len(table))
+    for style in dict.fromkeys(row["style"] for row in rows if row["style"]):
+        mine = sorted((row for row in rows if row["style"] == style), key=lambda row: row["timestamp"])
+        texts = np.array([None, *(row["content"] for row in mine)], dtype=object)
+        since = np.array([row["timestamp"] for row in mine], dtype=np.float32)
+        out[f"language.{style}"] = texts[np.searchsorted(since, t.astype(np.float32), side="right")]
+    return out
+
+
+def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, str]]]) -> pa.Table:
+    """A table of samples whose rows of language have these subtasks [(start in s, name), ...] by episode."""
+    as_json = pa.json_() if hasattr(pa, "json_") else pa.string()
+    fields = [("role", pa.string(), False), ("content", pa.string(), True), ("style", pa.string(), True)]
+    more = [("camera", pa.string(), True), ("tool_calls", pa.list_(as_json), True)]
+    episodes = table.column(EPISODE).to_numpy()
+    by_episode: dict[int, list[dict[str, Any]]] = {}
+    for number in np.unique(episodes).tolist():
+        rows = language_rows(table.filter(pa.array(episodes == number)))
+        rows = rows + [
+            {"role": "assistant", "content": name, "style": "subtask", "timestamp": start, "camera": None,
+             "tool_calls": None}
+            for start, name in subtasks.get(number, ())
+        ]  # fmt: skip
+        by_episode[number] = rows
+    for name, each, rows in (
+        (PERSISTENT, [*fields, ("timestamp", pa.float32(), False), *more], by_episode),
+        (EVENTS, [*fields, *more], dict.fromkeys(by_episode, [])),
+    ):
+        if name == EVENTS and name in table.column_names:
+            continue
+        kind = pa.list_(pa.struct([pa.field(key, kind, nullable=empty) for key, kind, empty in each]))
+        values = pa.array([rows[number] for number in episodes.tolist()], type=kind)
+        if name in table.column_names:
+            table = table.set_column(table.column_names.index(name), name, values)
+        else:
+            table = table.append_column(name, values)
+    return table
 
 
 def _named(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:

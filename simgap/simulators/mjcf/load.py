@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.units import UNITS, known_unit
+from hmmseg.io.units import UNITS, known_unit, unwrapped
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.map import Map, Mapped, read_map
 from simgap.simulators.protocol import Channel
-from simgap.simulators.recording import Recording, read_recording
+from simgap.simulators.recording import Recording, held, read_recording
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,28 @@ class Loaded:
     def read(self, path: Path) -> Recording:
         """A log in SI, as the map has it; InputError where a unit cannot be."""
         columns = self.map.columns
-        raw = read_recording(path, columns, self.map.time)
+        raw = read_recording(
+            path, columns, self.map.time, self.map.time_factor,
+            [name for name, mapped in columns.items() if mapped.kind == "command"],
+        )  # fmt: skip
         values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
-        log = Recording(raw.name, raw.t * self.map.time_factor, values)
+        for name, mapped in columns.items():
+            if mapped.kind == "command":  # a drive holds it until the next
+                values[name] = held(values[name])
+            elif mapped.thing == "joint" and mapped.kind == "position" and self.turns(mapped.name):
+                values[name] = unwrapped(values[name])
+        log = raw.with_columns(values)
         for pose in self.simulator.free.values():
             log = continuous(log, [pose[a] for a in ("qw", "qx", "qy", "qz")])
         _check_ranges(self.simulator.model, columns, log, str(path))
         return log
+
+    def turns(self, joint: str) -> bool:
+        """Whether a joint is a hinge, whose angle may be recorded with jumps by whole turns."""
+        from simgap.simulators.mjcf.engine import mujoco
+
+        kind = self.simulator.model.joint(joint).type.item()
+        return kind == int(mujoco.mjtJoint.mjJNT_HINGE)
 
     def effects(self, recordings: Sequence[Recording]) -> list[RobotEffect]:
         """Candidates that need the model: those it can set become its parameters, the rest are given."""
