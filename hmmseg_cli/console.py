@@ -83,10 +83,13 @@ class Output:
     def __exit__(self, *exception: object) -> None:
         self._cleanup.close()
 
-    def print(self, *renderables: Any) -> None:
-        """Show tables or text to people: standard output, or standard error beside `--json -`."""
+    def print(self, *renderables: Any, whole: bool = False) -> None:
+        """Show tables or text to people: standard output, or standard error beside `--json -`.
+
+        `whole`: lines are not wrapped, as somebody copies them.
+        """
         for renderable in renderables:
-            self._console.print(renderable, highlight=False, markup=False)
+            self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
 
     def warn(self, text: str) -> None:
         """Keep a warning for the JSON document and show it on standard error."""

@@ -116,14 +116,21 @@ def _show(out: Output, found: Any) -> None:
                       _number(channel.maximum), sparkline(channel.course))  # fmt: skip
     out.print(table)
     for line in found.said:
-        out.warn(f"{found.file}: column {line}")
+        out.warn(line)
     if found.toml:
-        out.print("proposed for rig.toml:", found.toml)
-    elif found.unknown:
+        out.print("proposed for rig.toml:")
+        out.print(found.toml, whole=True)
+        out.print(f"next: hmmseg inspect {found.file} --write rig.toml, or copy it there", whole=True)
+    elif not found.understood:
         out.print(
             f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
-            "which (hmmseg new lays it out)"
+            "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
+            f'sequence = ["...", "..."] in task.toml, then: hmmseg segment {found.file} --task task.toml',
+            whole=True,
         )
+    else:
+        out.print(f"{found.file}: all columns understood; next: hmmseg segment {found.file} --task task.toml "
+                  "--rig rig.toml", whole=True)  # fmt: skip
 
 
 def _number(value: float | None) -> str:

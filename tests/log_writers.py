@@ -44,6 +44,7 @@ class Topic:
     kind: str
     ns: np.ndarray
     values: dict
+    stamps: np.ndarray | None = None  # of its headers, where they are of another clock
 
     def body(self, k: int) -> dict:
         """Message k as plain Python, without its header."""
@@ -73,7 +74,8 @@ def mcap_of(path: Path, topics: list[Topic]) -> Path:
         schemas = {kind: writer.register_msgdef(kind, SCHEMAS[kind]) for kind in {t.kind for t in topics}}
         for topic, k in _ordered(topics):
             ns = int(topic.ns[k])
-            head = {"header": {"stamp": _stamp(ns), "frame_id": "tool"}} if topic.stamped else {}
+            stamp = ns if topic.stamps is None else int(topic.stamps[k])
+            head = {"header": {"stamp": _stamp(stamp), "frame_id": "tool"}} if topic.stamped else {}
             body = topic.body(k) | head
             writer.write_message(topic.name, schemas[topic.kind], body, log_time=ns + DELAY)
         writer.finish()

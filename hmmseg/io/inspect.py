@@ -15,7 +15,7 @@ from hmmseg.io.propose import as_toml, mended, propose
 from hmmseg.io.propose_gripper import propose_gripper
 from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, numbers
-from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS, mapped_times
+from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS, mapped_times, trial_of
 from hmmseg.io.units import unit_in_name
 from hmmseg.levels import GAP
 
@@ -42,7 +42,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class Inspection:
-    """One file: its recordings, its clock, gaps [(start, end) in s], channels and proposed mapping."""
+    """One file: its recordings, its clock, gaps [(start, end) in s], channels and proposed mapping.
+
+    `understood`: all that a hand needs (this rig's, or one of two fingers) is there under our names.
+    """
 
     file: str
     parts: tuple[str, ...]
@@ -56,23 +59,19 @@ class Inspection:
     mapping: dict[str, dict[str, Any]]
     toml: str
     said: tuple[str, ...]
-
-    @property
-    def unknown(self) -> bool:
-        """Whether neither a hand's own names are there nor any were recognised."""
-        names = {channel.name for channel in self.channels}
-        fingers = (set(CARTESIAN_CHANNELS) - set(CARTESIAN_OPTIONAL), set(JOINT_CHANNELS))
-        return not self.toml and not any(wanted <= names for wanted in fingers)
+    understood: bool
 
 
 def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     """What a file holds (of several recordings the first), judged with the rig where it is given."""
     parts = parts_of(path)
     table = read_table(f"{path}#{parts[0]}" if parts else path)
+    if not table.names or not table.rows.size:
+        raise InputError(str(path), "is empty", "a header row and a row for every sample")
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
     entries, said = mended(table, entries, rig)
-    said = [*table.notes, *_lengths(table), *said]
+    said = [*table.notes, *(f"{path}: {line}" for line in (*_lengths(table), *said))]
     toml = as_toml(entries, table) if entries else ""
     if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
         toml = propose_gripper(table, entries) or toml
@@ -88,8 +87,18 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     return Inspection(
         str(path), tuple(parts), int(table.rows.size), None if t is None or not t.size else float(t[0]),
         None if t is None or not t.size else float(t[-1]), rate, origin, tuple(gaps), channels, entries,
-        toml, tuple(said),
+        toml, tuple(said), not toml and _understood(table, rig),
     )  # fmt: skip
+
+
+def _understood(table: Table, rig: Rig | None) -> bool:
+    hands = (set(CARTESIAN_CHANNELS) - set(CARTESIAN_OPTIONAL), set(JOINT_CHANNELS))
+    if rig is None:
+        return any(wanted <= set(table.names) for wanted in hands)
+    try:
+        return bool(trial_of(table, rig, None).channels)
+    except InputError:
+        return False
 
 
 def _lengths(table: Table) -> list[str]:
@@ -97,7 +106,8 @@ def _lengths(table: Table) -> list[str]:
     by_length: dict[int, list[str]] = {}
     for name, values in table.columns.items():
         by_length.setdefault(len(values), []).append(name)
-    return [f"{', '.join(names)}: {length} rows, not {table.rows.size} as the others: not read together"
+    others = f"not {table.rows.size} as the others: they are not read together"
+    return [f"columns {', '.join(names)} have {length} rows, {others}"
             for length, names in by_length.items() if length != table.rows.size]  # fmt: skip
 
 

@@ -88,7 +88,7 @@ def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = N
             except InputError:
                 return entries, said
             found = [replace(f, certain=True) for f in check_clock(clock, hand, moving=False) if f.changes]
-        said += [line for f in found if (line := f"{f.channel} {f.problem}") not in said]
+        said += [line for f in found if (line := f"column {f.channel} {f.problem}") not in said]
         fresh = {k: v for f in found if f.certain or f.channel == "t" for k, v in f.changes.items()}
         if not fresh or all(entries.get(name) == fields for name, fields in fresh.items()):
             return entries, said

@@ -129,7 +129,7 @@ def lerobot_files(folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Spa
     from hmmseg.io.formats.lerobot import EVENTS, PERSISTENT, data_files, read_info, read_subtasks
 
     info = read_info(folder)
-    if "boundary_sd" in info["features"] or read_subtasks(folder):
+    if {"boundary_sd", "subtask_index"} & set(info["features"]) or read_subtasks(folder):
         raise InputError(f"{folder}/meta/info.json", "has subtasks already", "no labels yet")
     for name in (PERSISTENT, EVENTS):
         info["features"].setdefault(name, {"dtype": "language", "shape": [1], "names": None})
@@ -159,6 +159,9 @@ def _write_episodes(path: Path, file: Path, labelled: Mapping[int, tuple[Trial, 
         rows = episodes == number
         if rows.sum() == trial.t.size:
             sd[rows] = label(trial.t, spans).boundary_sd
-            subtasks[number] = [(span.start, span.label) for span in spans]
+            since = (
+                table.column("timestamp").to_numpy()[rows] if "timestamp" in table.column_names else trial.t
+            )
+            subtasks[number] = [(float(np.interp(s.start, trial.t, since)), s.label) for s in spans]
     table = with_subtasks(table, subtasks).append_column("boundary_sd", pa.array(sd))
     pq.write_table(table, path)

@@ -39,6 +39,11 @@ LAYOUTS = {
     "trailing separators": written().replace("\n", ",\n"),
     "scientific": written().replace("0.05,", "5.0E-2,", 1),
     "empty last rows": written(";") + ";;\n\n",
+    "the separator said first": "sep=;\n" + written(";", ","),
+    "any separator said first": "SEP=|\n" + written("|"),
+    "signs before the header and its first name": written(" ", head="# #t,x,f", before=["# lab 3, a stand"]),
+    "a remark behind the header in a comment": written(head="#t,x,f", after_header=["# one, two"]),
+    "separators behind the rows alone": written().replace("\n", ",\n").replace("f,\n", "f\n", 1),
 }
 
 
@@ -49,6 +54,29 @@ def test_layouts_hold_the_same_numbers(tmp_path, layout):
     trial = read_trial(path, task=PLAIN)
     for found, planted in ((trial.t, T), (trial.channels["x"], X), (trial.channels["f"], F)):
         np.testing.assert_allclose(found, planted, rtol=1e-12)
+
+
+EVEN = "t,x,f\n" + "".join(f"{t:.2f},1,{f:.3f}\n" for t, f in zip(T, F, strict=True))
+BROKEN_OFF = {
+    "in a row": (written() + "0.6,1", "row 14, the last, is cut off"),
+    "in a number": (EVEN + "0.6,1,12.", "row 14, the last, ends within a number"),
+    "in zero bytes": (written() + "\0" * 900, "ends in zero bytes"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", BROKEN_OFF)
+def test_what_was_broken_off_is_read_as_far_as_it_goes_and_said(tmp_path, how):
+    text, said = BROKEN_OFF[how]
+    (tmp_path / "a.csv").write_text(text)
+    trial = read_trial(tmp_path / "a.csv", task=PLAIN)
+    np.testing.assert_allclose(trial.t, T)
+    assert len(trial.warnings) == 1 and said in trial.warnings[0]
+
+
+def test_a_last_row_without_a_line_end_is_read(tmp_path):
+    (tmp_path / "a.csv").write_text(written()[:-1])
+    trial = read_trial(tmp_path / "a.csv", task=PLAIN)
+    assert (trial.t.size, trial.warnings) == (T.size, ())
 
 
 def test_spreadsheets_unicode_text(tmp_path):

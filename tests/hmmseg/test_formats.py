@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -15,11 +17,13 @@ from file_writers import (
     force,
     height,
     joint,
+    robomimic_of,
     write_bag,
     write_lerobot,
     write_mcap,
     write_robomimic,
 )
+from log_writers import Topic, mcap_of
 
 from hmmseg.errors import InputError
 from hmmseg.io.formats import kind_of, parts_of, read_table, split_part
@@ -70,6 +74,91 @@ def test_a_gap_of_a_topic_stays_a_gap(tmp_path):
     missing = np.isnan(trial.channels["height"])
     low, high = SLOW[SLOW < 500_000_000][-1], SLOW[SLOW >= 900_000_000][0]
     np.testing.assert_array_equal(missing, ((low < FAST) & (high > FAST)) | (SLOW[-1] < FAST))
+
+
+def test_two_publishers_of_a_topic_each_at_its_own_rate(tmp_path):
+    fast, slow = np.arange(100) * 20_000_000, np.arange(50) * 40_000_000 + 3_000_000
+    arm = {"position": {"a": joint(fast)}, "velocity": {"a": 0.0 * fast}}
+    finger = {"position": {"f": height(slow)}, "velocity": {"f": np.nan * slow}}
+    topics = [Topic("/joints", "sensor_msgs/msg/JointState", START + ns, v)
+              for ns, v in ((fast, arm), (slow, finger))]  # fmt: skip
+    rig = parse_rig({"topics": {"a": "/joints.position.a", "f": "/joints.position.f"}})
+    path = mcap_of(tmp_path / "a.mcap", topics)
+    trial = read_trial(path, rig, SequenceTask(("a",), channels=("a", "f")))
+    np.testing.assert_allclose(trial.channels["a"], joint(fast), rtol=1e-12)
+    inside = np.isfinite(trial.channels["f"])
+    assert inside.sum() == 98  # all but the one before the first message and the one after the last
+    np.testing.assert_allclose(trial.channels["f"][inside], height(fast[inside]), rtol=1e-9)
+    rates = read_table(path).rates
+    assert (rates["/joints.position.a"], rates["/joints.position.f"]) == (50.0, 25.0)
+
+
+@pytest.mark.parametrize("how", ["another clock", "a clock that was set"])
+def test_two_clocks_are_noticed(tmp_path, how):
+    stamps = START + FAST
+    late = stamps - 40_000_000_000 * ((FAST[90] < FAST) if how != "another clock" else 1)
+    value = {"force": np.stack([force(FAST)] * 3, axis=1)}
+    topics = [Topic("/a", "geometry_msgs/msg/WrenchStamped", stamps, value, stamps=stamps),
+              Topic("/b", "geometry_msgs/msg/WrenchStamped", stamps, value, stamps=late)]  # fmt: skip
+    rig = parse_rig({"topics": {"a": "/a.wrench.force.x", "b": "/b.wrench.force.x"}})
+    path = mcap_of(tmp_path / "a.mcap", topics)
+    trial = read_trial(path, rig, SequenceTask(("a",), channels=("a", "b")))
+    np.testing.assert_allclose(trial.channels["b"], force(FAST), rtol=1e-12)
+    assert "times of logging are used" in trial.warnings[0] or "latter are used" in trial.warnings[0]
+    one = parse_rig({"topics": {"a": "/a.wrench.force.x"}})
+    assert read_trial(path, one, SequenceTask(("a",), channels=("a",))).warnings == ()
+
+
+def test_a_topic_of_an_unknown_type_is_listed_and_left_out(tmp_path):
+    folder = write_bag(tmp_path / "log")
+    with sqlite3.connect(next(folder.glob("*.db3"))) as base:
+        base.execute("UPDATE topics SET type = 'lab_msgs/msg/Motor' WHERE name = '/opening'")
+    assert (
+        "topic /opening cannot be decoded (the bag does not define its type lab_msgs/msg/Motor)"
+        in "".join(read_table(folder).notes)
+    )
+    assert read_trial(folder, TOPICS, LOGGED).warnings == ()
+    rig = parse_rig({"topics": {"w": "/opening.data"}})
+    with pytest.raises(InputError, match=r"log: topic /opening: cannot be decoded \(the bag does not define"):
+        read_trial(folder, rig, SequenceTask(("a",), channels=("w",)))
+
+
+def test_a_bag_without_its_metadata(tmp_path):
+    folder = write_bag(tmp_path / "log")
+    (folder / "metadata.yaml").unlink()
+    trial = read_trial(folder, TOPICS, LOGGED)
+    np.testing.assert_allclose(trial.channels["push"], -force(FAST), rtol=1e-12)
+    assert "has no metadata.yaml: the recording was not finished" in trial.warnings[0]
+
+
+def test_columns_of_other_lengths_are_read_apart(tmp_path):
+    steps = np.arange(50.0)
+    path = robomimic_of(
+        tmp_path / "a.hdf5", 20, [{"states": np.stack([steps, -steps], 1), "actions": steps[1:]}]
+    )
+    for name, count in (("actions", 49), ("states[1]", 50)):
+        trial = read_trial(path, task=SequenceTask(("a",), channels=(name,)))
+        np.testing.assert_allclose(trial.t, np.arange(count) / 20)
+    assert {name: len(values) for name, values in read_table(path).columns.items()} == {
+        "t": 50, "states[0]": 50, "states[1]": 50, "actions": 49}  # fmt: skip
+    with pytest.raises(InputError, match="column actions: has 49 rows; expected 50 as in the others"):
+        read_trial(path, task=SequenceTask(("a",)))
+
+
+@pytest.mark.parametrize(("size", "line"), [
+    (1e9, "sampled at 1e-07 Hz if it is in s: it looks like ns; expected t = .*unit = \"ns\""),
+    (1e6, "sampled at 0.0001 Hz if it is in s: it looks like us"), (1.0, None)])  # fmt: skip
+def test_stamps_since_1970_in_another_unit_are_refused_in_any_recording(tmp_path, size, line):
+    t = ((START * 1e-9 + np.arange(40) * 0.01) * size).round(2)
+    pd.DataFrame({"t": t.astype(np.int64) if size > 1 else t, "x": np.arange(40.0)}).to_csv(
+        tmp_path / "a.csv", index=False
+    )
+    task = SequenceTask(("a", "b"))
+    if line is None:
+        assert read_trial(tmp_path / "a.csv", task=task).warnings == ()
+    else:
+        with pytest.raises(InputError, match=rf"a\.csv: column t: is {line}"):
+            read_trial(tmp_path / "a.csv", task=task)
 
 
 def test_interpolation_by_hand():

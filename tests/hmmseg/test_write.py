@@ -15,6 +15,7 @@ from file_writers import START, write_lerobot, write_mcap
 from mcap.reader import make_reader
 
 from hmmseg.errors import InputError
+from hmmseg.io.formats import read_table
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import read_trial
@@ -91,21 +92,27 @@ def test_a_lerobot_data_set_with_subtasks(tmp_path, version):
     for place, write in lerobot_files(folder, {1: (trial, SPANS)}).items():
         (tmp_path / "new" / place).parent.mkdir(parents=True, exist_ok=True)
         write(tmp_path / "new" / place)
-    names = pd.read_parquet(tmp_path / "new/meta/subtasks.parquet")
-    assert names["subtask_index"].to_dict() == {"reach": 0, "push": 1, "leave": 2}
     info = json.loads((tmp_path / "new/meta/info.json").read_text())
-    assert info["features"]["subtask_index"] == {"dtype": "int64", "shape": [1], "names": None}
+    language = {"dtype": "language", "shape": [1], "names": None}
+    assert [info["features"][name] for name in ("language_persistent", "language_events")] == [language] * 2
     files = sorted((tmp_path / "new/data").rglob("*.parquet"))
-    frame = pd.concat([pq.read_table(file).to_pandas() for file in files])
-    assert (frame["subtask_index"][frame["episode_index"] != 1] == -1).all()
-    one = frame[frame["episode_index"] == 1]
+    rows = [row for file in files for row in pq.read_table(file).to_pylist()]
+    assert not any(row["language_persistent"] for row in rows if row["episode_index"] != 1)
+    one = [row for row in rows if row["episode_index"] == 1]
+    said = {"role": "assistant", "style": "subtask", "camera": None, "tool_calls": None}
+    assert all(row["language_events"] == [] for row in rows)
+    for row in one:  # every sample repeats what is said of its episode
+        assert row["language_persistent"] == [
+            said | {"content": s.subtask, "timestamp": pytest.approx(s.start)} for s in SPANS
+        ]
+    held = read_table(f"{tmp_path}/new#1").columns["language.subtask"].tolist()
     expected = [
-        0 if t < 0.25 else 1 if t < 0.4 else 2 if t <= 0.6 else -1 for t in one["timestamp"].astype(float)
+        "reach" if t < 0.25 else "push" if t < 0.4 else "leave" for t in [row["timestamp"] for row in one]
     ]
-    assert one["subtask_index"].tolist() == expected
+    assert held == expected
     again = read_trial(f"{tmp_path}/new#1", rig, SequenceTask(("a",), channels=("action.b",)))
     np.testing.assert_array_equal(again.channels["action.b"], 1.0)
-    with pytest.raises(InputError, match="has a feature subtask_index already; expected no labels yet"):
+    with pytest.raises(InputError, match="has subtasks already; expected no labels yet"):
         lerobot_files(tmp_path / "new", {})
 
 

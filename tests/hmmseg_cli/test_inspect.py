@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,37 @@ def test_nothing_is_proposed_where_nothing_is_needed(case):
 def test_names_taken_apart(names, expected):
     table = plain_table("a", {name: np.zeros(9) for name in names})
     assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
+
+
+def test_what_to_do_next_is_said_and_no_line_to_copy_is_wrapped(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    assert main(["inspect", str(NONE / "trial_01.csv")]) == 0
+    assert "all columns understood; next: hmmseg segment" in capsys.readouterr().out
+    ours = cartesian()
+    frame = pd.DataFrame({OTHERS[name][0]: values for name, values in ours.items()})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    assert main(["inspect", str(tmp_path / "a.csv")]) == 0
+    text = capsys.readouterr().out
+    (start,) = [i for i, line in enumerate(text.split("\n")) if line == "[columns]"]
+    toml = "\n".join(text.split("\n")[start:]).split("\n\n")[0]
+    assert tomllib.loads(toml)["columns"]["t"]["from"] == "stamp"
+    assert f"next: hmmseg inspect {tmp_path / 'a.csv'} --write rig.toml" in text
+
+
+@pytest.mark.parametrize("text", ["", "t,x\n", "# nothing\n"])
+def test_an_empty_file_is_refused(tmp_path, capsys, text):
+    (tmp_path / "a.csv").write_text(text)
+    assert main(["inspect", str(tmp_path / "a.csv")]) == 2
+    assert (
+        capsys.readouterr().err
+        == f"{tmp_path}/a.csv: is empty; expected a header row and a row for every sample\n"
+    )
+
+
+def test_a_rate_that_is_not_the_files_is_said(tmp_path):
+    rig = read_rig(NONE / "rig.toml").model_copy(update={"rate": 50.0})
+    trial = read_trial(NONE / "trial_01.csv", rig)
+    assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
 
 
 def test_sparkline():

@@ -113,9 +113,8 @@ def spoken(table: pa.Table) -> dict[str, np.ndarray]:
 
 def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, str]]]) -> pa.Table:
     """A table of samples whose rows of language have these subtasks [(start in s, name), ...] by episode."""
-    as_json = pa.json_() if hasattr(pa, "json_") else pa.string()
     fields = [("role", pa.string(), False), ("content", pa.string(), True), ("style", pa.string(), True)]
-    more = [("camera", pa.string(), True), ("tool_calls", pa.list_(as_json), True)]
+    more = [("camera", pa.string(), True), ("tool_calls", pa.list_(pa.string()), True)]
     episodes = table.column(EPISODE).to_numpy()
     by_episode: dict[int, list[dict[str, Any]]] = {}
     for number in np.unique(episodes).tolist():
@@ -128,12 +127,17 @@ def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, 
         by_episode[number] = rows
     for name, each, rows in (
         (PERSISTENT, [*fields, ("timestamp", pa.float32(), False), *more], by_episode),
-        (EVENTS, [*fields, *more], dict.fromkeys(by_episode, [])),
+        (EVENTS, [*fields, *more], {number: [] for number in by_episode}),
     ):
         if name == EVENTS and name in table.column_names:
             continue
         kind = pa.list_(pa.struct([pa.field(key, kind, nullable=empty) for key, kind, empty in each]))
         values = pa.array([rows[number] for number in episodes.tolist()], type=kind)
+        if hasattr(pa, "json_"):  # as LeRobot has it, where pyarrow knows it
+            at = kind.value_type.get_field_index("tool_calls")
+            inner = [kind.value_type.field(i) for i in range(kind.value_type.num_fields)]
+            inner[at] = pa.field("tool_calls", pa.list_(pa.json_()))
+            values = values.cast(pa.list_(pa.struct(inner)))
         if name in table.column_names:
             table = table.set_column(table.column_names.index(name), name, values)
         else:
