@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
+.PHONY: golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -33,6 +33,9 @@ tests: $(INSTALLED)  ## tests alone, without those marked slow
 
 slow: $(INSTALLED)  ## the tests marked slow
 	$(BIN)/pytest -n auto --dist loadfile -m slow tests
+
+golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ against those pinned in tests/data/golden
+	$(BIN)/python -m experiments.golden compare
 
 wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
 	$(BIN)/python .ci/check_wheel.py
