@@ -146,15 +146,11 @@ def differences(old: Json, new: Json, exact: bool = False, where: str = "") -> I
             return
         for k, pair in enumerate(zip(old, new, strict=True)):
             yield from differences(*pair, exact, f"{where}[{k}]")
-    elif _number(old) and _number(new):
+    elif isinstance(old, int | float) and isinstance(new, int | float) and not isinstance(old, bool):
         if not np.isclose(new, old, rtol=EXACT if exact else 0.0, atol=0.0 if exact else _within(where, old)):
             yield f"{where}: {new:.6g}, pinned {old:.6g}"
     elif old != new:
         yield f"{where}: {new}, pinned {old}"
-
-
-def _number(value: Json) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _within(where: str, old: float) -> float:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.design import build
+from estimation.design import _combined, build
 from estimation.mode import find_mode
 from estimation.moments import unexpected_bias
 from estimation.nuisance import UNLIKE
@@ -203,3 +203,22 @@ def test_rigid_pads_that_give_are_told_and_allowed_for(case, aligned):
     i = design.names.index(("block1", "width"))
     error = mode.unknowns[i] - case.blocks["block1"]["width"][0]
     assert abs(error) < 3 * np.sqrt(mode.unknowns_covariance[i, i]) < 2e-3
+
+
+def test_alignments_are_combined_by_rubins_rule():
+    """Within one alignment plus (1 + 1/S) times the unbiased variance between them."""
+    rng = np.random.default_rng(3)
+    draws = 7
+    raw = 1.0 + 0.2 * rng.standard_normal((1, draws, 2, 1))
+    valid = np.ones(raw.shape, bool)
+    valid[0, 2, 1, 0] = False
+    variance = np.full(raw.shape, 0.01) * (1 + np.arange(draws))[None, :, None, None]
+    where = (np.zeros(2, int), np.arange(2), np.zeros(2, int))
+    mean, total, row = _combined(raw, variance, valid, np.ones((*raw.shape, 1)), where)
+    for k in range(2):
+        mine = valid[0, :, k, 0]
+        values = raw[0, mine, k, 0]
+        between = (1 + 1 / values.size) * np.var(values, ddof=1)
+        assert mean[k] == pytest.approx(values.mean())
+        assert total[k] == pytest.approx(variance[0, mine, k, 0].mean() + between)
+    assert row == pytest.approx(np.ones((2, 1)))

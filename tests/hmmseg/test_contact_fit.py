@@ -140,3 +140,14 @@ def test_a_trial_too_short_for_its_task_is_refused():
              ("t", "force", "vx", "vy", "ay", "y", "d", "sd_y", "sd_d", "sd_vx", "sd_vy")}  # fmt: skip
     with pytest.raises(InfeasibleAlignment):
         fit([replace(f, **short)], STEPS)
+
+
+def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
+    rng = np.random.default_rng(5)
+    gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
+    gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
+    counts = sum(g.mean(axis=0) for g in gammas)
+    expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
+    found = MeanShares((30, 50), np.full(4, 0.25)).updated(gammas).shares
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert found[3] > 0

@@ -15,6 +15,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.online import layout as at
 from hmmseg.online import scores
 from hmmseg.online.readings import SLOPE, WINDOW
+from hmmseg.online.step import _absorb
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, log_likelihoods
@@ -233,3 +234,20 @@ def test_what_cannot_be_watched_is_refused():
         Watcher(TASK, RIG, -1.0)
     with pytest.raises(ValueError, match="expected"):
         Watcher(TASK, RIG).update(0.0, [1.0])
+
+
+def test_two_hypotheses_merge_to_the_moments_of_their_mixture():
+    rng = np.random.default_rng(0)
+    share, mean, sd = np.array([0.3, 0.7]), np.array([1.0, 1.6]), np.array([0.05, 0.1])
+    rows = np.zeros((2, at.Layout(2, 2).width))
+    rows[:, at.WEIGHT] = np.log(share) - 2.0
+    moments = [(at.ENTRY, at.ENTRY_VARIANCE), (at.ORIGIN, at.ORIGIN + 1), (at.RING, at.RING + 1)]
+    for first, second in moments:
+        rows[:, first], rows[:, second] = mean, sd**2
+    _absorb(rows[0], rows[1])
+    drawn = np.where(rng.uniform(size=400_000) < share[0], *(m + s * rng.standard_normal(400_000)
+                     for m, s in zip(mean, sd, strict=True)))  # fmt: skip
+    assert rows[0, at.WEIGHT] == pytest.approx(-2.0)
+    for first, second in moments:
+        assert rows[0, first] == pytest.approx(drawn.mean(), abs=2e-3)
+        assert rows[0, second] == pytest.approx(drawn.var(), rel=0.01)

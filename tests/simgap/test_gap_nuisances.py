@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,12 +16,14 @@ from hmmseg.io.trial import read_trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
+from simgap.effects.base import tips
 from simgap.gap.assemble import _turning as turned_variance
 from simgap.gap.frame import build
 from simgap.gap.marginal import Nuisances
 from simgap.gap.noise_model import _density, _likeliest, with_noise
 from simgap.gap.nuisances import _late_rates, _settling, _turning
 from simgap.gap.problem import problem
+from simgap.gap.residuals import residuals
 from simgap.gap.trial_arrays import CHANNELS
 
 
@@ -45,8 +50,8 @@ def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
 
 
 @pytest.fixture(scope="module")
-def given(shared):
-    folder = shared / "recordings/none_1"
+def given():
+    folder = Path(__file__).parents[2] / "recordings" / "none_1"
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     assert isinstance(task, BlockTask)
     trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
@@ -111,3 +116,25 @@ def test_a_block_that_turns_frees_all_but_where_it_stands(given):
              for s in [int(given.frame.arrays.subtask[t, n])]}  # fmt: skip
     assert (y & standing).sum() == len(grips)  # one coefficient of a cell, its mean
     np.testing.assert_allclose(turned_variance(given, 0.04), 4 * turned_variance(given, 0.02))
+
+
+@double_precision
+def test_angles_in_doubt_widen_positions_by_what_they_move(given):
+    """A variance of angles is that of the block's place and of the fingers' distance, by differences."""
+    frame, variance, step = given.frame, 1e-6, 1e-6
+    world = jax.tree.map(lambda z: jnp.asarray(z, float), frame.world)
+    noise = jnp.asarray(np.where(frame.arrays.sd > 0, frame.arrays.sd, 1.0))
+    doubtful = world._replace(doubt_joints=jnp.full_like(world.joints, variance))
+    sure, wide = (
+        np.asarray(residuals(w, frame.arrays, jnp.asarray(given.centre), noise)[1]) for w in (world, doubtful)
+    )
+    more = (wide - sure)[..., :4] * np.square(np.asarray(noise)[..., :4])
+    expected = np.zeros_like(more)
+    for k in range(4):
+        turned = world._replace(joints=world.joints.at[..., k].add(step))
+        x1, y1, x2, y2 = np.moveaxis(np.asarray((tips(turned)[0] - tips(world)[0]) / step), -1, 0)
+        expected += variance * np.stack([(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], -1) ** 2
+    firm = np.asarray(world.carry) > 0  # a block in the air is held firmly but at the ends
+    share = (more[firm] / expected[firm])[:, [0, 1, 2, 3]]
+    assert np.median(share, axis=0) == pytest.approx(np.ones(4), rel=0.05)
+    assert (share < 1.01).all() and (wide >= sure - 1e-12).all()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 from simgap_swing import Swing, log
 
 from simgap.attribution.posterior import fitted, forms
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
 from simgap.robots.discrepancy import learned
-from simgap.robots.fit import moved_to
+from simgap.robots.fit import _prior, _slope, moved_to
 from simgap.robots.gap import gap_of
 from simgap.robots.judged import Judge
 from simgap.robots.linear import base_at, linearise, vary
@@ -113,3 +114,14 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     assert both.score > large.score + 100 > small.score + 200
     assert {*large.discrepancy.scale} == {"angle_b"} and {*small.discrepancy.scale} == {"angle_a"}
     assert both.discrepancy.scale.get("angle_a", 0.0) < 0.01 * off.scale["angle_a"]
+
+
+def test_priors_are_cauchy_and_of_what_was_calibrated_normal():
+    x = np.array([-30.0, -2.0, -1e-7, 0.0, 0.5, 4.0, 200.0])
+    for calibrated, density in ((False, stats.cauchy), (True, stats.norm)):
+        root = _prior(x, np.full(x.size, calibrated))
+        np.testing.assert_allclose(-0.5 * root**2, density.logpdf(x) - density.logpdf(0.0), atol=1e-12)
+    for at in (-30.0, -2.0, 0.5, 4.0):
+        step, loose = 1e-5, np.zeros(2, bool)
+        low, high = _prior(np.array([at - step, at + step]), loose)
+        assert _slope(np.array([at]))[0] == pytest.approx((high - low) / (2 * step), rel=1e-6)
