@@ -7,12 +7,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hmmseg.contact import identifiability
+from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import CONTRADICTS
 
-UNITS = identifiability.UNITS | {"friction": "1"}
+UNITS = decompose.UNITS | {"friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
 
 

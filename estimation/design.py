@@ -46,7 +46,7 @@ from hmmseg.contact.decompose import height_equations
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS
 from hmmseg.segmentation.align import AlignedTrials
-from hmmseg.segmentation.features import thin
+from hmmseg.segmentation.emissions import thin
 
 
 @dataclass(frozen=True)

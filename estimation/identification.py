@@ -22,8 +22,15 @@ from estimation.sliding import with_slides
 from estimation.summary import summary
 from estimation.tables import properties_table
 from estimation.unknowns import Unknown
-from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask, decompose, height_equations
-from hmmseg.contact.identifiability import UNITS
+from hmmseg.contact.decompose import (
+    ABOVE_GROUND,
+    FREE,
+    ON_GROUND,
+    UNITS,
+    Subtask,
+    decompose,
+    height_equations,
+)
 from hmmseg.errors import nearest
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask

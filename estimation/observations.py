@@ -30,7 +30,7 @@ from hmmseg.levels import TAIL
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
-from hmmseg.segmentation.features import acceleration, thin
+from hmmseg.segmentation.emissions import acceleration, thin
 
 CHANNELS = ("force", "distance", "rise")
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd

@@ -22,8 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtri
 
-from hmmseg.contact.decompose import ABOVE_GROUND, FREE, Subtask, decompose, height_equations, subtasks
-from hmmseg.contact.identifiability import UNITS
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, UNITS, Subtask, decompose, height_equations, subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation

@@ -11,7 +11,7 @@ from hmmseg.contact.equations import pads_of
 from hmmseg.hand.roll import with_roll
 from hmmseg.io.trial import ROLL
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
-from hmmseg.segmentation.tilt import tilts
+from hmmseg.segmentation.posteriors import tilts
 
 # Of velocities only means are read, which a roll leaves alone.
 TURNED = ("x1", "y1", "x2", "y2", "fx1", "fy1", "fx2", "fy2")

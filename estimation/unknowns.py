@@ -11,7 +11,7 @@ from estimation.combinations import Terms, simplest_combinations
 from estimation.observations import (
     CHANNELS,
 )
-from hmmseg.contact.identifiability import PROPERTIES
+from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.io.task import BlockTask
 
 FORCE, DISTANCE, RISE = range(len(CHANNELS))

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hmmseg.contact.decompose import Subtask
-from hmmseg.contact.identifiability import PROPERTIES
+from hmmseg.contact.decompose import PROPERTIES, Subtask
 from hmmseg.segmentation.spans import Segmentation
 
 

@@ -24,7 +24,7 @@ from experiments import (
 )
 from experiments.table_real import real
 from experiments.table_text import as_csv, covered, load, markdown, milliseconds, percent
-from hmmseg.contact.identifiability import PROPERTIES
+from hmmseg.contact.decompose import PROPERTIES
 
 ROOT = Path(__file__).parents[1]
 PAPER = {"weight": "3 %", "width": "7 %", "height": "10 %"}

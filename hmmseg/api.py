@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hmmseg.contact.decompose import Decomposition
 from hmmseg.contact.decompose import decompose as decompose_task
-from hmmseg.contact.decomposition import Decomposition
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask, Task

@@ -17,14 +17,13 @@ def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, 
               quiet: QuietOption = False) -> None:  # fmt: skip
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task
-    from hmmseg.contact.notation import equation
-    from hmmseg.contact.tables import decomposition_table, reasons
+    from hmmseg.contact.tables import decomposition_table, equation, reasons
     from hmmseg.io.task import read_task
 
     with Output("decompose", json=json, seed=seed, quiet=quiet) as out:
         found = decompose_task(read_task(task))
         if rig is not None:
-            from hmmseg.contact.hands import revealed_by
+            from hmmseg.contact.decompose import revealed_by
             from hmmseg.io.rig import read_rig
 
             found = revealed_by(found, read_rig(rig))

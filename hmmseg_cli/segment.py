@@ -12,7 +12,7 @@ import typer
 
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask, read_task
-from hmmseg.segmentation.tables import spans_table, trials_table
+from hmmseg.segmentation.spans import spans_table, trials_table
 from hmmseg_cli.batch import SchedulerOption, WorkersOption, recordings_in, segment_apart
 from hmmseg_cli.console import (
     FiguresOption,

@@ -19,7 +19,7 @@ from estimation.observations import WeighedTrial, gravity_factor
 from hmmseg.contact.decompose import ABOVE_GROUND, SLIDING, Subtask
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.segmentation.features import acceleration
+from hmmseg.segmentation.emissions import acceleration
 
 MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
 FEWEST = 4  # numerics: samples of sliding

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.paper.sources import recorded, save, simulated
 from experiments.recordings import Case
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, decompose, subtasks
-from hmmseg.contact.notation import cell, equation
+from hmmseg.contact.tables import cell, equation
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.thresholds import (
     FORCE_THRESHOLD,

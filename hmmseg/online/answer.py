@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hmmseg.contact.decompose import FREE, Subtask
-from hmmseg.contact.identifiability import UNITS
+from hmmseg.contact.decompose import FREE, UNITS, Subtask
 
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter

@@ -29,7 +29,7 @@ from hmmseg.online.refine import REACH, refined
 from hmmseg.online.scores import CREEP
 from hmmseg.online.step import LOG_DEPARTURE, advance
 from hmmseg.online.summary import boundary, summarise
-from hmmseg.segmentation.features import MAX_RATE, noise_sd
+from hmmseg.segmentation.emissions import MAX_RATE, noise_sd
 
 WARM_UP = 8  # numerics: rows that tell a force noise which the rig does not state
 NUM_CHANNELS = len(CARTESIAN_CHANNELS)

@@ -28,7 +28,7 @@ from hmmseg.online.layout import (
     T,
     Y,
 )
-from hmmseg.segmentation.features import MAX_RATE, WINDOW
+from hmmseg.segmentation.emissions import MAX_RATE, WINDOW
 
 SLOPE = 1.0 / MAX_RATE
 ROWS = 512  # numerics: rows looked back at, at most: 20 kHz over SLOPE

@@ -19,13 +19,10 @@ from hmmseg.io.trial import Trial
 from hmmseg.levels import DRIFTS
 from hmmseg.online import layout as at
 from hmmseg.segmentation.boundaries import combine
-from hmmseg.segmentation.changes import Disagreement, Prior
-from hmmseg.segmentation.crossings import contacts
-from hmmseg.segmentation.emissions import Parameters, log_likelihoods
-from hmmseg.segmentation.features import MAX_RATE, WINDOW, features, thin
-from hmmseg.segmentation.moment import moment
+from hmmseg.segmentation.changes import Disagreement, Prior, moment
+from hmmseg.segmentation.emissions import MAX_RATE, WINDOW, Parameters, features, log_likelihoods, thin
 from hmmseg.segmentation.pads import sense
-from hmmseg.segmentation.posteriors import nearest_touch
+from hmmseg.segmentation.posteriors import contacts, nearest_touch
 
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter

@@ -33,7 +33,7 @@ from hmmseg.online.layout import (
 )
 from hmmseg.online.learning import learn
 from hmmseg.online.scores import free, held, lifted, supported
-from hmmseg.segmentation.departure import BRIEF, DEPARTURE, RINGING, SETTLING, STAGES
+from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, RINGING, SETTLING, STAGES
 from hmmseg.segmentation.emissions import LOST
 
 LOG_DEPARTURE = math.log(DEPARTURE)

@@ -1,19 +1,242 @@
-"""Boundary posteriors in continuous time: where between two samples a contact changed.
+"""Where between two samples a contact changed: crossings in continuous time, and posteriors of boundaries.
 
-The alignment says in which sample interval a boundary lies. Within it the contact itself is a
-crossing: fingertips touch where the gap closes, a block lifts where the pads' shear force
-reaches its weight, meets its support where the shear force begins to fall below it, and is let
-go where a pad's compression reaches zero (`hmmseg.segmentation.motions`).
+The alignment says in which sample interval a boundary lies. Within it the contact itself is a crossing:
+fingertips touch where the gap closes, a block lifts where the pads' shear force reaches its weight, meets its
+support where the shear force begins to fall below it, and is released where a pad's compression reaches zero.
+
+A crossing quantity g (a gap, a height over where the pads' shear carries a block) is known at both ends of a
+sample interval; forces give compressions far more finely than positions do. Smooth motion is the cubic that
+joins both ends with the measured velocities; its crossing time has the density of Rice's formula,
+
+    p(t) ~ N(0; g(t), s(t)^2) E[max(dg/dt, 0)],
+
+s being the propagated sensor noise and the interpolation's own uncertainty (Rice 1944; docs/segmentation.md).
+Touches stop the motion: they come somewhere on the way of a minimum-jerk motion (Flash and Hogan 1985) whose
+start and duration both fingers share.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
-from hmmseg.segmentation.motions import POINTS, Crossing, last_impact, log_launch, log_smooth
+POINTS = 41  # numerics: nodes per sample interval
+BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
+UNSEEN = 0.15  # prior: the same, as a share of the way that the velocities at both ends do not account for
+LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
+MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
+STARTS = 24  # numerics: nodes over the time at which that motion started
+ALONE = 0.1  # prior: share of grips to which fingers do not come as one
+SEVERAL = 0.1  # prior: share of landings within whose sample interval one motion ends and another begins
+SHAPE = 0.05  # prior: how far its speed may be off the minimum-jerk profile, as a share of it
+STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
+
+Kind = Literal["smooth", "impact", "launch"]
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A quantity [m] at both ends of a sample interval that crosses zero upwards inside it.
+
+    `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise.
+    `kind`: "smooth" motion through the crossing; "impact": the crossing stops it (a touch, a
+    touchdown); "launch": it sets in with the crossing (a block that was held down lifts off). `anywhere`:
+    probability that it happened at some moment of the interval, whatever the motion. `earlier`: how long
+    before the left end [s] another sample was, its value and its rate. `restless` [m^2/s^3]: variance
+    a second by which the rate wanders where another motion may begin within the interval; 0: it is one.
+    """
+
+    left: float
+    right: float
+    v_left: float
+    v_right: float
+    sd_left: float
+    sd_right: float
+    sd_v: float
+    kind: Kind = "smooth"
+    anywhere: float = 0.0
+    earlier: tuple[float, float, float] | None = None
+    restless: float = 0.0
+
+    @property
+    def known(self) -> bool:
+        """Whether no sample that it needs is missing."""
+        numbers = (self.left, self.right, self.v_left, self.v_right, self.sd_left, self.sd_right, self.sd_v)
+        return bool(np.isfinite(numbers).all())
+
+
+def log_smooth(c: Crossing, h: float, u: np.ndarray, bend: float | None = None) -> np.ndarray:
+    """Rice's formula on the cubic that joins both ends, give or take a `bend` [m] amid them."""
+    h00, h10, h01, h11 = _hermite(u)
+    d00, d10, d01, d11 = _hermite_slopes(u)
+    value = h00 * c.left + h10 * h * c.v_left + h01 * c.right + h11 * h * c.v_right
+    slope = (d00 * c.left + d01 * c.right) / h + d10 * c.v_left + d11 * c.v_right
+    if bend is None:
+        unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
+        bend = float(np.hypot(BEND * h * np.hypot(c.v_right - c.v_left, c.sd_v), UNSEEN * unseen))
+    variance = (h00 * c.sd_left) ** 2 + (h01 * c.sd_right) ** 2
+    variance += (h * c.sd_v) ** 2 * (h10**2 + h11**2) + (4 * u * (1 - u) * bend) ** 2
+    rise = np.hypot(slope, c.sd_v + bend / h)
+    return _log_normal(value, 0.0, np.sqrt(variance)) + np.log(rise * ndtr(slope / rise * 2))
+
+
+def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
+    """Probability (POINTS,) that every finger has hit by each node of an interval of h s.
+
+    Fingers move as one, so that duration and start of the motion are marginalised for all of them together;
+    or each by itself, as far as their readings say so. Distance, noise and stop are each finger's own.
+    """
+    u = (np.arange(POINTS) + 0.5) / POINTS
+    duration = np.geomspace(*MOTION, MOTIONS)[:, None, None]
+    starts = (np.arange(STARTS) + 0.5) / STARTS
+    age = starts[:, None] * (duration + h) - h  # since its start, at the first sample; uniform
+    log_prior = np.log(duration + h)[..., 0] + np.zeros(STARTS)
+    log_prior = log_prior - np.logaddexp.reduce(log_prior, axis=None)
+    together, every, apart, hits = log_prior, np.ones(1), 0.0, np.ones(1)
+    for c in impacts:
+        log_motion, log_after = _log_impact(c, h, u, duration, age / duration)
+        log_density = log_motion + log_after
+        peak = log_density.max(axis=-1, keepdims=True)
+        density = np.exp(log_density - peak)
+        total = density.sum(axis=-1)
+        log_own, own = peak[..., 0] + np.log(total), np.cumsum(density, axis=-1) / total[..., None]
+        together, every = together + log_own, every * own
+        evidence, hit = _mixed(log_prior + log_own, own)
+        apart, hits = apart + evidence, hits * hit
+    evidence, hit = _mixed(together, every)
+    if len(impacts) == 1:
+        return _or_several(impacts[0], h, u, log_prior[..., None] + log_motion, log_after, hit)
+    share = 1 / (1 + ALONE / (1 - ALONE) * np.exp(np.clip(apart - evidence, -500, 500)))
+    return share * hit + (1 - share) * hits
+
+
+def _or_several(
+    c: Crossing, h: float, u: np.ndarray, log_motion: np.ndarray, log_after: np.ndarray, hit: np.ndarray
+) -> np.ndarray:
+    """Probability (POINTS,) of a hit by one motion, as in `hit`, or by several within the interval.
+
+    `log_motion` are weights of what one motion may be, `log_after` how well each explains the right end. Of
+    several the rate wanders: the way is normal about what the rates at both ends make of it, h^3 / 12 times
+    the variance a second, and amid the interval off the cubic by h^3 / 192 (integrated Brownian motion).
+    """
+    if c.restless <= 0:
+        return hit
+    both = float(np.logaddexp.reduce(log_motion + log_after, axis=None))
+    one = both - float(np.logaddexp.reduce(log_motion, axis=None)) - np.log(STOPS)
+    unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
+    variance = c.restless * h**3 / 12 + c.sd_left**2 + c.sd_right**2 + (h * c.sd_v) ** 2 / 2
+    several = -0.5 * (unseen**2 / variance + np.log(variance))
+    share = 1 / (1 + (1 - SEVERAL) / SEVERAL * np.exp(np.clip(one - several, -500, 500)))
+    log_density = log_smooth(c, h, u, float(np.sqrt(c.restless * h**3 / 192)))
+    density = np.exp(log_density - log_density.max())
+    return (1 - share) * hit + share * np.cumsum(density) / density.sum()
+
+
+def _mixed(log_weight: np.ndarray, hit: np.ndarray) -> tuple[float, np.ndarray]:
+    """Log sum of weights (...), and the weighted mean of hit (..., POINTS)."""
+    peak = log_weight.max()
+    weight = np.exp(log_weight - peak)
+    axes = tuple(range(weight.ndim))
+    return float(peak + np.log(weight.sum())), (weight[..., None] * hit).sum(axis=axes) / weight.sum()
+
+
+def _log_impact(
+    c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log likelihoods (..., POINTS) of what precedes and of what follows an impact at u, given its motion.
+
+    A minimum-jerk motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample.
+    Its distance is unknown (log-uniform); gap and velocity of the first sample tell it. The face
+    that it hits is as likely in one place on its way as in another. After the hit the velocity
+    decays to v_right with an unknown time constant, which makes the compression `right`.
+    """
+    before, after = u * h, (1 - u) * h
+    at_hit = phase + before / duration
+    way = np.maximum(_minimum_jerk(at_hit) - _minimum_jerk(phase), 1e-9)
+    rate, rate_at_hit = _minimum_jerk_slope(phase) / duration, _minimum_jerk_slope(at_hit) / duration
+    gap, sd_v = -c.left, np.hypot(c.sd_v, SHAPE * max(c.v_left, -c.left / h))
+    # Each reading ~ N(distance share, sd), the distance integrated out: gap and speed, and those before.
+    shares, readings = [way, rate], [(gap, c.sd_left), (c.v_left, sd_v)]
+    if c.earlier is not None:
+        ago, value, speed_then = c.earlier
+        phase_then = phase - ago / duration
+        covered = value - c.left
+        shares += [
+            _minimum_jerk(phase_then) - _minimum_jerk(phase),
+            _minimum_jerk_slope(phase_then) / duration,
+        ]
+        readings += [(covered, np.hypot(np.sqrt(2.0) * c.sd_left, SHAPE * covered)),
+                     (speed_then, np.hypot(c.sd_v, SHAPE * max(speed_then, -covered / ago)))]  # fmt: skip
+    precision = sum((share / sd) ** 2 for share, (_, sd) in zip(shares, readings, strict=True))
+    weighed = sum(share * x / sd**2 for share, (x, sd) in zip(shares, readings, strict=True))
+    distance = np.maximum(weighed / precision, c.sd_left)
+    left_over = sum((x / sd) ** 2 for x, sd in readings) - weighed**2 / precision
+    log_before = -0.5 * left_over - 0.5 * np.log(precision) - np.log(distance)
+    speed = np.maximum(distance * rate_at_hit, c.sd_v)
+    stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
+    reach = stop * -np.expm1(-after / stop)
+    # What is left of `right`, but for its sign, when the velocity has decayed over this way; in place, as
+    # these are the largest arrays of a boundary.
+    apart = reach * (speed - c.v_right)
+    apart -= c.right - c.v_right * after
+    variance = reach**2 * (2 * SHAPE * speed) ** 2
+    variance += c.sd_right**2 + (c.sd_v * after) ** 2
+    log_after = _log_sum_normal(apart, variance)
+    return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + np.log(speed), log_after
+
+
+def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:
+    """Log density of a normal distribution but for a constant."""
+    return -0.5 * ((x - mean) / sd) ** 2 - np.log(sd)
+
+
+def _log_sum_normal(x: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Log of the sum along the first axis of normal densities, but for a constant; uses up its arguments."""
+    x *= x
+    x /= variance
+    x *= -0.5
+    peak = x.max(axis=0)
+    x -= peak
+    np.exp(x, out=x)
+    x /= np.sqrt(variance, out=variance)
+    return peak + np.log(x.sum(axis=0))
+
+
+def _minimum_jerk(phase: np.ndarray | float) -> np.ndarray | float:
+    s = np.clip(phase, 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def _minimum_jerk_slope(phase: np.ndarray | float) -> np.ndarray | float:
+    s = np.clip(phase, 0.0, 1.0)
+    return 30 * s**2 * (1 - s) ** 2
+
+
+def log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
+    """Log likelihood of a launch at u: a creep under load up to it, speed gained after it.
+
+    Under load the fingers creep by -left at the load's own pace, of which v_left is a noisy early
+    reading; from there to v_right they gain speed with constant jerk, as minimum-jerk motions
+    set in, so that the gain covers a third of what full speed would, give or take LAUNCH.
+    """
+    before, after = u * h, (1 - u) * h
+    creep = np.clip(-c.left / before, 0.0, max(c.v_right, c.sd_v))
+    gain = np.hypot(c.v_right - creep, c.sd_v)
+    sd = np.sqrt(c.sd_right**2 + (c.sd_v * after / 3) ** 2 + (LAUNCH * gain * after) ** 2)
+    log_after = _log_normal(c.right, (creep + (c.v_right - creep) / 3) * after, sd) + np.log(gain)
+    return log_after + _log_normal(c.v_left, 0.75 * creep, np.hypot(c.sd_v, 0.25 * creep))
+
+
+def _hermite(u: np.ndarray) -> tuple[np.ndarray, ...]:
+    return 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u, -2 * u**3 + 3 * u**2, u**3 - u**2
+
+
+def _hermite_slopes(u: np.ndarray) -> tuple[np.ndarray, ...]:
+    return 6 * u**2 - 6 * u, 3 * u**2 - 4 * u + 1, -6 * u**2 + 6 * u, 3 * u**2 - 2 * u
+
 
 ONSET = 0.001  # prior: s; a pad's force leads its compression by its viscosity, a few ms in foam
 UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, against what g leaves out

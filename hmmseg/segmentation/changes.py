@@ -1,9 +1,21 @@
-"""One contact change: where it may be, what its contacts show, and the posterior of its moment.
+"""One contact change: in which sample interval it may be, what its contacts show, and when it was.
+
+A contact is a penetration p(t) [m]: how far a finger is in a pad, or how far a block's weight is short of
+hanging on the pads alone. Where there is contact (p > 0) the force measures it, far more finely than
+positions do; where there is none the force is silent and the position measures how far apart things are:
+
+    contact: pressed ~ N(p, .), place ~ N(p, .), p > 0      apart: pressed ~ N(0, .), place ~ N(p, .), p < 0
+
+with p unknown, uniform over the range seen. Every sample so weighs contact against none, with p integrated
+out; a switch at interval n has the likelihood of all samples up to n before it and all later ones after it.
+The chain of contact states does not know that motion is continuous (a block that has just lifted is still
+near the ground); these samples do. The alignment says which contact is meant.
 
 Force and position must agree where there is contact. By how much they do not, at the contacts nearest to
-the changes of one kind in all recordings at hand (a block that a first finger pushed, a table that
-yields, pads that creep), is a discrepancy [m] that positions are then allowed. How often a force is silent
-while positions still find the pad pressed is the share of contacts that end abruptly.
+the changes of one kind in all recordings at hand (a block that a first finger pushed, a table that yields,
+pads that creep), is a discrepancy [m] that positions are then allowed. How often a force is silent while
+positions still find the pad pressed is the share of contacts that end abruptly. A change that may be one of
+several things (a grip that ends, the later of two touches) is a mixture of them.
 """
 
 from __future__ import annotations
@@ -13,14 +25,125 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import log_ndtr, ndtr
 
-from hmmseg.levels import SURE
+from hmmseg.levels import SURE, TAIL
 from hmmseg.segmentation.boundaries import (
+    ONSET,
+    POINTS,
     UNIFORM,
+    BoundaryPosterior,
+    Crossing,
+    Kind,
+    blurred,
+    crossing_density,
+    first_of,
 )
-from hmmseg.segmentation.motions import Kind
-from hmmseg.segmentation.switching import Penetration, switch_probability
+
+# prior: share of samples at which one sensor tells another story than the model (ringing, a block
+# pushed)
+STRAY = 0.02
+SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
+LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
+DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
+ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """One contact as sensed, arrays (num_samples,), NaN where missing.
+
+    `pressed` [m]: by the force; `place` [m]: by the position; `rate` (2, num_samples) [m/s] of `place`, just
+    before and just after each sample. `sd_pressed` is
+    the noise of the force, `form` the share by which a pad's force may be off its compression;
+    `sd_apart` [m]: what the force may be of itself where there is no contact. `hidden`: a rigid pad, whose
+    force tells that there is contact, but not how deep.
+    """
+
+    t: np.ndarray
+    pressed: np.ndarray
+    place: np.ndarray
+    rate: np.ndarray
+    sd_pressed: float
+    sd_apart: float
+    sd_place: float
+    sd_rate: float
+    form: float
+    hidden: bool = False
+    ahead: np.ndarray | None = None
+
+    @property
+    def free_place(self) -> np.ndarray:
+        """Place (num_samples,) [m] of a thing that is apart."""
+        return self.place if self.ahead is None else self.place + self.ahead
+
+    def restless(self, n: int) -> float:
+        """How much the speed of what comes down wanders up to sample n: its variance a second [m^2/s^3]."""
+        last = slice(max(n - LOOKED_BACK, 0), n + 1)
+        change, step = np.diff(self.rate[0, last]), np.diff(self.t[last])
+        there = np.isfinite(change)
+        wandered = float(np.sum(change[there] ** 2)) - 2 * self.sd_rate**2 * there.sum()
+        return max(wandered, 0.0) / float(step[there].sum()) if there.any() else 0.0
+
+
+def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Log-likelihoods (num_samples,) of contact and of none, p integrated out; a missing sensor adds nothing.
+
+    After the change forces are `louder` than their noise: in contact if it is made, apart if it is broken.
+
+    What is more likely amiss differs: before a touch (`making`) the face may lie elsewhere, as a finger
+    that came first pushes the block; after a release the force may ring.
+    """
+    sd_pressed, sd_apart = (
+        c.sd_pressed * (louder if making else 1.0),
+        c.sd_apart * (1.0 if making else louder),
+    )
+    force, position = np.isfinite(c.pressed), np.isfinite(c.place)
+    pressed, place = np.where(force, c.pressed, 0.0), np.where(position, c.place, 0.0)
+    log_force = np.log(2 * max(np.ptp(pressed), 10 * c.sd_pressed)) * force
+    log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
+    pushes = np.where(force, log_ndtr(pressed / sd_pressed), 0.0) - log_force
+    silent = np.where(force, _log_student(pressed / sd_apart) - np.log(sd_apart), 0.0)
+    # What stands on its corner comes to lie flat: its place is anywhere between.
+    ahead = np.zeros(c.t.size) if c.ahead is None else c.ahead
+    place, sd_place = place + ahead / 2, np.sqrt(c.sd_place**2 + ahead**2 / 12)
+    within = np.where(position, log_ndtr(place / sd_place), 0.0) - log_place
+    apart = np.where(position, c.free_place, 0.0)
+    beyond = np.where(position, log_ndtr(-apart / c.sd_place), 0.0) - log_place
+    sd_force = np.hypot(sd_pressed, c.form * np.abs(pressed))
+    both = np.hypot(sd_force, sd_place)
+    depth = (sd_place**2 * pressed + sd_force**2 * place) / both**2
+    agree = _log_student((pressed - place) / both) - np.log(both) - log_place
+    # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
+    # is lost in it, that would count against contact, of which force alone tells.
+    deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
+    agree = agree + np.log(np.maximum(ROOT_2PI * sd_place / deep, 1.0))
+    held = agree + log_ndtr(depth * both / (sd_force * sd_place))
+    held = np.where(force & position & (not c.hidden), held, pushes + within)
+    moved, rung = (STRAY, SELDOM) if making else (SELDOM, STRAY)
+    neither = np.log(STRAY * SELDOM) - log_force - log_place
+    contact = np.logaddexp.reduce([held, np.log(moved) + pushes - log_place, neither])
+    none = np.logaddexp.reduce([
+        silent + beyond, np.log(moved) + silent - log_place, np.log(rung) + beyond - log_force, neither,
+    ])  # fmt: skip
+    return contact, none
+
+
+def switch_probability(
+    c: Penetration, log_prior: np.ndarray, making: bool, louder: float = 1.0
+) -> np.ndarray:
+    """Probability (num_samples - 1,) that the contact is made, or broken, in each interval."""
+    contact, none = log_contact(c, making, louder)
+    before, after = (none, contact) if making else (contact, none)
+    log_weight = np.cumsum(before)[:-1] + np.cumsum(after[::-1])[::-1][1:] + log_prior
+    weight = np.exp(log_weight - log_weight.max())
+    return weight / weight.sum()
+
+
+def _log_student(z: np.ndarray) -> np.ndarray:
+    """Log density of a standard Student-t variable (its constant is that of TAIL degrees of freedom)."""
+    return -0.98082925 - (TAIL + 1) / 2 * np.log1p(z**2 / TAIL)
+
 
 LIKELY = 1e-3  # numerics: least probability of an interval within which the crossing is looked at
 SURROUNDING = 2.5  # chosen: sample intervals of the alignment within which it cannot tell one from another
@@ -205,3 +328,102 @@ def _last_pressed(c: Penetration, n: int) -> int:
     """The interval up to n at whose start the force last shows contact, whatever positions say."""
     sure = np.flatnonzero(c.pressed[: n + 1] > SURE * c.sd_pressed)
     return int(sure[-1]) if sure.size else n
+
+
+# prior: that a grip ends when its force is silent, when it slides, when it has opened
+VIEWS = (0.6, 0.2, 0.2)
+STOOD = 0.5  # prior: that a block stood still until the later finger touched it
+FRICTION = 0.1  # prior: share by which friction differs from one contact to another
+
+
+def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
+    """Posterior of the moment of a change, with what is `known` of its sort.
+
+    A grip may be said to end when a pad's friction is spent and it begins to slide, when its force is first
+    silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
+    meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
+
+    Of two touches the later comes when both fingers are the block's width apart, as the first pushes the
+    block; or, of a heavy block in soft pads and touches some ms apart, before it has moved (STOOD).
+    """
+    contacts, unmoved = (
+        [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in each]
+        for each in (change.contacts, change.unmoved)
+    )
+    views, weight = [contacts], (1.0,)
+    if unmoved:
+        views, weight = [contacts, unmoved], (1 - STOOD, STOOD)
+    if change.slips:
+        sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
+        opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
+        views, weight = [contacts, sliding, opened], VIEWS
+    found, t = [_seen(view, change, known) for view in views], contacts[0].t
+    sd = float(np.hypot(ONSET, change.timing))
+    times = np.concatenate([times for times, _ in found])
+    masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, found, strict=True)])
+    return blurred(times, masses, float(t[0]), float(t[-1]), sd)
+
+
+def _beyond(c: Penetration, slip: float) -> Penetration:
+    """The contact as far as it is deeper than where it slides [m]."""
+    sd = float(np.hypot(c.sd_place, FRICTION * slip))
+    return replace(c, pressed=np.maximum(c.pressed - slip, 0.0), place=c.place - slip, sd_place=sd)
+
+
+def _seen(
+    contacts: Sequence[Penetration], change: Change, known: Disagreement
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and masses of the moment at which contacts are made, or the first is broken."""
+    t, making = contacts[0].t, change.making
+    found = np.array([switch_probability(c, change.log_prior, making, known.louder) for c in contacts])
+    combined = crossing_density if making else first_of
+    inner = (np.arange(POINTS) + 0.5) / POINTS
+    times, masses = [], []
+    for n in range(t.size - 1):
+        width = float(t[n + 1] - t[n])
+        for chosen, mass in _shares(found, n, making):
+            if mass < LIKELY:
+                continue
+            deciding = [_crossing(contacts[i], n, change, known) for i in chosen]
+            density = combined(deciding if all(x.known for x in deciding) else [], width)
+            if not np.isfinite(density).all():
+                density = combined([], width)
+            times.append(t[n] + inner * width)
+            masses.append(mass * density)
+    return np.concatenate(times), np.concatenate(masses)
+
+
+def _shares(found: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ...], float]]:
+    """Which contacts decide the boundary in interval n, and with what probability.
+
+    `found` (num_contacts, num_intervals): independent switch probabilities. Two contacts made in one
+    interval decide together, else the later one; of contacts broken, the earlier.
+    """
+    if len(found) == 1:
+        return [((0,), float(found[0, n]))]
+    done = found[:, :n].sum(axis=1) if making else found[:, n + 1 :].sum(axis=1)
+    a, b = found[:, n]
+    return [((0, 1), float(a * b)), ((0,), float(a * done[1])), ((1,), float(b * done[0]))]
+
+
+def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Crossing:
+    """The crossing of interval n: by position where apart, by force where there is contact."""
+    making, kind = change.making, change.kind
+    touching, apart = (n + 1, n) if making else (n, n + 1)
+    pressed, gap = c.pressed[touching], c.free_place[apart]
+    noise = c.sd_pressed * (known.louder if making else 1.0)
+    sd_pressed = float(np.hypot(noise, c.form * abs(pressed)))
+    if c.hidden:  # a rigid pad hides its compression
+        pressed = max(c.place[touching], 0.0)
+        sd_pressed = c.sd_place + 0.5 * abs(gap)
+    before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
+    if making:
+        found = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
+        if len(change.contacts) == 1:  # a block is set down in several motions
+            return replace(found, restless=c.restless(n))
+        if n == 0:
+            return found
+        then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
+        return replace(found, earlier=then) if np.isfinite(then).all() else found
+    share = abrupt(known.abrupt, inside(c, n)) if kind == "smooth" else 0.0
+    return Crossing(-pressed, -gap, -before, -after, sd_pressed, c.sd_place, c.sd_rate, kind, float(share))

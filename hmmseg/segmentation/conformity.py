@@ -1,10 +1,15 @@
 """Does a trial show its task? The task's order against contact states in any order.
 
-One hidden Markov model holds both: the chain of the task's subtasks, and the states of
-free_contacts, into which a path may leave the chain for good. P(leaving) is small (DEPARTURE), so
-that a trial counts as a misfit only where leaving gains more evidence than that (posterior odds
-above 1); the subtask that the path then does not reach is the one that fails. Ending before the
-last subtask, or starting outside of the first one, is leaving as well.
+One hidden Markov model holds both: the chain of the task's subtasks, and the states of free_contacts, into
+which a path may leave the chain for good. P(leaving) is small (DEPARTURE), so that a trial counts as a
+misfit only where leaving gains more evidence than that (posterior odds above 1); the subtask that the path
+then does not reach is the one that fails. Ending before the last subtask, or starting outside of the first
+one, is leaving as well. Contacts ring and bounce for a while after each change, so every state is entered
+through settling stages (docs/model.md).
+
+Of a trial that fails, the subtasks up to the failing one are reported and, counted back from the end, those
+that the recording's last runs still match (same contact state, same block). What lies between belongs to no
+subtask.
 """
 
 from __future__ import annotations
@@ -15,14 +20,132 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.contact.decompose import FREE, Subtask, height_equations, subtasks
+from hmmseg.contact.decompose import (
+    ABOVE_GROUND,
+    FREE,
+    ON_GROUND,
+    SLIDING,
+    Subtask,
+    height_equations,
+    subtasks,
+)
 from hmmseg.hmm.alignment import align
 from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED
-from hmmseg.segmentation.departure import column, departing, leaving, scored, settled
-from hmmseg.segmentation.emissions import Features
-from hmmseg.segmentation.first_look import Block
-from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts, log_evidence, most_probable
+from hmmseg.segmentation.boundaries import BoundaryPosterior
+from hmmseg.segmentation.emissions import Features, Parameters
+from hmmseg.segmentation.free_contacts import (
+    IMPOSSIBLE,
+    RINGING,
+    Block,
+    FreeContacts,
+    fit_free_contacts,
+    log_evidence,
+    most_probable,
+    switching,
+)
+
+DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
+SETTLING, STAGES = 0.2, 3  # prior: s, and most stages (of an Erlang law) in which a contact state settles
+BRIEF = 1e-8  # prior: to end before is less likely by this: a bounce is no grip, a halt in the air no place
+
+
+def column(free: FreeContacts, step: Subtask, assignment: dict[str, int | None]) -> int | None:
+    """Index in `free.states` of what a subtask looks like in one trial; None: it has no such block."""
+    state = (step.state, None if step.state == FREE else assignment.get(str(step.object)))
+    return free.states.index(state) if state in free.states else None
+
+
+def scored(free: FreeContacts, columns: Sequence[int | None]) -> np.ndarray:
+    """Log-likelihoods (num_timesteps, num_subtasks + num_states) of the chain and then the free states."""
+    n = len(free.table)
+    chain = [np.full(n, IMPOSSIBLE) if c is None else free.table[:, c] for c in columns]
+    return np.column_stack([*chain, free.table])
+
+
+def settled(
+    free: FreeContacts, columns: Sequence[int | None], log_initial: np.ndarray, log_transition: np.ndarray
+) -> tuple[np.ndarray, int, tuple[np.ndarray, np.ndarray]]:
+    """Log-likelihoods with all settling stages, their number, and the model (initial, transitions)."""
+    stages = int(np.clip(round(SETTLING / free.interval / 2), 1, STAGES))
+    settle = min(0.5, stages * free.interval / SETTLING)
+    index = np.r_[[-1 if c is None else c for c in columns], np.arange(len(free.states))]
+    table = scored(free, columns)
+    every = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
+    every[:, -1] = table
+    every[:, :-1] = _settling_table(table, index, free)[:, None]
+    for i, c in enumerate(columns):  # a block is let go by fingers that open; a path that leaves may lose it
+        if c is not None and i > 0 and free.states[c][0] == FREE:
+            every[:, 0, i] += free.opened[: len(table)]
+    model = _settling(log_initial, log_transition, stages, settle)
+    return every.reshape(len(table), -1), stages, model
+
+
+def departing(
+    states: tuple[tuple[str, int | None], ...], columns: Sequence[int | None], leave: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log initial and transition probabilities of the chain followed by the free states.
+
+    `leave`: probability per sample that a contact state ends.
+    """
+    k, num_states = len(columns), len(states)
+    out = np.full((k + num_states, k + num_states), -np.inf)
+    out[k:, k:] = switching(states, leave)
+    index = np.arange(k)
+    out[index, index] = np.log1p(-leave)
+    out[index[:-1], index[1:]] = np.log(leave) + np.log1p(-DEPARTURE)
+    for i, same in enumerate(columns):
+        if same is not None:
+            follows = np.isfinite(out[k + same, k:])
+            follows[same] = False  # to go on in the same state is not to leave
+            out[i, k:][follows] = np.log(leave * DEPARTURE / max(follows.sum(), 1))
+    initial = np.full(k + num_states, np.log(DEPARTURE / num_states))
+    initial[: k + 1] = -np.inf  # whatever is free motion at the start is the task's own
+    initial[0] = np.log1p(-DEPARTURE)
+    return initial, out
+
+
+def leaving(num_subtasks: int, n: int) -> float:
+    """Probability per sample that a contact state ends: as many of them as the task has."""
+    return min(0.5, num_subtasks / n)
+
+
+def _settling(
+    log_initial: np.ndarray, log_transition: np.ndarray, stages: int, settle: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every state stages + 1 times: it is entered in the first and settled in the last.
+
+    A stage passes to the next with `settle` per sample, so that durations are Erlang rather than
+    geometric; before the last, leaving the state has BRIEF of its probability. A recording starts
+    settled. Log initial and transition probabilities over (stages, states).
+    """
+    same = np.eye(log_initial.size, dtype=bool)
+    stay, move = np.where(same, log_transition, -np.inf), np.where(same, -np.inf, log_transition)
+    blocks = [[np.full_like(stay, -np.inf)] * (stages + 1) for _ in range(stages + 1)]
+    for i in range(stages):
+        blocks[i][i], blocks[i][i + 1] = stay + np.log1p(-settle), stay + np.log(settle)
+        blocks[i][0] = np.logaddexp(blocks[i][0], move + np.log(BRIEF))
+    blocks[-1][-1], blocks[-1][0] = stay, move
+    return np.r_[np.full(stages * log_initial.size, -np.inf), log_initial], np.block(blocks)
+
+
+def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) -> np.ndarray:
+    """Log-likelihoods (num_timesteps, num_states) while a contact settles.
+
+    Fingers and block ring for a while after any contact change. What the forces of a ringing sample
+    do says which block is held, but not how: every hold of it scores as the likeliest of them. Fingers that
+    have just let go ring in the air.
+    """
+    out = table.copy()
+    blocks = np.array([-1 if block is None else block for _, block in free.states])
+    block = np.where(columns < 0, -1, blocks[columns])
+    out[:, (columns >= 0) & (block < 0)] = free.ringing[: len(table), None]
+    for number in np.unique(block[block >= 0]):
+        same = block == number
+        ringing = np.log(RINGING) + table[:, same].max(axis=1, keepdims=True)
+        out[:, same] = np.logaddexp(np.log1p(-RINGING) + table[:, same], ringing)
+    return out
+
 
 ENDING = 1e-3  # prior: and that its recording stops before the task's end
 # cited: s; nobody grips anew before a slip was felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
@@ -279,3 +402,168 @@ def _runs(path: np.ndarray, steps: Sequence[Subtask], free: FreeContacts,
         state, block = (steps[k].state, None) if column is None else free.states[column]
         out.append(Run(state, block, int(start), int(stop), k if chained else None))
     return tuple(out)
+
+
+PHRASES = {
+    ON_GROUND: "held on the ground", ABOVE_GROUND: "held above the ground", SLIDING: "pushed along",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The order that a misfit trial shows, as steps to align it with.
+
+    The first `num_before` steps are the task's first; the last `num_after` its last. `start` are
+    the alternative's parameters under the names that the steps give to blocks.
+    """
+
+    steps: tuple[Subtask, ...]
+    num_before: int
+    num_after: int
+    start: Parameters
+
+
+def plan(c: Conformity, steps: tuple[Subtask, ...]) -> Plan:
+    """The order shown by a trial that fails."""
+    failing = c.failing
+    if failing is None:
+        raise ValueError("the trial fits its task")
+    if c.wrong_rise is not None:  # other blocks or places than the task's: nothing after is the task's
+        runs = [
+            r if r.subtask is not None and r.subtask < failing else replace(r, subtask=None) for r in c.runs
+        ]
+    else:
+        runs = list(c.runs)
+    before = sum(r.subtask is not None for r in runs)
+    after = 0 if c.wrong_rise is not None else _matching(runs[before:], steps[failing + 1 :], c)
+    own = {block: name for name, block in reversed(c.assignment.items()) if block is not None}
+    shown, held = [], False
+    for i, run in enumerate(runs):
+        k = len(steps) - len(runs) + i if i >= len(runs) - after else run.subtask
+        if k is None:
+            names = {FREE: "release", ON_GROUND: "place" if held else "pickup", SLIDING: "slide",
+                     ABOVE_GROUND: "carry"}  # fmt: skip
+            block = None if run.block is None else own.get(run.block, f"block {run.block}")
+            shown.append(Subtask(i, names[run.state], block, run.state, None))
+        else:
+            shown.append(replace(steps[k], index=i))
+        held = run.state != FREE
+    called = {str(s.object): str(run.block) for s, run in zip(shown, runs, strict=True) if s.state != FREE}
+    learned = c.free.parameters
+    start = replace(
+        learned,
+        weight={name: learned.weight[block] for name, block in called.items()},
+        width={name: learned.width[block] for name, block in called.items()},
+    )
+    return Plan(tuple(shown), before, after, start)
+
+
+def _matching(runs: Sequence[Run], tail: Sequence[Subtask], c: Conformity) -> int:
+    """How many of the last runs match the task's last subtasks."""
+    count = 0
+    for run, step in zip(reversed(runs), reversed(tail), strict=False):
+        expected = None if step.state == FREE else c.assignment.get(str(step.object))
+        if run.state != step.state or run.block != expected:
+            break
+        count += 1
+    return count if count > 1 else 0  # free motion alone says nothing of which release it is
+
+
+def task_boundaries(
+    shown: Plan, found: Sequence[BoundaryPosterior], num_subtasks: int, first: float, last: float
+) -> tuple[BoundaryPosterior, ...]:
+    """The task's boundaries from those of the order shown.
+
+    The failing subtask takes all that belongs to none; missing ones after it have no length.
+    """
+    every = [at(first), *found, at(last)]  # every[i] is where step i starts
+    resume = every[len(shown.steps) - shown.num_after]
+    out = []
+    for k in range(1, num_subtasks):
+        back = num_subtasks - k
+        if k <= shown.num_before:
+            out.append(every[k])
+        elif back < shown.num_after:
+            out.append(every[len(shown.steps) - back])
+        else:
+            out.append(resume)
+    return tuple(out)
+
+
+def at(t: float) -> BoundaryPosterior:
+    """A boundary that is known to be at t [s]."""
+    return BoundaryPosterior(np.array([t]), np.array([1.0]))
+
+
+def explain(
+    c: Conformity, steps: tuple[Subtask, ...], starts: Sequence[float], stands: np.ndarray | None = None
+) -> str:
+    """Why the failing subtask is not there, in plain words.
+
+    `starts` [s]: when each step of the order shown starts; `stands` [s]: when a finger stood on something.
+    """
+    if c.failing is None:
+        raise ValueError("the trial fits its task")
+    expected = steps[c.failing]
+    if c.wrong_rise is not None:
+        moved = "raised" if c.wrong_rise > 0 else "lowered"
+        distance = f"{abs(c.wrong_rise) * 1e3:.0f} mm from pickup to place"
+        return (
+            f"{expected.object} was {moved} by {distance}, against the task: another block, or another place"
+        )
+    left = next((i for i, run in enumerate(c.runs) if run.subtask is None), None)
+    if left is None:
+        return _ended(steps[c.failing - 1], c.runs)
+    if left == 0:
+        return f"the recording starts while a block is {PHRASES[c.runs[0].state]}"
+    if c.runs[left].state == FREE:
+        return _stood(steps[left - 1], left, starts, stands) or _let_go(c, steps[left - 1], left, starts)
+    if c.runs[left - 1].state == FREE:
+        return _gripped(c, steps, left, starts[left])
+    step, then = steps[left - 1], PHRASES[c.runs[left].state]
+    return f"{step.object} is {then} at {starts[left]:.2f} s, where the task has {steps[c.failing].name}"
+
+
+def _ended(last: Subtask, runs: Sequence[Run]) -> str:
+    if last.state != FREE:
+        return f"the recording ends while {last.object} is {PHRASES[last.state]}"
+    grips = sum(a.state == FREE != b.state for a, b in itertools.pairwise(runs))
+    number = {0: "", 1: "second ", 2: "third "}.get(grips, "further ")
+    return f"no {number}grip: the recording ends in free motion"
+
+
+def _stood(held: Subtask, left: int, starts: Sequence[float], stands: np.ndarray | None) -> str:
+    """What is said of a grip that never lifted, where a finger stood on something meanwhile."""
+    if stands is None or held.name != "pickup":
+        return ""
+    before = starts[left - 2] if left > 1 else -np.inf  # free motion before the grip
+    then = stands[(stands >= before) & (stands < starts[left])]
+    if not then.size:
+        return ""
+    return (
+        f"a finger pushed down on something at {then[0]:.2f} s, harder than a grip could, before "
+        f"{held.object} was held: on the ground, or on what the task does not name"
+    )
+
+
+def _let_go(c: Conformity, held: Subtask, left: int, starts: Sequence[float]) -> str:
+    where = {"carry": " in mid-air", "pickup": " without being lifted"}.get(held.name, "")
+    text = f"{held.object} was let go{where} at {starts[left]:.2f} s"
+    again = next((i for i in range(left + 1, len(c.runs)) if c.runs[i].state != FREE), None)
+    if again is not None and c.runs[again].block == c.runs[left - 1].block:
+        text += f" and gripped again at {starts[again]:.2f} s"
+    return text
+
+
+def _gripped(c: Conformity, steps: tuple[Subtask, ...], left: int, t: float) -> str:
+    if left == len(steps):
+        return f"the recording goes on after the task's end with another grip at {t:.2f} s"
+    expected, block = steps[left].object, c.runs[left].block
+    before = [
+        str(steps[r.subtask].object) for r in c.runs[:left] if r.subtask is not None and r.block == block
+    ]
+    if block is not None and before and before[-1] != expected:
+        return f"{before[-1]} was gripped again at {t:.2f} s, not {expected}"
+    if block != c.assignment.get(str(expected)):
+        return f"another block than {expected} was gripped at {t:.2f} s"
+    return f"{expected} is {PHRASES[c.runs[left].state]} from the moment it is gripped at {t:.2f} s"

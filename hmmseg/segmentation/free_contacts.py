@@ -1,11 +1,15 @@
 """The unconstrained alternative to a task: contact states in any order, fitted to one trial alone.
 
-States are free motion and, for every distinct block the trial shows (grips of like width and
-weight are one block), hold on ground, hold above ground and, where the task slides, sliding;
-any state may follow any other. Emissions are those of contact_emissions, but for two things: no
-resting levels (each hold would need its own), and a lifted block may also be held still, which
-must not pass for a rest on something. Fitted by Viterbi training from robust starts, so that an
-order forced on a trial that does not have it cannot spoil weights or widths.
+States are free motion and, for every distinct block the trial shows (grips of like width and weight are one
+block), hold on ground, hold above ground and, where the task slides, sliding; any state may follow any
+other. Emissions are those of `hmmseg.segmentation.emissions`, but for two things: no resting levels (each
+hold would need its own), and a lifted block may also be held still, which must not pass for a rest on
+something. Fitted by Viterbi training from robust starts, so that an order forced on a trial that does not
+have it cannot spoil weights or widths.
+
+A pad that holds a block by its side passes on at most its friction, |fy| <= mu |fx| (Coulomb). A finger
+that pushes down harder than that stands on something; fingers that both press while they are farther apart
+than their block is wide have something else between them.
 """
 
 from __future__ import annotations
@@ -17,12 +21,174 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
-from hmmseg.robust import median_of_known
-from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
-from hmmseg.segmentation.first_look import Block, blocks_of, filled, runs, ungripped
-from hmmseg.segmentation.fit import maximisation
-from hmmseg.segmentation.standing import standing
+from hmmseg.levels import MOVED, SURE
+from hmmseg.robust import NORMAL, median_of_known, robust_sd
+from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
+from hmmseg.segmentation.fit import maximisation, otsu
+
+SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
+SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
+PRESSED = 30  # chosen: noise sds of a grip force that is there all the time, and so no bias
+# chosen: m from the heights at a grip's ends (medians of so many samples) to be lifted
+RAISED, ENDS = 3e-3, 3
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block as one trial shows it: `width` [m] and `weight` [N] (NaN: never lifted)."""
+
+    width: float
+    weight: float
+
+    def like(self, other: Block, slack: float = 1.0) -> bool:
+        """Whether both can be the same block: like widths, and weights where both are known.
+
+        `slack` multiplies the tolerances.
+        """
+        narrow = abs(self.width - other.width) <= slack * SAME_WIDTH
+        apart = abs(self.weight - other.weight)  # NaN where either is unknown, which excludes nothing
+        return bool(narrow and not apart > slack * SAME_WEIGHT * max(self.weight, other.weight))
+
+
+def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
+    """Force biases (4,), force scale and which samples are gripped: a start from the grip force.
+
+    Otsu's split always finds two groups. They are free and gripped only where they lie far
+    apart in terms of noise; where the lower one carries force as well, all is gripped.
+    """
+    found = np.array([noise_sd(f.force[:, c]) for c in range(4)])
+    noise = max(median_of_known(found, 0.0), 1e-3 * f.span["force"])
+    grip = f.grip
+    there = np.isfinite(grip)
+    every = np.ones(grip.size, bool)
+    if there.sum() < 2:
+        return np.zeros(4), noise, ~every
+    split = otsu(grip)
+    low, high = grip[there & (grip <= split)], grip[there & (grip > split)]
+    apart = high.size > 0 and np.median(high) - np.median(low) > SURE * noise
+    # Where one group alone is there, opposed forces far above the noise are a grip, others a bias.
+    opposed = abs(median_of_known(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
+    if np.median(low) > (0.3 * np.median(high) if apart else PRESSED * noise) and opposed:
+        return np.zeros(4), noise, every
+    threshold = np.median(low) + 0.25 * (np.median(high) - np.median(low)) if apart else np.inf
+    held = filled(grip) > threshold
+    free = f.force[~held]
+    bias = np.array([median_of_known(free[:, c], 0.0) for c in range(4)])
+    spread = np.array([NORMAL * median_of_known(np.abs(free[:, c] - bias[c]), np.nan) for c in range(4)])
+    return bias, max(median_of_known(spread, 0.0), noise), held
+
+
+def filled(values: np.ndarray) -> np.ndarray:
+    """Values with what is missing interpolated; zeros where all are."""
+    there = np.flatnonzero(np.isfinite(values))
+    return np.interp(np.arange(values.size), there, values[there]) if there.size else np.zeros(values.size)
+
+
+def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = False) -> tuple[Block, ...]:
+    """Distinct blocks among the grips, each grip's width and weight by robust means.
+
+    What is weighed is what surely moves. Where its load is lost in noise no weight is known; if `guessing`
+    it is what that load seems to be, two standard errors at least.
+    """
+    fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
+    fx1, fx2 = (filled(f.force[:, c] - bias[c]) for c in (0, 2))
+    widths = block_width(f.d, fx1, fx2, f.pads)
+    noise = noise_sd(f.force[:, 1])
+    found: list[Block] = []
+    for start, stop in runs(held):
+        span = slice(start, stop)
+        width = median_of_known(widths[span], np.nan)
+        if stop - start < 2 or not np.isfinite(width):
+            continue
+        lifted = (fy / f.carrying)[span][_lifted(f, span, guessing)]
+        lifted = lifted[np.isfinite(lifted)]
+        weight = float(np.median(lifted)) if lifted.size > 2 else np.nan
+        # Of the median of n sums of two forces, whose standard error is sqrt(pi / 2) sqrt(2 / n) sds of one.
+        error = noise * np.sqrt(np.pi / max(lifted.size, 1))
+        least = weight if guessing else 3 * error
+        block = Block(width, max(weight, 2 * error) if weight >= least else np.nan)
+        match = next((i for i, other in enumerate(found) if block.like(other)), None)
+        if match is None:
+            found.append(block)
+        elif not np.isfinite(found[match].weight):
+            found[match] = block
+    return tuple(found)
+
+
+def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
+    """Which samples of one grip, (stop - start,), are surely of a lifted block; if `guessing`, probably.
+
+    Whatever is lifted moves vertically; a block that is pushed or only gripped does not. Velocities
+    tell it where they are known and exact; heights, which last longer, tell it of poor recordings: far
+    from where the grip begins and from where it ends. A block that falls is where its grip ends, so that the
+    guess is what is far from where it begins.
+    """
+    moving = np.abs(f.vy[span]) > 6 * f.sd_vy[span]
+    height = filled(f.y)[span]
+    least = np.maximum(4 * f.sd_y[span], RAISED)
+    ends = np.median(height[:ENDS]), np.median(height[-ENDS:])
+    return moving | np.all([np.abs(height - end) > least for end in ends[: 1 if guessing else 2]], axis=0)
+
+
+def runs(found: np.ndarray) -> list[tuple[int, int]]:
+    """Where each stretch of true samples starts and stops."""
+    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+FRICTION = 1.5  # cited: rubber on dry solids reaches about 1 to 1.4 (Persson, J. Chem. Phys. 115, 2001)
+CLEAR = 6.0  # numerics: standard deviations, so that no noise of an hour at 1 kHz is taken for a touch
+BRIEF = 0.05  # physics: s; an impact of hard parts rings no longer
+
+
+def standing(t: np.ndarray, force: np.ndarray, sd_force: float, free: np.ndarray) -> np.ndarray:
+    """Booleans (num_timesteps,): samples of stretches in which a finger stands on something.
+
+    `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N] at t [s]; `sd_force`: their noise, NaN if not stated.
+    `free` (num_timesteps,) marks free motion: offsets and spread of the vertical forces are learned there.
+    """
+    out = np.zeros(t.size, bool)
+    for across, along in (force[:, :2].T, force[:, 2:].T):
+        rest = along[free & np.isfinite(along)]
+        centre = float(np.median(rest)) if rest.size else 0.0
+        spread = robust_sd(rest - centre) if rest.size else 0.0
+        limit = FRICTION * np.abs(np.nan_to_num(across)) + CLEAR * max(spread, float(np.nan_to_num(sd_force)))
+        out |= _lasting(centre - np.nan_to_num(along, nan=np.inf) > limit, t)
+    return out
+
+
+def astride(
+    t: np.ndarray, press: np.ndarray, apart: np.ndarray, sd_force: float, width: float, touch: float
+) -> tuple[float, float] | None:
+    """When fingers that close on a block first had something wider between them [s], and how wide [m] it was.
+
+    None where nothing was. `press` (num_timesteps, 2): what each finger presses inwards with [N] at t [s],
+    `sd_force` its noise; `apart` (num_timesteps,): width [m] of what is between them, if anything. The block
+    is `width` [m] wide and is touched at `touch` [s]. Fingers that press no more for longer than an impact
+    have let go meanwhile: what they did before belongs to no closing.
+    """
+    pressed = press > SURE * sd_force
+    n = int(np.searchsorted(t, touch))
+    any_pressed = np.flatnonzero(pressed[:n].any(axis=1))
+    last, first = touch, n
+    for i in any_pressed[::-1]:
+        if last - t[i] > BRIEF:
+            break
+        first, last = int(i), float(t[i])
+    found = np.flatnonzero(pressed[first:n].all(axis=1) & (apart[first:n] > width + MOVED))
+    return (float(t[first + found[0]]), float(apart[first + found[0]])) if found.size else None
+
+
+def _lasting(found: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Those stretches of `found` that last longer than an impact."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], found, [False]])))
+    out = np.zeros_like(found)
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        out[start:stop] = stop - start > 1 and t[stop - 1] - t[start] >= BRIEF
+    return out
+
 
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
 CLOSED = (

@@ -1,25 +1,277 @@
-"""Posteriors of the boundaries of an aligned trial, and its spans."""
+"""Posteriors of an aligned trial's boundaries, from what finger and block show of each contact change.
+
+A block in a hand that rolls hangs askew: one of its corners meets the ground before its middle would.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from hmmseg.contact.decompose import FREE, Subtask
-from hmmseg.hand.signals import Signals
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
+from hmmseg.contact.equations import Pads, block_offset, block_y, corner_drop, hanging
+from hmmseg.hand.rates import one_sided
+from hmmseg.hand.roll import slow_roll
+from hmmseg.hand.signals import Signals, central_differences
 from hmmseg.hmm.alignment import AlignmentPosterior
-from hmmseg.levels import DRIFTS
-from hmmseg.segmentation.boundaries import BoundaryPosterior, combine, normal
-from hmmseg.segmentation.changes import Change, Disagreement, Prior
-from hmmseg.segmentation.crossings import contacts
-from hmmseg.segmentation.emissions import Parameters
-from hmmseg.segmentation.moment import moment
-from hmmseg.segmentation.motions import Kind
-from hmmseg.segmentation.pads import Sensing
+from hmmseg.levels import DRIFTS, SURE
+from hmmseg.robust import median_of_known
+from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal
+from hmmseg.segmentation.changes import Change, Disagreement, Penetration, Prior, cut, moment
+from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
+from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span
-from hmmseg.segmentation.tilt import corner_drops
+
+
+def tilts(
+    s: Signals, pads: Pads, ends: Sequence[tuple[float, float]], steps: Sequence[Subtask]
+) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """Of each carry its samples (num_timesteps,) and, on them, the block's tilt [rad], and its error [rad].
+
+    Against how it stood when it was gripped: as the recorded roll of the hand says, else as the pads'
+    places on the block show, of fingers that are one gripper's. `ends` (num_subtasks, 2) [s]: first and last
+    time of every subtask.
+    """
+    if s.roll is None and not s.coupled:  # a block slips along one finger and stays upright
+        return
+    offset = block_offset(s.offset, s.fy1, s.fy2, pads)
+    for before, step in pairwise(steps):
+        start, end = ends[step.index]
+        lift = ends[before.index][1]
+        inside = (s.t >= start) & (s.t <= end)
+        stood = (s.t > lift - DRIFTS) & (s.t <= lift)
+        if (before.state, step.state) != (ON_GROUND, ABOVE_GROUND) or not inside.any():
+            continue
+        shown = offset if s.roll is None else s.roll
+        stood &= np.isfinite(shown)
+        if not stood.any():
+            continue
+        change = shown[inside] - np.median(shown[stood])
+        if s.roll is not None:
+            yield inside, change, 0.0
+        else:
+            yield inside, *slow_roll(s.t[inside], change, s.distance[inside])
+
+
+def corner_drops(
+    s: Signals, pads: Pads, ends: Sequence[tuple[float, float]], steps: Sequence[Subtask]
+) -> tuple[np.ndarray, float]:
+    """How far the lowest corner of what is carried lies below its base's middle (num_timesteps,) [m], and sd.
+
+    After a landing as at its moment, until the block stands flat.
+    """
+    out, worst = np.zeros(s.t.size), 0.0
+    for inside, tilt, sd in tilts(s, pads, ends, steps):
+        there = s.distance[inside][np.isfinite(s.distance[inside])]
+        if not there.size:
+            continue
+        width = float(np.median(there))
+        out[inside] = np.nan_to_num(corner_drop(width, tilt))
+        last = np.flatnonzero(inside)[-1]
+        following = np.flatnonzero(s.t <= s.t[last] + DRIFTS)
+        out[last + 1 : following[-1] + 1] = out[last]
+        worst = max(worst, float(corner_drop(width, sd)))
+    return out, worst
+
+
+PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
+STIFFEST = 1e-7  # numerics: m/N
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Fingertip signals of one trial with what the fit knows: biases, weights, pads and noise.
+
+    `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
+    position along its own closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just
+    after each sample, by finger, `sinking` (2, T) that of the mean height downwards [m/s]; `deflection` (T,):
+    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N];
+    `drop` (T,): how far the lowest corner of a carried block lies below the middle of its base [m].
+    """
+
+    signals: Signals
+    sensing: Sensing
+    compression: np.ndarray
+    inward: np.ndarray
+    inward_rate: np.ndarray
+    sinking: np.ndarray
+    deflection: np.ndarray
+    tangential: np.ndarray
+    drop: np.ndarray
+    weight: dict[str, float]
+    sd: dict[str, float]
+
+    def change(
+        self, before: Subtask, after: Subtask, prior: Prior, held: tuple[float, float]
+    ) -> Change | None:
+        """What is known of one boundary; None: these signals say nothing of it.
+
+        `held` [s]: a stretch on the held side of the boundary in which the block rests or is held.
+        """
+        stretch = (self.signals.t >= held[0]) & (self.signals.t <= held[1])
+        if not stretch.any():
+            return None
+        timing = self.sensing.delay_sd
+        if FREE in (before.state, after.state):
+            making = before.state == FREE
+            rests = (after if making else before).state == ON_GROUND
+            fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
+            if making:
+                pushed = tuple(self._finger(i, stretch, making, False) for i in (0, 1))
+                return cut(Change(pushed, prior, making, "impact", timing, unmoved=fingers if rests else ()))
+            slips = tuple(self._slip(i, stretch) for i in (0, 1))
+            return cut(Change(fingers, prior, making, "smooth", timing, slips))
+        if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
+            making = after.state == ON_GROUND
+            load = self._load(before, stretch, making)
+            if self.signals.timing is not None:
+                timing = float(
+                    np.hypot(timing, np.median(self.signals.timing[stretch][:: 1 if making else -1][:2]))
+                )
+            return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
+        return None
+
+    def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
+        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
+        inward, rate, sd_inward = self.inward[i], self.inward_rate[:, i], self.sd["inward"]
+        if rests:
+            moved, moving = self._pushed(1 - i, held)
+            inward, rate, sd_inward = inward + moved, rate + moving, np.sqrt(2.0) * sd_inward
+        else:
+            inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
+        face = median_of_known(inward[held] - self.compression[i, held])
+        # A pad of another stiffness would put the face elsewhere.
+        pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
+        sd_inward = float(np.hypot(sd_inward, self.sensing.normal.doubt * pressed))
+        sd = self.sd["compression"]
+        return self._timely(Penetration(
+            self.signals.t, self.compression[i], inward - face, rate, sd, sd,
+            sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
+            self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
+        ), making)  # fmt: skip
+
+    def _slip(self, i: int, held: np.ndarray) -> float:
+        """Compression [m] at which finger i slides off a block that it has `held`: friction bears no more."""
+        if self.sensing.friction <= 0:
+            return 0.0
+        needed = np.abs(median_of_known(self.tangential[i, held])) / self.sensing.friction
+        return float(np.nan_to_num(_compression(np.array([needed]), self.sensing)[0]))
+
+    def _pushed(self, i: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far finger i has pushed the block from where it rested (T,) [m], and its speed (2, T) [m/s].
+
+        A finger that comes first, or stays longer, pushes the block: as long as it touches, its own
+        position less its pad's compression is where the block is.
+        """
+        pressed = self.compression[i]
+        face = median_of_known(self.inward[i, held] - pressed[held])
+        moved = self.inward[i] - pressed - face
+        doubt = np.hypot(self.sd["inward"], self.sensing.normal.form * pressed)
+        pushes = (pressed > SURE * self.sd["compression"]) & (np.abs(moved) > PUSHED * doubt)
+        moving = self.inward_rate[:, i] - np.gradient(pressed, self.signals.t)
+        return np.where(pushes, moved, 0.0), np.where(pushes & np.isfinite(moving), moving, 0.0)
+
+    def _load(self, before: Subtask, held: np.ndarray, making: bool) -> Penetration:
+        """The fingers below the height at which the pads' shear just carries the weight."""
+        y = self.signals.y
+        level = median_of_known(y[held] - self.deflection[held])
+        carrying = hanging(self.weight[str(before.object)], shown(self.sensing.pads))
+        sd_y = float(np.hypot(self.sd["y"], self.sensing.shear.doubt * carrying))
+        return self._timely(Penetration(
+            self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
+            self.sd["deflection"], self.sd["carried"], sd_y, self.sd["vy"],
+            self.sensing.shear.form, self.sensing.shear.value < RIGID, ahead=self.drop,
+        ), making)  # fmt: skip
+
+    def _timely(self, c: Penetration, making: bool) -> Penetration:
+        """The contact as its change would be seen without the forces' small delay, or lead.
+
+        A touch begins where the compression does, and so do both changes for a sensor that is late.
+        Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly. How fast a
+        stiff pad is pressed only its force tells: what its finger moves, it moves with the block.
+        """
+        rate = central_differences(c.t, c.pressed)[0] if c.hidden else c.rate.mean(axis=0)
+        moved = self.sensing.delay * np.nan_to_num(rate)
+        if not making and self.sensing.delay < 0:
+            return replace(c, place=c.place - moved)
+        # What is farther apart than it moves within a reading has no compression to be late: its force rings.
+        meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(self.sensing.delay))
+        sure = (c.pressed > SURE * c.sd_apart) & ~(c.free_place < -SURE * c.sd_place - meanwhile)
+        return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
+
+
+def _compression(force: np.ndarray, sensing: Sensing) -> np.ndarray:
+    """Compression [m] of one pad at each normal force [N]."""
+    return force * float(shown(sensing.pads).normal1) + sensing.normal.toe.give(2 * force) / 2
+
+
+def shown(pads: Pads) -> Pads:
+    """A pad too stiff to show its compression still shows its force, in whatever unit of length."""
+    return Pads(*(max(float(c), STIFFEST) for c in pads))
+
+
+def contacts(
+    signals: Signals, sensing: Sensing, parameters: Parameters, drop: tuple[np.ndarray, float] | None = None
+) -> Contacts:
+    """Contacts of one trial; noise the rig does not state is learned from the recording.
+
+    `drop`: of a carried block's lowest corner, and its sd [m] (`corner_drops`); None: level.
+    """
+    s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
+    normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
+    inward = np.stack([s.x1, -s.x2])
+    sd_x, sd_y = _sd(s.sd_x, s.x1), _sd(s.sd_y, s.y1)
+    rates, sinking, sd_vx, sd_vy = _rates(s, inward, sd_x, sd_y)
+    force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+
+    pads, toe = shown(sensing.pads), sensing.normal.toe
+    fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
+    level = parameters.scale["level"]
+    lowest, lowest_sd = (np.zeros(s.t.size), 0.0) if drop is None else drop
+    return Contacts(
+        signals=s, sensing=sensing,
+        compression=_compression(normal, sensing),
+        inward=inward, inward_rate=rates, sinking=sinking, deflection=-block_y(0.0, fy1, fy2, pads),
+        tangential=np.stack([fy1, fy2]), drop=lowest,
+        weight=parameters.weight,
+        sd={
+            "compression": force * (float(pads.normal1) + toe.slope),
+            "inward": sd_x,
+            "inward_rate": sd_vx,
+            "y": float(np.sqrt(sd_y**2 / 2 + level**2 + lowest_sd**2)),
+            "vy": sd_vy / root2,
+            "deflection": root2 * hanging(force, pads),
+            "carried": hanging(max(parameters.scale["carry"], root2 * force), pads),
+        },
+    )  # fmt: skip
+
+
+def _sd(stated: np.ndarray, values: np.ndarray) -> float:
+    """Noise of a channel: as stated, or as the recording shows it."""
+    return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
+
+
+def _rates(
+    s: Signals, inward: np.ndarray, sd_x: float, sd_y: float
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Rates (2, 2, T) of closing and (2, T) of sinking, before and after each sample, and their noise [m/s].
+
+    Where velocities are differences of positions, each side has its own.
+    """
+    if not s.derived:
+        rates, sinking = np.stack([s.vx1, -s.vx2]), -s.vy
+        return (
+            np.stack([rates, rates]),
+            np.stack([sinking, sinking]),
+            _sd(s.sd_vx, s.vx1),
+            _sd(s.sd_vy, s.vy1),
+        )
+    (left, noise), (right, _), (rising, _) = (one_sided(s.t, x) for x in (*inward, s.y))
+    return np.stack([left, right], axis=1), -rising, noise * sd_x, noise * sd_y
+
 
 INTERVAL = (0.05, 0.95)  # physics: a definition: the central 90 %
 NEARBY = 0.15  # chosen: s; a touch known apart from forces this near a boundary is that boundary

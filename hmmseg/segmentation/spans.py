@@ -1,4 +1,4 @@
-"""Results of a segmentation: spans of subtasks with uncertain boundaries."""
+"""Results of a segmentation: spans of subtasks with uncertain boundaries, as data and as tables."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hmmseg.contact.decomposition import Subtask, labelled
+from rich.table import Table
+
+from hmmseg.contact.decompose import Subtask, labelled
 from hmmseg.tables import Tabled
 
 
@@ -146,7 +148,7 @@ class Segmentation(Tabled):
 
     def tables(self) -> list[Any]:
         """The spans, one a row."""
-        from hmmseg.segmentation.tables import spans_table
+        from hmmseg.segmentation.spans import spans_table
 
         return [spans_table(self)]
 
@@ -185,3 +187,32 @@ def known(
         for s, a, b in zip(shown, times[:-1], times[1:], strict=True)
     )
     return Segmentation(file, rate, None, spans, failed, recorded=recorded)
+
+
+def spans_table(segmentation: Segmentation) -> Table:
+    """The spans of one trial for people to read."""
+    table = Table(title=f"{Path(segmentation.file).name} ({segmentation.rate:.4g} Hz)", title_justify="left")
+    for head, justify in (("subtask", "left"), ("state", "left"), ("start [s]", "right"),
+                          ("90 % interval", "left"), ("end [s]", "right")):  # fmt: skip
+        table.add_column(head, justify=justify)  # type: ignore[arg-type]
+    elsewhere = any(span.alternatives for span in segmentation.spans)
+    if elsewhere:
+        table.add_column("could as well be at [s]", justify="left")
+    for span in segmentation.spans:
+        low, high = span.start_90
+        interval = f"{low:.3f} to {high:.3f}" if high > low else ""
+        places = ", ".join(f"{p.time:.3f} ({100 * p.probability:.0f} %)" for p in span.alternatives)
+        row = [span.label, span.state, f"{span.start:.3f}", interval, f"{span.end:.3f}"]
+        table.add_row(*row, *[places] * elsewhere)
+    return table
+
+
+def trials_table(segmentations: Sequence[Segmentation]) -> Table:
+    """One row a trial: whether it fits its task, or where it does not."""
+    table = Table(title=f"{len(segmentations)} trials", title_justify="left")
+    for head in ("trial", "rate", "subtasks", "fits its task"):
+        table.add_column(head)
+    for s in segmentations:
+        verdict = "yes" if s.failed is None else str(s.failed)
+        table.add_row(Path(s.file).name, f"{s.rate:.4g} Hz", str(len(s.spans)), verdict)
+    return table

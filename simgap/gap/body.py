@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hmmseg.contact.identifiability import PROPERTIES, UNITS
+from hmmseg.contact.decompose import PROPERTIES, UNITS
 from simgap.attribution.document import entries
 from simgap.attribution.findings import Attribution, EffectPosterior
 from simgap.effects import catalogue

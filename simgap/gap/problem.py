@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
-from hmmseg.contact.identifiability import PROPERTIES
+from hmmseg.contact.decompose import PROPERTIES
 from simgap.effects import fitted as known_effects
 from simgap.effects import free_parameters, name_of
 from simgap.effects.base import Effect, Parameter

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.identification import identify_aligned
-from hmmseg.contact.identifiability import PROPERTIES
+from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align

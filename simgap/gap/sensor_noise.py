@@ -6,7 +6,7 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
-from hmmseg.segmentation.features import noise_sd
+from hmmseg.segmentation.emissions import noise_sd
 from simgap.gap.unresolved import changes, kinks, of_a_kink, pushed, speed_jumps
 
 UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,

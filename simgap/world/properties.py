@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from estimation.actual import read_actual
-from hmmseg.contact.identifiability import UNITS
+from hmmseg.contact.decompose import UNITS
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask
 

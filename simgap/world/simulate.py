@@ -20,8 +20,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
-from hmmseg.segmentation.spans import Segmentation, known
-from hmmseg.segmentation.tables import spans_table
+from hmmseg.segmentation.spans import Segmentation, known, spans_table
 from hmmseg.tables import Tabled
 from simgap.world.dynamics import Physics, State, resting_state
 from simgap.world.operator import OperatorSettings, Plan, Window, plan

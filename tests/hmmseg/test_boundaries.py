@@ -6,24 +6,22 @@ import numpy as np
 import pytest
 
 from hmmseg.segmentation.boundaries import (
-    ONSET,
-    UNIFORM,
-    BoundaryPosterior,
-    combine,
-    crossing_density,
-    first_of,
-)
-from hmmseg.segmentation.motions import (
     LAUNCH,
     MOTION,
+    ONSET,
     POINTS,
     SHAPE,
     STOP,
+    UNIFORM,
+    BoundaryPosterior,
     Crossing,
     _hermite,
     _hermite_slopes,
     _minimum_jerk,
     _minimum_jerk_slope,
+    combine,
+    crossing_density,
+    first_of,
 )
 
 WIDTH = 0.05

@@ -9,11 +9,9 @@ import pytest
 
 from hmmseg import Rig, Trial, align, example_folder
 from hmmseg.hand.signals import task_space
-from hmmseg.segmentation.changes import Change, Prior, disagreements
-from hmmseg.segmentation.crossings import contacts
-from hmmseg.segmentation.moment import moment
+from hmmseg.segmentation.changes import Change, Penetration, Prior, disagreements, moment
 from hmmseg.segmentation.pads import Compliance, Sensing
-from hmmseg.segmentation.switching import Penetration
+from hmmseg.segmentation.posteriors import contacts
 
 T = np.arange(12) * 0.02
 SD_PRESSED, SD_PLACE = 3e-6, 2e-5

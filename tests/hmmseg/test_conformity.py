@@ -20,7 +20,7 @@ from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial, read_trial
 from hmmseg.segmentation import align as segmentation
 from hmmseg.segmentation.conformity import MAX_RATE, examine
-from hmmseg.segmentation.features import features, thin
+from hmmseg.segmentation.emissions import features, thin
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 STACK = Path(__file__).parents[1] / "data" / "stack"

@@ -8,7 +8,7 @@ import pytest
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Fingertip, Noise, Rig, read_rig
 from hmmseg.io.trial import Trial, read_trial
-from hmmseg.segmentation.features import acceleration, features, noise_sd, thin
+from hmmseg.segmentation.emissions import acceleration, features, noise_sd, thin
 
 HERE = Path(__file__).resolve().parents[2]
 CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")

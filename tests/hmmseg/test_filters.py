@@ -6,8 +6,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter, savgol_filter
 
 from hmmseg.hand.pose import smooth
-from hmmseg.segmentation.lagging import lagging
-from hmmseg.segmentation.lateness import Squeeze, _joined
+from hmmseg.segmentation.pads import Squeeze, _joined
+from hmmseg.segmentation.stretches import lagging
 
 
 @pytest.mark.parametrize("deriv", [0, 1, 2])

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import null_space
 
-from hmmseg.contact.identifiability import Equation, Source, balance, determined
-from hmmseg.contact.states import contact_states
+from hmmseg.contact.decompose import Equation, Source, balance, contact_states, determined
 from hmmseg.io.task import GROUND, BlockTask, Move
 
 PAPER = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))

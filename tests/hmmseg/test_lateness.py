@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from hmmseg.segmentation.lateness import Squeeze, lateness
-from hmmseg.segmentation.pads import LATE, _unfiltered
+from hmmseg.segmentation.pads import LATE, Squeeze, _unfiltered, lateness
 
 COMPLIANCE, WIDTH = 2.5e-4, 0.03
 PRIOR = (COMPLIANCE, 0.3 * COMPLIANCE)

@@ -22,7 +22,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.trial import CARTESIAN_CHANNELS, ROLL, read_trial
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
-from hmmseg.segmentation.tilt import tilts
+from hmmseg.segmentation.posteriors import tilts
 from simgap.world.properties import random_properties
 
 NUMBERS = range(76100, 76106)

@@ -9,7 +9,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, read_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
-from hmmseg.segmentation.standing import astride, standing
+from hmmseg.segmentation.free_contacts import astride, standing
 
 T = np.arange(0.0, 4.0, 0.02)
 GRIPPED = T > 2.0

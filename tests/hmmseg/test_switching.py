@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from hmmseg.segmentation.switching import Penetration, log_contact, switch_probability
+from hmmseg.segmentation.changes import Penetration, log_contact, switch_probability
 
 
 def sensed(p, sd_pressed=3e-6, sd_place=3e-5, seed=0, **others):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hmmseg.segmentation.toe import NONE, Toe, find
+from hmmseg.segmentation.stretches import NONE, Toe, find
 
 SD = 2e-5
 

@@ -18,8 +18,7 @@ from hmmseg.online.readings import SLOPE, WINDOW
 from hmmseg.online.step import _absorb
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
-from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, log_likelihoods
-from hmmseg.segmentation.features import features
+from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, features, log_likelihoods
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 CASE = RECORDINGS / "paper_blocks"

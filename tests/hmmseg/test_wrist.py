@@ -8,8 +8,7 @@ import pytest
 
 from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
-from hmmseg.contact.decompose import decompose
-from hmmseg.contact.hands import revealed_by
+from hmmseg.contact.decompose import decompose, revealed_by
 from hmmseg.errors import InputError
 from hmmseg.hand.opening import closings, grip_of
 from hmmseg.hand.pose import pose_of
