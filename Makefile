@@ -46,9 +46,9 @@ docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are error
 constants: $(INSTALLED)  ## docs/tables/constants.csv: every numeric constant with its kind and reason
 	$(BIN)/python -m experiments.constants
 
-bench: $(INSTALLED)  ## kernels beside hmmlearn and dynamax, stages of the commands; fills docs/benchmarks.md
+bench: $(INSTALLED)  ## alignment beside hmmlearn and dynamax, stages of the commands; fills docs/benchmarks.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
-	$(BIN)/python -m experiments.benchmarks.kernels
+	$(BIN)/python -m experiments.benchmarks.hmm
 	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
 	$(BIN)/python -m experiments.write_tables
 

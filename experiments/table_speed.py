@@ -7,69 +7,24 @@ from pathlib import Path
 from experiments.table_text import load, markdown, percent
 
 LENGTHS = Path(__file__).parents[1] / "docs" / "figures" / "long_recordings.png"
-OURS = ("hmmseg, float64, as called", "hmmseg, float32, as called", "hmmseg, JAX inside jit, float64",
-        "hmmseg, JAX inside jit, float32")  # fmt: skip
-ORDER = (*OURS, "hmmlearn's kernel", "dynamax")
-CASES = {"one trial": "one trial, 200 x 9", "4,096 trials": "4,096 trials, 150 to 200 x 9",
-         "one stream": "one stream, 1,000,000 x 9", "many states": "one stream, 100,000 x 101",
-         "long and many": "one stream, 1,000,000 x 101"}  # fmt: skip
-SMOOTHED = {key: CASES[key] for key in ("one trial", "one stream", "many states")} | {
-    "weakly apart": "one stream, 1,000,000 x 9, states hardly apart"}  # fmt: skip
+OTHERS = ("hmmlearn's kernel", "dynamax")
 
 
-def kernels() -> str | None:
-    """docs/benchmarks.md: Viterbi paths as ratios to the limit."""
-    found = load("benchmark_kernels")
+def alignment() -> str | None:
+    """README.md, docs/benchmarks.md: paths and posteriors by hmmseg.hmm and by other libraries."""
+    found = load("benchmark_hmm")
     if found is None:
         return None
     rows = []
-    for key, title in CASES.items():
-        case = found[key]
-        cells = [f"{case['viterbi'][name]['ratio']:.2f}" if name in case["viterbi"] else "" for name in ORDER]
-        rows.append([title, f"{1e3 * case['limit']:.3f} ms", *cells])
-    versions = ", ".join(f"{k} {v or 'not installed'}" for k, v in found["versions"].items())
-    agree = all(row["same_path"] is not False for key in CASES for row in found[key]["viterbi"].values())
-    moved, above = found["exactness"], found["memory"]
-    shares = ", ".join(f"{name} {share:.2f}" for name, share in above["shares"].items() if share is not None)
-    told = [
-        f"Versions: {versions}. Repeats: {found['repeats']}. All paths "
-        f"{'are the same' if agree else 'are NOT the same'}.",
-        f"Samples of {moved['samples']:,}, states half a standard deviation apart, that single precision "
-        + "gives another label: " + ", ".join(f"{k} {v}" for k, v in moved["moved"].items()) + ".",
-        f"Highest memory above the input, {above['samples']:,} x 9, as a share of it: {shares}.",
-    ]  # fmt: skip
-    change = found["one trial"]["viterbi"].get("ruptures")
-    if change is not None:
-        told.append(f"ruptures finds eight changes in the trial's signal in {change['ratio']:.0f} limits.")
-    return markdown(["case", "limit", *ORDER], rows) + "\n\n" + "\n".join(told)
-
-
-def kernels_short() -> str | None:
-    """README.md: the same, of few rows and columns."""
-    found = load("benchmark_kernels")
-    if found is None:
-        return None
-    names = (OURS[0], *ORDER[-2:])
-    rows = []
-    for key in ("one trial", "4,096 trials", "one stream", "many states"):
-        own, *others = (found[key]["viterbi"][name]["seconds"] for name in names)
-        rows.append([CASES[key], f"{1e3 * own:.3g} ms", *(f"{other / own:.1f} x" for other in others)])
-    return markdown(["most probable alignment", "`hmmseg.hmm`", *ORDER[-2:]], rows)
-
-
-def smoothing() -> str | None:
-    """docs/benchmarks.md: forward-backward with boundary posteriors."""
-    found = load("benchmark_kernels")
-    if found is None:
-        return None
-    rows = []
-    for key, title in SMOOTHED.items():
-        case, times = found[key], found[key]["smoothing"]
-        others = [f"{times[n] / times['hmmseg']:.1f}" if n in times else "" for n in ORDER[-2:]]
-        rows.append([title, f"{1e3 * times['hmmseg']:.3f} ms", f"{case['smoothing_over_viterbi']:.1f}",
-                     *others])  # fmt: skip
-    head = ["case", "`smooth`", "over its own `viterbi`", "hmmlearn over it", "dynamax over it"]
-    return markdown(head, rows)
+    for title, case in found["cases"].items():
+        times = case["seconds"]
+        own = times["inside jit"]
+        others = [f"{times[n] / own:.1f} x" if n in times else "" for n in ("as called", *OTHERS)]
+        rows.append([title, f"{1e3 * own:.3g} ms", *others])
+    versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    same = "the same" if all(case["same"] for case in found["cases"].values()) else "NOT the same"
+    table = markdown(["", "`hmmseg.hmm` inside jit", "as called", *OTHERS], rows)
+    return f"{table}\n\nAll paths are {same}. Versions: {versions}."
 
 
 def samplers() -> str | None:

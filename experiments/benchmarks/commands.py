@@ -4,7 +4,7 @@
 
 Writes experiments/results/benchmark_commands.json. Each figure is the least of three; every run is a
 process of its own, so that imports count. The first run ever is one with an empty cache folder, where all
-kernels and programs are compiled.
+programs are compiled.
 """
 
 from __future__ import annotations
@@ -31,20 +31,19 @@ STAGES = {
         "from hmmseg.io.rig import Rig; from hmmseg.io.task import Task; from hmmseg.io.trial import Trial; "
         "rig = Rig.read('{rig}'); task = Task.read('{task}'); trial = Trial.read('{trial}', rig)"
     ),
-    "loading the segmentation and its kernels": (
-        "from hmmseg.segmentation import align as a; import hmmseg.hmm.kernels.dense, "
-        "hmmseg.hmm.kernels.best_path, hmmseg.hmm.kernels.smoothing"
+    "loading the segmentation and JAX": (
+        "from hmmseg.segmentation import align as a; import hmmseg.hmm.dense, hmmseg.hmm.inference"
     ),
-    "first segmentation (kernels from the disk)": "a.segment([trial], task, rig)",
+    "first segmentation (programs from the disk)": "a.segment([trial], task, rig)",
     "one more segmentation": "a.segment([trial], task, rig)",
 }
 IDENTIFY_STAGES = {
     "Python and the command line": STAGES["Python and the command line"],
     "reading task, rig and trial": STAGES["reading task, rig and trial"],
-    "loading the segmentation, the estimation and kernels": (
-        STAGES["loading the segmentation and its kernels"] + "; import estimation.identification as e"
+    "loading the segmentation, the estimation and JAX": (
+        STAGES["loading the segmentation and JAX"] + "; import estimation.identification as e"
     ),
-    "first segmentation (kernels from the disk)": "found = a.align([trial], task, rig)",
+    "first segmentation (programs from the disk)": "found = a.align([trial], task, rig)",
     "properties": "e.identify_aligned(found)",
     "properties once more": "e.identify_aligned(found)",
 }

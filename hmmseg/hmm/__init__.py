@@ -18,14 +18,16 @@ from hmmseg._lazy import lazily
 if TYPE_CHECKING:
     from hmmseg.hmm.chain import Chain, InfeasibleAlignment, left_to_right
     from hmmseg.hmm.durations import DurationChain, lasting
-    from hmmseg.hmm.inference import forward, k_best, log_evidence, sample, smooth, viterbi
+    from hmmseg.hmm.inference import filter, k_best, log_evidence, sample, smooth, viterbi
+    from hmmseg.hmm.learn import Durations, Emission, em
     from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
     from hmmseg.hmm.streaming import Step, StreamingFilter, Window
 
 _MODULES = {
     "chain": ("Chain", "InfeasibleAlignment", "left_to_right"),
     "durations": ("DurationChain", "lasting"),
-    "inference": ("forward", "k_best", "log_evidence", "sample", "smooth", "viterbi"),
+    "inference": ("filter", "k_best", "log_evidence", "sample", "smooth", "viterbi"),
+    "learn": ("Durations", "Emission", "em"),
     "results": ("Alignment", "Alignments", "Filtered", "Posterior"),
     "streaming": ("Step", "StreamingFilter", "Window"),
 }
@@ -36,13 +38,16 @@ __all__ = [
     "Alignments",
     "Chain",
     "DurationChain",
+    "Durations",
+    "Emission",
     "Filtered",
     "InfeasibleAlignment",
     "Posterior",
     "Step",
     "StreamingFilter",
     "Window",
-    "forward",
+    "em",
+    "filter",
     "k_best",
     "lasting",
     "left_to_right",

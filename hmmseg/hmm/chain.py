@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import jax
 import numpy as np
+from jax.core import Tracer
+from jax.tree_util import register_pytree_node_class
 from numpy.typing import ArrayLike
 
 
@@ -21,19 +25,26 @@ class InfeasibleAlignment(ValueError):
         self.reason = reason
 
 
+@register_pytree_node_class
 class Chain:
     """Log weights of a left-to-right chain of `num_states` states; need not be normalised.
 
-    `log_stay` (num_states,): to stay in a state from one sample to the next; `log_advance`
-    (num_states - 1,): to go from k to k + 1; `log_skip`: from k to k + 2 (num_states - 2,), or a
-    sequence of arrays for k + 2, k + 3, ... Where these change in time they have one row a
-    transition, (num_samples - 1, ...), row t between the samples t and t + 1; some may and others not.
-    `log_initial`, `log_final` (num_states,): weights of the first and of the last sample's state;
-    None: the first state, the last state, for sure. -inf forbids. Raises ValueError on wrong
-    shapes, NaN and +inf.
+    A pytree: it may be an argument of functions under jit, vmap and grad, its weights be traced.
+
+    Args:
+        log_stay: (num_states,), to stay in a state from one sample to the next.
+        log_advance: (num_states - 1,), to go from k to k + 1.
+        log_skip: from k to k + 2 (num_states - 2,), or a sequence of arrays for k + 2, k + 3, ...
+        log_initial: (num_states,), of the first sample's state; None: the first state, for sure.
+        log_final: (num_states,), of the last sample's state; None: the last state, for sure.
+            Any of the first three may vary in time and then has a row for each transition,
+            (num_samples - 1, ...), row t between the samples t and t + 1. -inf forbids.
+
+    Raises:
+        ValueError: wrong shapes, NaN or +inf.
     """
 
-    __slots__ = ("addresses", "bands", "log_final", "log_initial", "num_samples", "num_states")
+    __slots__ = ("bands", "log_final", "log_initial")
 
     def __init__(
         self,
@@ -46,70 +57,98 @@ class Chain:
     ) -> None:
         skips: tuple = ()
         if log_skip is not None:
-            skips = (log_skip,) if isinstance(log_skip, np.ndarray) else tuple(log_skip)  # type: ignore[arg-type]
-        bands = [np.ascontiguousarray(b, dtype=np.float64) for b in (log_stay, log_advance, *skips)]
+            whole = isinstance(log_skip, (np.ndarray, jax.Array))
+            skips = (log_skip,) if whole else tuple(log_skip)  # type: ignore[arg-type]
+        bands = tuple(_weights(band) for band in (log_stay, log_advance, *skips))
         if bands[0].ndim not in (1, 2) or not bands[0].shape[-1]:
             raise ValueError(
                 f"log_stay: shape {bands[0].shape}, expected (num_states,) or one such row a step"
             )
-        self.num_states: int = bands[0].shape[-1]
-        rows = [len(b) for b in bands if b.ndim == 2]
-        self.num_samples: int | None = rows[0] + 1 if rows else None
-        self.bands: tuple[np.ndarray, ...] = tuple(self._checked(d, b) for d, b in enumerate(bands))
-        self.log_initial: np.ndarray = self._end("log_initial", log_initial, 0)
-        self.log_final: np.ndarray = self._end("log_final", log_final, -1)
-        # Of stay and advance, whether these vary, of initial and final, as kernels take them.
-        tables = [each.ctypes.data for each in (*self.bands[:2], self.log_initial, self.log_final)]
-        self.addresses = (tables[0], tables[1], self.varying, tables[2], tables[3])
+        self.bands: tuple[Any, ...] = bands
+        for d, band in enumerate(bands):
+            self._check(d, band)
+        self.log_initial = self._end("log_initial", log_initial, 0)
+        self.log_final = self._end("log_final", log_final, -1)
 
-    def __reduce__(self) -> tuple:  # addresses do not outlive the process
-        return _rebuilt, (*self.bands[:2], self.bands[2:] or None, self.log_initial, self.log_final)
+    def tree_flatten(self) -> tuple[tuple, None]:
+        """The weights, for JAX."""
+        return (self.bands, self.log_initial, self.log_final), None
 
-    def _checked(self, d: int, band: np.ndarray) -> np.ndarray:
-        width = max(self.num_states - d, 0)
-        steps = None if self.num_samples is None else self.num_samples - 1
-        name = ("log_stay", "log_advance")[d] if d < 2 else f"log_skip[{d - 2}]"
-        if band.shape != (width,) and band.shape != (steps, width):
-            expected = f"{(width,)}" if steps is None else f"{(steps, width)} or {(width,)}"
-            raise ValueError(f"{name}: shape {band.shape}, expected {expected}")
-        if band.size and not band.max() < np.inf:
-            raise ValueError(f"{name}: {_first_bad(band)}, expected numbers or -inf")
-        if steps is not None and band.ndim == 1:
-            band = np.ascontiguousarray(np.broadcast_to(band, (steps, width)))
-        return band
+    @classmethod
+    def tree_unflatten(cls, _: None, leaves: tuple) -> Chain:
+        """A chain of weights that are whatever JAX puts in their places."""
+        chain = object.__new__(cls)
+        chain.bands, chain.log_initial, chain.log_final = leaves
+        return chain
 
-    def _end(self, name: str, end: ArrayLike | None, index: int) -> np.ndarray:
-        if end is None:
-            out = np.full(self.num_states, -np.inf)
-            out[index] = 0.0
-            return out
-        out = np.ascontiguousarray(end, dtype=np.float64)
-        if out.shape != (self.num_states,):
-            raise ValueError(f"{name}: shape {out.shape}, expected {(self.num_states,)}")
-        if not out.max() < np.inf:
-            raise ValueError(f"{name}: {_first_bad(out)}, expected numbers or -inf")
-        return out
+    def __reduce__(self) -> tuple:
+        return Chain.tree_unflatten, (None, (self.bands, self.log_initial, self.log_final))
+
+    @property
+    def num_states(self) -> int:
+        """How many states it has."""
+        return self.bands[0].shape[-1]
+
+    @property
+    def num_samples(self) -> int | None:
+        """How long recordings must be where weights vary in time, else None."""
+        return next((len(band) + 1 for band in self.bands if band.ndim == 2), None)
 
     @property
     def varying(self) -> bool:
         """Whether any weight changes in time."""
         return self.num_samples is not None
 
+    def _check(self, d: int, band: Any) -> None:
+        width = max(self.num_states - d, 0)
+        steps = None if self.num_samples is None else self.num_samples - 1
+        name = ("log_stay", "log_advance")[d] if d < 2 else f"log_skip[{d - 2}]"
+        if band.shape != (width,) and band.shape != (steps, width):
+            expected = f"{(width,)}" if steps is None else f"{(steps, width)} or {(width,)}"
+            raise ValueError(f"{name}: shape {band.shape}, expected {expected}")
+        _refuse_bad(name, band)
+
+    def _end(self, name: str, end: ArrayLike | None, index: int) -> Any:
+        if end is None:
+            out = np.full(self.num_states, -np.inf)
+            out[index] = 0.0
+            return out
+        out = _weights(end)
+        if out.shape != (self.num_states,):
+            raise ValueError(f"{name}: shape {out.shape}, expected {(self.num_states,)}")
+        _refuse_bad(name, out)
+        return out
+
     def band(self, d: int, num_samples: int) -> np.ndarray:
         """Weights (num_samples - 1, num_states - d) of going from k to k + d."""
         return np.broadcast_to(self.bands[d], (num_samples - 1, max(self.num_states - d, 0)))
 
-    def stacked(self) -> np.ndarray:
-        """All bands in one table (rows, num_bands, num_states), -inf where one is shorter."""
-        rows = 1 if self.num_samples is None else self.num_samples - 1
-        out = np.full((rows, len(self.bands), self.num_states), -np.inf)
-        for d, band in enumerate(self.bands):
-            out[:, d, : max(self.num_states - d, 0)] = band
-        return out
+    def by_target(self, xp: Any = np) -> Any:
+        """Weights (num_samples - 1 or 1, num_bands, num_states) of coming to k from k - d, -inf for k < d.
+
+        `xp`: NumPy, or jax.numpy where weights may be traced.
+        """
+        bands = [xp.asarray(band).astype(np.float64) for band in self.bands]
+        bands = [band[None] if band.ndim == 1 else band for band in bands]
+        rows = max(len(band) for band in bands) if self.num_samples != 1 else 1
+        whole = []
+        for d, band in enumerate(bands):
+            d = min(d, self.num_states)
+            padded = xp.concatenate([xp.full((len(band), d), -np.inf, band.dtype), band], axis=1)
+            whole.append(xp.broadcast_to(padded, (rows, self.num_states)))
+        return xp.stack(whole, axis=1)
 
 
-def _rebuilt(stay, advance, skips, log_initial, log_final) -> Chain:
-    return Chain(stay, advance, skips, log_initial=log_initial, log_final=log_final)
+def _weights(given: ArrayLike) -> Any:
+    """Doubles of NumPy, or what JAX has as it is."""
+    return given if isinstance(given, jax.Array) else np.asarray(given, dtype=np.float64)
+
+
+def _refuse_bad(name: str, weights: Any) -> None:
+    if isinstance(weights, Tracer):
+        return
+    if weights.size and not weights.max() < np.inf:
+        raise ValueError(f"{name}: {_first_bad(np.asarray(weights))}, expected numbers or -inf")
 
 
 def left_to_right(mean_samples: ArrayLike, presence: ArrayLike | None = None) -> Chain:

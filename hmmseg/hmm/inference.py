@@ -1,41 +1,278 @@
 """Alignments and posteriors of recordings under a chain: the functions of hmmseg.hmm.
 
-Log-likelihoods are (num_samples, num_states), in single or double precision; sums are always made
-in double precision. A row of NaN is a missing sample, no evidence either way. InfeasibleAlignment is
-raised where no path exists, ValueError for NaN beside numbers, for +inf and for wrong shapes.
+Log-likelihoods are (num_samples, num_states); a row of NaN is a missing sample, no evidence either way.
+Sums are made in double precision, whatever the process's JAX is set to. Every function may be called in
+two ways:
 
-Recursions: Rabiner, Proc. IEEE 77(2), 1989; forward filtering, backward sampling: Scott, J. Am. Stat.
-Assoc. 97, 2002.
+- on plain arrays: it compiles once for a short ladder of lengths, returns NumPy arrays, and raises
+  InfeasibleAlignment where no path exists and ValueError for NaN beside numbers, for +inf and for wrong
+  shapes;
+- inside jit, vmap or grad, with `length` for what is no padding: nothing of the data can raise there, a
+  log weight is -inf where no path exists and NaN where a row holds NaN beside numbers. vmap runs
+  recordings one after the other on a CPU, together elsewhere.
+
+`parallel`: solve the recursions in time by associative scans (see recursions.py); unless said, not on a
+CPU.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from hmmseg.hmm import durations
+from hmmseg.hmm import durations, recursions
 from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
 from hmmseg.hmm.durations import DurationChain
-from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
+from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
 
-Tables = Any  # one array, or a sequence of arrays
 AnyChain = Chain | DurationChain
-_NONE = np.empty((0, 0))  # numerics: stands for bands that a chain does not have
-_SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
-_CELLS_A_THREAD = 1 << 17  # numerics: below, another thread costs more than it saves
+SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
+TOGETHER = 64  # numerics: recordings of one shape that make one call; what is over is done one by one
+MAX_RANKS = 65_535  # limit: of k_best
 
 
-def table(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
-    """The log-likelihoods as the kernels take them; ValueError where their shape is not the chain's."""
-    ll = np.asarray(log_likelihoods)
-    if ll.dtype != _DOUBLE and ll.dtype != _SINGLE:
-        ll = ll.astype(np.float64)
+def ladder(num_samples: int) -> int:
+    """The length to which a recording is padded: powers of two, from 4,096 on with quarters between them."""
+    below = max(SHORTEST, 1 << (num_samples - 1).bit_length()) // 2
+    step = below // 4 if below >= 4096 else 2 * below
+    return -(-num_samples // step) * step
+
+
+def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
+            parallel: bool | None = None) -> Any:  # fmt: skip
+    """The most probable alignment; a tie goes to staying.
+
+    Args:
+        log_likelihoods: (num_samples, num_states). Several recordings, not under jit: a sequence of such
+            arrays, or (num_recordings, num_samples, num_states) with `lengths` (num_recordings,).
+        chain: one, or one for each recording.
+        lengths: how many samples are no padding; all unless given.
+        parallel: see the module.
+
+    Returns:
+        Alignment, of several recordings Alignments.
+
+    Raises:
+        InfeasibleAlignment, ValueError: see the module.
+    """
+    if _single(log_likelihoods, chain):
+        return _run(_viterbi, log_likelihoods, chain, lengths, parallel=parallel)
+    tables, chains = recordings(log_likelihoods, chain, lengths)
+    found = run_many(_viterbi, tables, chains, parallel=parallel)
+    num_states = chains[0].num_states if chains else 0
+    return Alignments(
+        np.array([a.starts for a in found], np.int64).reshape(len(found), num_states),
+        np.array([a.num_samples for a in found], np.int64),
+        np.array([a.log_prob for a in found], float),
+    )
+
+
+def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
+                 parallel: bool | None = None) -> Any:  # fmt: skip
+    """Log of the summed weight of all paths.
+
+    Differentiable once, in reverse: its gradient with respect to the log-likelihoods is the posterior
+    probability of each state at each sample, with respect to the weights of a chain the expected number of
+    moves. Arguments and exceptions as of `viterbi`.
+    """
+    return _run(_log_evidence, log_likelihoods, chain, length, parallel=parallel, inside=_differentiable)
+
+
+def filter(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
+           parallel: bool | None = None) -> Filtered:  # fmt: skip
+    """What each sample says together with those before it. Arguments and exceptions as of `viterbi`."""
+    return _run(_filter, log_likelihoods, chain, length, parallel=parallel)
+
+
+def smooth(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
+           parallel: bool | None = None) -> Posterior:  # fmt: skip
+    """Probabilities of states and boundaries given the whole recording; arguments as of `viterbi`."""
+    return _run(_smooth, log_likelihoods, chain, length, parallel=parallel)
+
+
+def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: Any = 0,
+           length: Any = None) -> Alignments:  # fmt: skip
+    """Independent exact draws from the posterior over alignments.
+
+    `seed`: a number, or a key of jax.random. `log_prob` is NaN. Further arguments as of `viterbi`.
+    """
+    key = jax.random.key(seed) if isinstance(seed, (int, np.integer)) else seed
+    return _run(_sample, log_likelihoods, chain, length, key, num_draws=num_draws, parallel=None)
+
+
+def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int, length: Any = None) -> Alignments:
+    """The k most probable alignments, best first; fewer where fewer are possible (under jit: -inf).
+
+    Arguments and exceptions as of `viterbi`.
+    """
+    if not 0 < k <= MAX_RANKS:
+        raise ValueError(f"k: {k}, expected 1 to {MAX_RANKS}")
+    found = _run(_k_best, log_likelihoods, chain, length, k=k, parallel=None)
+    if not isinstance(found.log_prob, np.ndarray):
+        return found
+    keep = int(np.isfinite(found.log_prob).sum())
+    return Alignments(found.starts[:keep], found.num_samples[:keep], found.log_prob[:keep])
+
+
+# What the functions compute: of rows x without NaN and a length n, padded or not, the log weight that must be
+# finite for there to be an answer, and the answer.
+
+
+def _tables(chain: Chain) -> tuple[jax.Array, jax.Array, jax.Array]:
+    initial, final = (jnp.asarray(end).astype(jnp.float64) for end in (chain.log_initial, chain.log_final))
+    return chain.by_target(jnp), initial, final
+
+
+def _viterbi(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
+    if isinstance(chain, DurationChain):
+        starts, log_prob = durations.rank(x, chain, n, 1)
+        starts, log_prob = starts[0], log_prob[0]
+    else:
+        starts, log_prob = recursions.best_path(x, *_tables(chain), n, parallel=parallel)
+    return log_prob, Alignment(starts, n, log_prob)
+
+
+def _log_evidence(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
+    if isinstance(chain, DurationChain):
+        total = durations.evidence(x, chain, n)
+    else:
+        total = recursions.evidence(x, *_tables(chain), n, parallel=parallel)
+    return total, total
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _differentiable(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> jax.Array:
+    """The log evidence in the precision of x. Its gradient is the posterior, in that of what it is of."""
+    with jax.enable_x64(True):
+        return _log_evidence(missing_as_zeros(x.astype(jnp.float64)), chain, n, parallel)[0].astype(x.dtype)
+
+
+def _with_gradient(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
+    with jax.enable_x64(True):
+        known = missing_as_zeros(x.astype(jnp.float64))
+        if isinstance(chain, DurationChain):
+            total, states, _ = durations.posterior(known, chain, n)
+            by_chain = None
+        else:
+            total, states, moves = recursions.posterior(known, *_tables(chain), n, parallel=parallel)
+            bands = [moves[:, d, d:] for d in range(len(chain.bands))]
+            bands = [each if band.ndim == 2 else each.sum(0)
+                     for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
+            ends = states[0], recursions.row(states, n - 1)
+            by_chain = Chain.tree_unflatten(None, (tuple(bands), *ends))
+            by_chain = jax.tree.map(lambda by, of: by.astype(of.dtype), by_chain, chain)
+        gradient = jnp.where(jnp.isnan(x), 0.0, states).astype(x.dtype)
+        return total.astype(x.dtype), (gradient, by_chain)
+
+
+def _pull_back(parallel: bool | None, gradients: Any, cotangent: jax.Array) -> tuple[Any, Any, None]:
+    del parallel
+    return *jax.tree.map(lambda each: cotangent.astype(each.dtype) * each, gradients), None
+
+
+_differentiable.defvjp(_with_gradient, _pull_back)
+
+
+def _filter(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Filtered]:
+    if isinstance(chain, DurationChain):
+        raise ValueError("chain: tables of durations, expected a Chain")
+    w, initial, final = _tables(chain)
+    table, taken = recursions.forward(x, w, initial, n, recursions.log_add, parallel)
+    table = jnp.where((recursions.numbers(len(x)) < n)[:, None], table, recursions.NEVER)
+    total = recursions.log_sum(recursions.row(table, n - 1) + final, 0) + taken
+    return total, Filtered(total, recursions.probabilities(table, 1))
+
+
+def _smooth(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
+    if isinstance(chain, DurationChain):
+        total, states, moves = durations.posterior(x, chain, n)
+    else:
+        total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+    return total, Posterior(total, states, tuple(moves[:, d, d:] for d in range(1, moves.shape[1])))
+
+
+def _sample(x: jax.Array, chain: Any, n: jax.Array, key: jax.Array, num_draws: int,
+            parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
+    if isinstance(chain, DurationChain):
+        total, starts = durations.draw(x, chain, n, key, num_draws)
+    else:
+        total, starts = recursions.draw(x, *_tables(chain), n, key, num_draws, parallel)
+    unknown = jnp.where(jnp.isfinite(total), jnp.nan, total)  # -inf where there was no path to draw
+    return total, Alignments(starts, jnp.full(num_draws, n), jnp.full(num_draws, unknown))
+
+
+def _k_best(x: jax.Array, chain: Any, n: jax.Array, k: int,
+            parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
+    del parallel  # ranks are found row by row on every device
+    if isinstance(chain, DurationChain):
+        starts, log_prob = durations.rank(x, chain, n, k)
+    else:
+        starts, log_prob = recursions.rank(x, *_tables(chain), n, k)
+    return log_prob[0], Alignments(starts, jnp.full(k, n), log_prob)
+
+
+def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple]:
+    total, posterior = _smooth(x, chain, n, parallel)
+    return total, (_viterbi(x, chain, n, parallel)[1], posterior)
+
+
+# How they are called.
+
+
+def _single(log_likelihoods: Any, chain: Any) -> bool:
+    return getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain)
+
+
+def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
+         inside: Callable | None = None, parallel: bool | None, **static: Any) -> Any:  # fmt: skip
+    """The core on one recording: traced where anything of it is, else compiled, as NumPy arrays."""
+    leaves = jax.tree.leaves((log_likelihoods, chain, length, keys))
+    if not any(isinstance(leaf, Tracer) for leaf in leaves):
+        table = checked(log_likelihoods, chain)
+        if length is not None:
+            table = table[: _checked_length(int(length), len(table))]
+        return run_many(core, [table], [chain], *keys, parallel=parallel, **static)[0]
+    x = jnp.asarray(log_likelihoods)
+    _check_shape(x, chain)
+    with jax.enable_x64(True):
+        # By way of uint32, as NumPy's 64 bits under vmap pass for 32 where JAX is set to these.
+        n = jnp.asarray(len(x) if length is None else length).astype(jnp.uint32).astype(jnp.int32)
+        kind = x.dtype if jnp.issubdtype(x.dtype, jnp.floating) else jnp.dtype(float)
+        if inside is not None:
+            return inside(
+                x.astype(kind), jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain), n, parallel
+            )
+        found = core(missing_as_zeros(x.astype(jnp.float64)), chain, n, *keys, parallel=parallel, **static)[1]
+        return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, found)
+
+
+def missing_as_zeros(x: Any) -> Any:
+    """Zeros, no evidence, in rows of NaN."""
+    xp = np if isinstance(x, np.ndarray) else jnp
+    return xp.where(xp.isnan(x).all(-1, keepdims=True), 0.0, x)
+
+
+def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
+    """Doubles (num_samples, num_states) without missing rows; ValueError for what is no such table."""
+    ll = np.asarray(log_likelihoods, dtype=np.float64)
+    _check_shape(ll, chain)
+    missing = np.isnan(ll)
+    if missing.any():
+        partly = missing.any(1) & ~missing.all(1)
+        if partly.any():
+            raise not_numbers(ll, int(partly.argmax()))
+        ll = np.where(missing, 0.0, ll)
+    return ll
+
+
+def _check_shape(ll: Any, chain: AnyChain) -> None:
     if ll.ndim != 2 or 0 in ll.shape:
         raise ValueError(f"log_likelihoods: shape {ll.shape}, expected (num_samples, num_states)")
     num_samples, num_states = ll.shape
@@ -45,228 +282,115 @@ def table(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
         raise ValueError(
             f"log_likelihoods: {num_samples} samples, expected {chain.num_samples} as in the chain"
         )
-    return ll if ll.flags.c_contiguous else np.ascontiguousarray(ll)
 
 
-def filled(ll: np.ndarray) -> np.ndarray:
-    """Doubles with zeros, no evidence, in rows of NaN; ValueError for NaN beside numbers."""
-    x = np.array(ll, dtype=np.float64)
-    missing = np.isnan(x)
-    if missing.any():
-        partly = missing.any(1) & ~missing.all(1)
-        if partly.any():
-            raise not_numbers(x, int(partly.argmax()))
-        x[missing] = 0.0
-    return x
+def _checked_length(length: int, num_samples: int, recording: str = "") -> int:
+    if not 0 < length <= num_samples:
+        raise ValueError(f"lengths: {length}{recording}, expected 1 to {num_samples}")
+    return length
 
 
-def viterbi(log_likelihoods: Tables, chain: AnyChain | Sequence[AnyChain],
-            lengths: Sequence[int] | np.ndarray | None = None) -> Alignment | Alignments:  # fmt: skip
-    """Most probable alignment; of each recording where there are several. A tie goes to staying.
-
-    Several recordings: a sequence of tables, or one array (num_recordings, num_samples, num_states)
-    with the `lengths` (num_recordings,) of what is no padding; with one chain or one for each.
-    """
-    if getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain):
-        return _viterbi_one(table(log_likelihoods, chain), chain)
-    return _viterbi_many(*recordings(log_likelihoods, chain, lengths))
-
-
-def recordings(
-    log_likelihoods: Tables, chain: AnyChain | Sequence[AnyChain], lengths: Sequence[int] | np.ndarray | None
-) -> tuple[list[np.ndarray], list[AnyChain]]:
-    """Tables and chains of several recordings."""
+def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
+               lengths: Sequence[int] | np.ndarray | None) -> tuple[list, list]:  # fmt: skip
+    """Checked tables and chains of several recordings."""
     tables = list(log_likelihoods)
     if lengths is not None:
         if len(lengths) != len(tables):
             raise ValueError(f"lengths: {len(lengths)} given, expected {len(tables)}, one a recording")
-        for i, n in enumerate(lengths):
-            if not 0 < n <= len(tables[i]):
-                raise ValueError(f"lengths: {n} for recording {i}, expected 1 to {len(tables[i])}")
-        tables = [each[:n] for each, n in zip(tables, lengths, strict=True)]
+        tables = [
+            ll[: _checked_length(n, len(ll), f" for recording {i}")]
+            for i, (ll, n) in enumerate(zip(tables, lengths, strict=True))
+        ]
     chains = [chain] * len(tables) if isinstance(chain, AnyChain) else list(chain)
     if len(chains) != len(tables):
         raise ValueError(f"chain: {len(chains)} given, expected {len(tables)}, one a recording")
-    return [table(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
+    return [checked(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
 
 
-def _viterbi_one(ll: np.ndarray, chain: AnyChain) -> Alignment:
-    if isinstance(chain, DurationChain):
-        return durations.k_best(filled(ll), chain, 1)[0]
-    if len(chain.bands) > 2:
-        from hmmseg.hmm.kernels.general import best_general
+def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
+             parallel: bool | None = None, **static: Any) -> list:  # fmt: skip
+    """The core on checked recordings, each padded to the ladder: one program for all of one shape.
 
-        starts = np.empty(chain.num_states, np.int64)
-        log_prob = best_general(
-            filled(ll), chain.stacked(), chain.varying, chain.log_initial, chain.log_final, starts
+    Raises InfeasibleAlignment, and ValueError for +inf.
+    """
+    if parallel is None:
+        parallel = jax.default_backend() != "cpu"
+    padded = [_padded(chain, len(ll)) for ll, chain in zip(tables, chains, strict=True)]
+    groups: dict[Any, list[int]] = {}
+    for i, (ll, chain) in enumerate(zip(tables, padded, strict=True)):
+        leaves, kind = jax.tree.flatten(chain)
+        groups.setdefault((ladder(len(ll)), kind, *(np.shape(leaf) for leaf in leaves)), []).append(i)
+    found: list[Any] = [None] * len(tables)
+    for (size, *_), members in groups.items():
+        whole = len(members) // TOGETHER * TOGETHER
+        parts = [members[i : i + TOGETHER] for i in range(0, whole, TOGETHER)] + [
+            [i] for i in members[whole:]
+        ]
+        for part in parts:
+            n = np.array([len(tables[i]) for i in part], np.int32)
+            x = np.zeros((len(part), size, tables[part[0]].shape[1]))
+            for row, i in zip(x, part, strict=True):
+                row[: len(tables[i])] = tables[i]
+            chain = jax.tree.map(lambda *leaves: np.stack(leaves), *(padded[i] for i in part))
+            with jax.enable_x64(True):
+                program = compiled(core, parallel, tuple(sorted(static.items())))
+                totals, results = jax.tree.map(np.asarray, program(x, chain, n, *keys))
+            for j, i in enumerate(part):
+                if not np.isfinite(totals[j]):
+                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
+                    raise why(tables[i], chains[i])
+                found[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], results), len(tables[i]))
+    return found
+
+
+def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
+    """`viterbi` and `smooth` of several recordings, as EM takes them."""
+    return [
+        AlignmentPosterior(
+            posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
         )
-    else:
-        from hmmseg.hmm.kernels.best_path import best_path
-
-        found = np.empty((1, chain.num_states), np.int64)
-        log_prob, bad = best_path(ll.ctypes.data, ll.dtype == _SINGLE, len(ll), chain.num_states,
-                                  *chain.addresses, found, 0)  # fmt: skip
-        if bad >= 0:
-            raise not_numbers(ll, bad)
-        starts = found[0]
-    if not -np.inf < log_prob < np.inf:
-        raise why_infeasible(ll, chain)
-    return Alignment(starts, len(ll), log_prob)
+        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
+    ]
 
 
-def _viterbi_many(tables: list[np.ndarray], mixed: list[AnyChain]) -> Alignments:
-    lengths = np.array([len(ll) for ll in tables], dtype=np.int64)
-    chains = [c for c in mixed if isinstance(c, Chain)]
-    kinds = {(c.num_states, c.varying, len(c.bands), ll.dtype) for c, ll in zip(chains, tables, strict=False)}
-    if len(chains) < len(mixed) or len(kinds) > 1 or (chains and len(chains[0].bands) > 2):
-        each = [_viterbi_one(ll, c) for ll, c in zip(tables, mixed, strict=True)]
-        return Alignments(np.array([a.starts for a in each]), lengths, np.array([a.log_prob for a in each]))
-    if not tables:
-        return Alignments(np.empty((0, 0), np.int64), lengths, np.empty(0))
-    from hmmseg.hmm.kernels.best_path import best_paths
+@cache
+def compiled(core: Callable, parallel: bool, static: tuple) -> Callable:
+    """The core for several recordings as one program."""
+    kws = dict(static, parallel=parallel)
 
-    num_states = chains[0].num_states
-    starts, log_prob = np.empty((len(tables), num_states), np.int64), np.empty(len(tables))
-    ll = np.array([each.ctypes.data for each in tables], dtype=np.int64)
-    if len(set(map(id, chains))) == 1:
-        ends = chains[0].addresses
-        stay, advance, initial, final = (np.full(len(tables), ends[i]) for i in (0, 1, 3, 4))
-    else:
-        columns = np.array([c.addresses for c in chains], dtype=np.int64).T
-        stay, advance, initial, final = (np.ascontiguousarray(columns[i]) for i in (0, 1, 3, 4))
-    fixed = (
-        lengths,
-        tables[0].dtype == _SINGLE,
-        num_states,
-        stay,
-        advance,
-        chains[0].varying,
-        initial,
-        final,
+    def run(x: jax.Array, chain: Any, n: jax.Array, *keys: jax.Array) -> Any:
+        def one(args: tuple) -> Any:
+            return core(*args, *keys, **kws)
+
+        return jax.vmap(one)((x, chain, n)) if parallel else jax.lax.map(one, (x, chain, n))
+
+    return jax.jit(run)
+
+
+def _padded(chain: AnyChain, num_samples: int) -> AnyChain:
+    """The chain for a recording that is padded to the ladder."""
+    if chain.num_samples is None:
+        return chain
+    more = ladder(num_samples) - num_samples
+    assert isinstance(chain, Chain)
+    bands = tuple(
+        np.pad(band, ((0, more), (0, 0)), constant_values=-np.inf) if band.ndim == 2 else band
+        for band in map(np.asarray, chain.bands)
     )
-
-    def run(part: tuple[int, int]) -> tuple[int, int]:
-        return best_paths(ll, *fixed, starts, log_prob, *part)
-
-    for i, row in in_threads(run, lengths, num_states):
-        if i >= 0:
-            raise not_numbers(tables[i], row)
-    for i in np.flatnonzero(~np.isfinite(log_prob)):
-        raise why_infeasible(tables[i], chains[i])
-    return Alignments(starts, lengths, log_prob)
+    return Chain.tree_unflatten(None, (bands, chain.log_initial, chain.log_final))
 
 
-def in_threads(run, lengths: np.ndarray, num_states: int) -> list:
-    """`run` for parts (first, last) of the recordings, alike in samples, one a processor."""
-    cells = int(lengths.sum()) * num_states
-    num = max(min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-                  cells // _CELLS_A_THREAD, len(lengths)), 1)  # fmt: skip
-    if num == 1:
-        return [run((0, len(lengths)))]
-    cumulative = np.cumsum(lengths)
-    cuts = [0, *np.searchsorted(cumulative, cumulative[-1] * np.arange(1, num) / num), len(lengths)]
-    with ThreadPoolExecutor(num) as pool:
-        return list(pool.map(run, [(int(a), int(b)) for a, b in pairwise(cuts)]))
-
-
-def filtered_table(ll: np.ndarray, chain: Chain, table: np.ndarray, logs: bool = False) -> float:
-    """Log evidence; filtered probabilities, or their logs, into `table`, empty where not asked for."""
-    if len(chain.bands) > 2:
-        from hmmseg.hmm.kernels.general import smooth_general
-
-        none = np.empty((0, len(chain.bands) - 1, chain.num_states))
-        found = smooth_general(filled(ll), chain.stacked(), chain.varying, chain.log_initial,
-                               chain.log_final, table, _NONE, none)  # fmt: skip
-        if not logs:
-            np.exp(table, out=table)
-        return _possible(found, -1, ll, chain)
-    from hmmseg.hmm.kernels.forward import evidence
-
-    found, bad = evidence(ll.ctypes.data, ll.dtype == _SINGLE, *ll.shape, *chain.addresses, table, logs)
-    return _possible(found, bad, ll, chain)
-
-
-def smoothed_tables(ll: np.ndarray, chain: Chain) -> tuple[float, np.ndarray, tuple[np.ndarray, ...]]:
-    """Log evidence, and probabilities of states and moves as in Posterior."""
-    num_samples, num_states = ll.shape
-    if len(chain.bands) > 2:
-        from hmmseg.hmm.kernels.general import smooth_general
-
-        state = np.empty((num_samples, num_states))
-        moved = np.empty((num_samples - 1, len(chain.bands) - 1, num_states))
-        found = smooth_general(filled(ll), chain.stacked(), chain.varying, chain.log_initial,
-                               chain.log_final, _NONE, state, moved)  # fmt: skip
-        log_evidence = _possible(found, -1, ll, chain)
-        moves = (moved[:, d - 1, : max(num_states - d, 0)] for d in range(1, len(chain.bands)))
-        return log_evidence, np.exp(state), tuple(np.exp(each) for each in moves)
-    from hmmseg.hmm.kernels.smoothing import probabilities
-
-    # One row a state: the system hands out memory only where something is written.
-    state, boundary = np.zeros((num_states, num_samples)), np.zeros((num_states - 1, num_samples - 1))
-    found, bad = probabilities(ll.ctypes.data, ll.dtype == _SINGLE, num_samples, num_states, *chain.addresses,
-                               state, boundary)  # fmt: skip
-    return _possible(found, bad, ll, chain), state.T, (boundary.T,)
-
-
-def _possible(log_evidence: float, bad: int, ll: np.ndarray, chain: Chain) -> float:
-    """The log evidence; raises where there is none."""
-    if bad >= 0:
-        raise not_numbers(ll, bad)
-    if not -np.inf < log_evidence < np.inf:
-        raise why_infeasible(ll, chain)
-    return log_evidence
-
-
-def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain) -> float:
-    """Log of the summed weight of all paths."""
-    if isinstance(chain, DurationChain):
-        return durations.forward(filled(table(log_likelihoods, chain)), chain)[0]
-    return filtered_table(table(log_likelihoods, chain), chain, _NONE)
-
-
-def forward(log_likelihoods: ArrayLike, chain: AnyChain) -> Filtered:
-    """Filtered probabilities: what each sample says together with those before it."""
-    if not isinstance(chain, Chain):
-        raise ValueError("chain: tables of durations, expected a Chain")
-    ll = table(log_likelihoods, chain)
-    filtered = np.empty(ll.shape)
-    return Filtered(filtered_table(ll, chain, filtered), filtered)
-
-
-def smooth(log_likelihoods: ArrayLike, chain: AnyChain) -> Posterior:
-    """Probabilities of states and boundaries given the whole recording."""
-    if isinstance(chain, DurationChain):
-        return durations.smooth(filled(table(log_likelihoods, chain)), chain)
-    return Posterior(*smoothed_tables(table(log_likelihoods, chain), chain))
-
-
-def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: int = 0) -> Alignments:
-    """Independent exact draws from the posterior over alignments; `log_prob` is NaN."""
-    if isinstance(chain, DurationChain):
-        return durations.sample(filled(table(log_likelihoods, chain)), chain, num_draws, seed)
-    from hmmseg.hmm.kernels.general import draw_starts
-
-    ll = table(log_likelihoods, chain)
-    online = np.empty(ll.shape)
-    filtered_table(ll, chain, online, logs=True)
-    rng = np.random.default_rng(seed)
-    starts = np.empty((num_draws, chain.num_states), np.int64)
-    draw_starts(online, chain.stacked(), chain.varying, chain.log_final, rng.random(num_draws), rng, starts)
-    return Alignments(starts, np.full(num_draws, len(ll)), np.full(num_draws, np.nan))
-
-
-def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int) -> Alignments:
-    """The k most probable alignments, best first; fewer where fewer are possible."""
-    from hmmseg.hmm.kernels.general import best_k
-
-    if not 0 < k < 1 << 16:
-        raise ValueError(f"k: {k}, expected 1 to 65535")
-    ll = table(log_likelihoods, chain)
-    if isinstance(chain, DurationChain):
-        return durations.k_best(filled(ll), chain, k)
-    starts, log_prob = np.empty((k, chain.num_states), np.int64), np.empty(k)
-    best_k(filled(ll), chain.stacked(), chain.varying, chain.log_initial, chain.log_final, starts, log_prob)
-    if not np.isfinite(log_prob[0]):
-        raise why_infeasible(ll, chain)
-    keep = int(np.isfinite(log_prob).sum())
-    return Alignments(starts[:keep], np.full(keep, len(ll)), log_prob[:keep])
+def _trimmed(result: Any, n: int) -> Any:
+    """The result without the rows of padding, numbers as Python has them."""
+    if isinstance(result, tuple):
+        return tuple(_trimmed(each, n) for each in result)
+    if isinstance(result, Posterior):
+        moves = tuple(move[: n - 1] for move in result.moves)
+        return Posterior(float(result.log_evidence), result.smoothed[:n], moves)
+    if isinstance(result, Filtered):
+        return Filtered(float(result.log_evidence), result.filtered[:n])
+    if isinstance(result, Alignment):
+        return Alignment(result.starts.astype(np.int64), int(result.num_samples), float(result.log_prob))
+    if isinstance(result, Alignments):
+        return Alignments(result.starts.astype(np.int64), result.num_samples, result.log_prob)
+    return float(result)

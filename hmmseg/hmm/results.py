@@ -1,35 +1,48 @@
-"""What the recursions of hmmseg.hmm return."""
+"""What the functions of hmmseg.hmm return: pytrees of NumPy arrays, of JAX arrays under jit and vmap."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from jax.tree_util import register_dataclass
 
 
-def crossings(moves: Sequence[np.ndarray]) -> np.ndarray:
+def crossings(moves: Sequence[Any]) -> Any:
     """Probabilities that each boundary is crossed, from those of moves by one state, two, ..."""
     if len(moves) == 1:
         return moves[0]
-    crossed = moves[0].copy()
-    for d, band in enumerate(moves[1:], 2):
-        for k in range(band.shape[1]):
-            crossed[:, k : k + d] += band[:, k, None]
+    xp = np if isinstance(moves[0], np.ndarray) else _jax_numpy()
+    width, crossed = moves[0].shape[1], 0.0
+    for d, band in enumerate(moves, 1):
+        for by in range(min(d, width)):  # a move by d states from k crosses the boundaries k to k + d - 1
+            crossed = crossed + xp.pad(band, ((0, 0), (by, width - by - band.shape[1])))
     return crossed
 
 
+def _jax_numpy() -> Any:
+    import jax.numpy
+
+    return jax.numpy
+
+
+@register_dataclass
 @dataclass(frozen=True)
 class Alignment:
     """One path through the states, by where each state starts.
 
-    `starts` (num_states,): first sample of each state; a state that is not visited starts where the
-    next one does (`num_samples` where none follows). `log_prob`: the path's log weight.
+    Attributes:
+        starts: (num_states,), first sample of each state; a state that is not visited starts where the
+            next one does (`num_samples` where none follows).
+        num_samples: of the recording.
+        log_prob: the path's log weight; under jit -inf where there is no path.
     """
 
-    starts: np.ndarray
-    num_samples: int
-    log_prob: float
+    starts: Any
+    num_samples: Any
+    log_prob: Any
 
     @property
     def lengths(self) -> np.ndarray:
@@ -42,16 +55,18 @@ class Alignment:
         return np.repeat(np.arange(self.starts.size), self.lengths)
 
 
+@register_dataclass
 @dataclass(frozen=True)
 class Alignments:
     """Several paths; `alignments[i]` is one of them.
 
-    `starts` (n, num_states), `num_samples` (n,), `log_prob` (n,), as in Alignment.
+    Attributes:
+        starts: (n, num_states), num_samples (n,), log_prob (n,), as in Alignment.
     """
 
-    starts: np.ndarray
-    num_samples: np.ndarray
-    log_prob: np.ndarray
+    starts: Any
+    num_samples: Any
+    log_prob: Any
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -63,31 +78,37 @@ class Alignments:
         return (self[i] for i in range(len(self)))
 
 
+@register_dataclass
 @dataclass(frozen=True)
 class Filtered:
-    """On-line view: `filtered` [t, k] = p(state k at t | samples up to t).
+    """On-line view.
 
-    `log_evidence` sums the weights of all complete paths.
+    Attributes:
+        log_evidence: log of the summed weight of all complete paths.
+        filtered: [t, k] = p(state k at t | samples up to t).
     """
 
-    log_evidence: float
-    filtered: np.ndarray
+    log_evidence: Any
+    filtered: Any
 
 
+@register_dataclass
 @dataclass(frozen=True)
 class Posterior:
     """Posterior over alignments given the whole recording, as probabilities.
 
-    `smoothed` [t, k]: state k at sample t. `moves[d - 1]` [t, k]: from k to k + d between the
-    samples t and t + 1.
+    Attributes:
+        log_evidence: log of the summed weight of all paths.
+        smoothed: [t, k], state k at sample t.
+        moves: moves[d - 1] [t, k], from k to k + d between the samples t and t + 1.
     """
 
-    log_evidence: float
-    smoothed: np.ndarray
-    moves: tuple[np.ndarray, ...]
+    log_evidence: Any
+    smoothed: Any
+    moves: tuple
 
     @property
-    def boundary(self) -> np.ndarray:
+    def boundary(self) -> Any:
         """Probability [t, k] that states up to k end between t and t + 1 (num_samples - 1, num_states - 1).
 
         Who passes over states crosses all their boundaries at once.
@@ -106,7 +127,7 @@ class Posterior:
         return self._quantiles((1 - level) / 2, (1 + level) / 2)
 
     def _quantiles(self, *levels: float) -> np.ndarray:
-        boundary = self.boundary
+        boundary = np.asarray(self.boundary)
         found = np.full((boundary.shape[1], len(levels)), np.nan)
         for k, probability in enumerate(boundary.T):
             cumulative = np.cumsum(probability)
@@ -122,3 +143,17 @@ class Posterior:
         high = np.clip(at + within + 1, 0, len(cumulative) - 1)
         k = np.arange(cumulative.shape[1])
         return cumulative[high, k] - cumulative[low, k]
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class AlignmentPosterior(Posterior):
+    """A posterior with its most probable path.
+
+    Attributes:
+        path: (num_samples,), the states of the most probable path.
+        log_prob: its log weight.
+    """
+
+    path: Any
+    log_prob: Any

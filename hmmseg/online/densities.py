@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.levels import TAIL
+from hmmseg.online.compiled import compiled
 
 _HALF = (TAIL + 1) / 2
 _CONSTANT = math.lgamma(_HALF) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)

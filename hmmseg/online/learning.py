@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.levels import TAIL
+from hmmseg.online.compiled import compiled
 from hmmseg.online.layout import (
     ABOVE_KIND,
     AY,

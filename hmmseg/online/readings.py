@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.online.compiled import compiled
 from hmmseg.online.layout import (
     AY,
     FX1,

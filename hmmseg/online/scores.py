@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 
-from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.levels import MOVED
+from hmmseg.online.compiled import compiled
 from hmmseg.online.densities import log_between, log_broad, log_rising, log_student, log_sum
 from hmmseg.online.layout import (
     AY,

@@ -29,7 +29,7 @@ from hmmseg.contact.decompose import (
     height_equations,
     subtasks,
 )
-from hmmseg.hmm.alignment import align
+from hmmseg.hmm import Chain, viterbi
 from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED
 from hmmseg.segmentation.boundaries import BoundaryPosterior
@@ -385,7 +385,7 @@ def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[st
         chain = scored(free, columns)[:, :num_subtasks]
         chain[-1, :-1] += np.log(ENDING)
         leaves = np.full(num_subtasks, leave)
-        path = align(chain, np.log1p(-leaves), np.log(leaves[:-1])).path
+        path = viterbi(chain, Chain(np.log1p(-leaves), np.log(leaves[:-1]))).path
         runs = _runs(path, steps, free, columns)
     total = float(np.logaddexp(log_left, log_complete))
     return Conformity(free, assignment, runs, failing, log_left - log_complete, total)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
-from hmmseg.hmm.alignment import AlignmentPosterior, Bands
-from hmmseg.hmm.em import em
+from hmmseg.hmm import Chain, em
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import TAIL
 from hmmseg.robust import NORMAL, weighted_median
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
@@ -63,7 +63,7 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
 
 @dataclass(frozen=True)
 class ContactEmission:
-    """The contact states of one task, learned from several trials together (an `em.Emission`)."""
+    """The contact states of one task, learned from several trials together (an `Emission` of EM)."""
 
     features: tuple[Features, ...]
     subtasks: tuple[Subtask, ...]
@@ -81,7 +81,7 @@ class ContactEmission:
 
 @dataclass(frozen=True)
 class MeanShares:
-    """Geometric durations whose means are the same share of every trial (an `em.Durations`).
+    """Geometric durations whose means are the same share of every trial (`Durations` of EM).
 
     `lengths` of the trials [samples], `shares` (num_subtasks,), under a Dirichlet prior of equal shares
     that is worth one trial.
@@ -89,13 +89,12 @@ class MeanShares:
 
     lengths: tuple[int, ...]
     shares: np.ndarray
-    ends = (None, None)
 
-    def bands(self, trial: int) -> Bands:
+    def chain(self, trial: int) -> Chain:
         """Log probabilities to stay (num_subtasks,) and to advance (num_subtasks - 1,)."""
         mean = np.maximum(self.shares * self.lengths[trial], 1.5)
         advance = np.clip(1.0 / mean, 1e-6, 0.6)
-        return np.log1p(-advance), np.log(advance[:-1])
+        return Chain(np.log1p(-advance), np.log(advance[:-1]))
 
     def updated(self, responsibilities: Sequence[np.ndarray]) -> MeanShares:
         """Posterior mean shares."""

@@ -16,7 +16,7 @@ from hmmseg.contact.equations import Pads, block_offset, block_y, corner_drop, h
 from hmmseg.hand.rates import one_sided
 from hmmseg.hand.roll import slow_roll
 from hmmseg.hand.signals import Signals, central_differences
-from hmmseg.hmm.alignment import AlignmentPosterior
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal

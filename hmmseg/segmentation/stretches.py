@@ -20,7 +20,6 @@ from functools import cached_property
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.hmm.kernels.compile import compiled
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.levels import SURE as SIGNIFICANT
 from hmmseg.robust import NORMAL, robust_sd
@@ -34,29 +33,12 @@ def lagging(values: np.ndarray, kept: np.ndarray, place: np.ndarray, share: np.n
     as in that. `place` (N,), never falling: the step before each time, `share` (N,): how far it is on the way
     to the next.
     """
-    rows = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
-    out = np.empty((len(rows), place.size, kept.size))
-    _lagging(rows, kept, place, share, out)
-    return out.reshape(*values.shape[:-1], place.size, kept.size)
-
-
-@compiled
-def _lagging(rows, kept, place, share, out):
-    """y = (1 - kept) x + kept y of every row x (R, S) for every filter, read into out (R, N, C)."""
-    num_filters = kept.size
-    before, now = np.empty(num_filters), np.empty(num_filters)
-    for r in range(rows.shape[0]):
-        for c in range(num_filters):
-            now[c] = rows[r, 0]
-        n = 0
-        for s in range(rows.shape[1]):
-            for c in range(num_filters):
-                before[c] = now[c]
-                now[c] = (1 - kept[c]) * rows[r, s] + kept[c] * before[c]
-            while n < place.size and place[n] + 1 == s:
-                for c in range(num_filters):
-                    out[r, n, c] = (1 - share[n]) * before[c] + share[n] * now[c]
-                n += 1
+    steps = np.empty((*values.shape, kept.size))
+    steps[..., 0, :] = values[..., :1]
+    for s in range(1, values.shape[-1]):  # y = (1 - kept) x + kept y
+        steps[..., s, :] = (1 - kept) * values[..., s, None] + kept * steps[..., s - 1, :]
+    share = share[:, None]
+    return (1 - share) * steps[..., place, :] + share * steps[..., place + 1, :]
 
 
 SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; loads at which the toe may end, a factor of two apart

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import AlignmentPosterior, align_many
-from hmmseg.hmm.results import crossings
+from hmmseg.hmm.inference import align
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.detectors import Detectors, learn
@@ -166,8 +166,7 @@ def _held_out(values, channels, cells, paths, half, temper, floor,
         ll, ratios = emissions.log_likelihoods(values[i]), detectors.log_ratios(channels[i])
         parts += [(s * ll, jumps(ratios, replace(detectors, weight=w), law.bands))
                   for w in WEIGHTS for s in STATE_WEIGHTS]  # fmt: skip
-    aligned = align_many([p[0] for p in parts], [p[1] for p in parts],
-                         log_initial=law.log_initial, log_final=law.log_final)  # fmt: skip
+    aligned = align([p[0] for p in parts], [law.chain(p[1]) for p in parts])
     grid = (len(values), len(WEIGHTS), len(STATE_WEIGHTS))
     per_trial = grid[1] * grid[2]
     scores = [_log_probability(a, cells[n // per_trial]) for n, a in enumerate(aligned)]
@@ -201,4 +200,4 @@ def _log_probability(alignment: AlignmentPosterior, cells: np.ndarray) -> float:
 
 def boundary_probabilities(alignment: AlignmentPosterior) -> np.ndarray:
     """Probability (num_cells - 1, num_states - 1) that subtasks up to k end at each cell edge."""
-    return crossings(alignment.moves)
+    return alignment.boundary

@@ -1,4 +1,4 @@
-"""EM over all trials of a plain ordered task: its emissions and durations under `hmmseg.hmm.em`."""
+"""EM over all trials of a plain ordered task: its emissions and durations under `hmmseg.hmm.learn`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.hmm.alignment import AlignmentPosterior, Bands
-from hmmseg.hmm.em import em, expectation
+from hmmseg.hmm import Chain
+from hmmseg.hmm.learn import em, expectation
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import (
     StudentEmissions,
@@ -106,7 +107,7 @@ class Learner:
 
 @dataclass(frozen=True)
 class _Emission:
-    """`hmmseg.hmm.em.Emission` of a learner's trials; scales are kept above `floor`."""
+    """`hmmseg.hmm.learn.Emission` of a learner's trials; scales are kept above `floor`."""
 
     learner: Learner
     detectors: Detectors | None
@@ -126,20 +127,17 @@ class _Emission:
 
 @dataclass(frozen=True)
 class _Durations:
-    """`hmmseg.hmm.em.Durations` of a learner's trials; detectors make advancing depend on time."""
+    """`hmmseg.hmm.learn.Durations` of a learner's trials; detectors make advancing depend on time."""
 
     learner: Learner
     detectors: Detectors | None
     law: Transitions
 
-    @property
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.law.log_initial, self.law.log_final
-
-    def bands(self, trial: int) -> Bands:
+    def chain(self, trial: int) -> Chain:
         if self.detectors is None:
-            return self.law.bands
-        return jumps(ratios_of(self.learner.values[trial], self.detectors), self.detectors, self.law.bands)
+            return self.law.chain()
+        ratios = ratios_of(self.learner.values[trial], self.detectors)
+        return self.law.chain(jumps(ratios, self.detectors, self.law.bands))
 
     def updated(self, responsibilities: Sequence[np.ndarray]) -> _Durations:
         return replace(self, law=self.learner.law(self.learner.as_labelled(responsibilities)))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hmmseg.hmm import dense as ergodic
-from hmmseg.hmm.alignment import AlignmentPosterior
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
 

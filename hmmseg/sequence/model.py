@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import AlignmentPosterior, Bands, align_many
+from hmmseg.hmm.inference import align
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.sequence.detectors import Detectors
@@ -18,6 +19,7 @@ from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.sequence.transitions import Transitions, transitions
 from hmmseg.tables import Tabled
 
+Bands = tuple[np.ndarray, ...]  # to stay, to advance by one state, by two, ...
 FORMAT = "hmmseg.sequence-model/3"
 INDEPENDENT = 250.0  # chosen: independent observations that one trial's fit is judged by in the limit of many
 
@@ -86,8 +88,7 @@ class SequenceModel(Tabled):
         """Posterior alignments; InfeasibleAlignment for a trial with fewer cells than subtasks."""
         parts = [self.weights(trial) for trial in trials]
         law = self.transitions
-        return align_many([p[0] for p in parts], [p[1] for p in parts],
-                          log_initial=law.log_initial, log_final=law.log_final)  # fmt: skip
+        return align([p[0] for p in parts], [law.chain(p[1]) for p in parts])
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class NamedCourse:
         count = len(self.mean_cells)
         law = transitions(self.mean_cells, np.ones(count), [False] * count)
         ll = self.emissions.log_likelihoods(trial.values)
-        return align_many([ll], [law.bands], log_initial=law.log_initial, log_final=law.log_final)[0]
+        return align([ll], [law.chain()])[0]
 
 
 def optional_states(task: SequenceTask, settled: bool) -> list[bool]:

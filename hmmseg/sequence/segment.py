@@ -9,8 +9,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from hmmseg.errors import InputError
-from hmmseg.hmm.alignment import AlignmentPosterior
 from hmmseg.hmm.chain import InfeasibleAlignment
+from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Place, Question, Segmentation, Span

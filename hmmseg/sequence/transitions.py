@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.hmm import Chain
+
 
 @dataclass(frozen=True)
 class Transitions:
-    """Band-limited transitions as hmmseg.hmm.alignment takes them.
+    """Band-limited transitions, of which a chain of hmmseg.hmm is made.
 
     `bands[d]` (num_states - d,): log weight of going from k to k + d between neighbouring cells;
     `log_initial`, `log_final` (num_states,).
@@ -23,6 +25,11 @@ class Transitions:
     bands: tuple[np.ndarray, ...]
     log_initial: np.ndarray
     log_final: np.ndarray
+
+    def chain(self, bands: tuple[np.ndarray, ...] | None = None) -> Chain:
+        """The chain; with other bands, if given, that may vary in time."""
+        stay, advance, *skips = self.bands if bands is None else bands
+        return Chain(stay, advance, skips or None, log_initial=self.log_initial, log_final=self.log_final)
 
 
 def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Transitions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmmseg.hmm.kernels.compile import compiled
+from hmmseg.online.compiled import compiled
 from simgap.robot_effects.base import RobotEffect, Setting, places
 
 

@@ -1,40 +1,33 @@
 """Alignments against enumeration of every path: an oracle that shares no code with the recursions."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from path_enumeration import brute, random_problem
 
-from experiments.jax_viterbi import viterbi
-from hmmseg.hmm.alignment import align, align_many
-from hmmseg.hmm.chain import InfeasibleAlignment
-
-SIZES = [(1, 1), (4, 1), (2, 2), (5, 2), (4, 4), (6, 3), (8, 4)]
+from hmmseg.hmm import Chain, InfeasibleAlignment
+from hmmseg.hmm.inference import align
 
 
-@pytest.mark.parametrize("num_skips", [0, 1, 2])
-@pytest.mark.parametrize("size", SIZES)
-def test_every_quantity_matches_enumeration(size, num_skips):
-    ll, bands = random_problem(*size, seed=sum(size), num_skips=num_skips)
+def test_path_and_posterior_come_together():
+    ll, bands = random_problem(8, 3, seed=1)
     paths, weights, log_evidence, smoothed, moves = brute(ll, bands)
-    aligned = align(ll, bands[0], bands[1], bands[2:])
+    (aligned,) = align([ll], [Chain(*bands)])
     assert aligned.path.tolist() == paths[weights.argmax()].tolist()
     np.testing.assert_allclose(aligned.log_prob, weights.max(), rtol=1e-12)
     np.testing.assert_allclose(aligned.log_evidence, log_evidence, rtol=1e-12)
     np.testing.assert_allclose(aligned.smoothed, smoothed, atol=1e-12)
-    for ours, theirs in zip(aligned.moves, moves, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    np.testing.assert_allclose(aligned.boundary, moves[0], atol=1e-12)
 
 
-def test_batch_equals_one_by_one():
-    trials = [random_problem(n, 3, seed=n)[0] for n in (5, 9, 300)]
-    stay, advance = np.log([0.9, 0.8, 1.0]), np.log([0.1, 0.2])
-    for ll, batched in zip(trials, align_many(trials, [(stay, advance)] * 3), strict=True):
-        single = align(ll, stay, advance)
-        assert batched.path.tolist() == single.path.tolist()
-        np.testing.assert_allclose(batched.smoothed, single.smoothed, rtol=1e-9)
-    assert align_many([], []) == []
+def test_many_recordings_equal_one_by_one():
+    """More than go into one call, of two lengths of the ladder, each with a chain of its own."""
+    trials = [random_problem(n % 7 + 3 if n % 9 else 300, 3, seed=n)[0] for n in range(75)]
+    chains = [Chain(np.log([0.9, 0.8, 1.0]) + 0.01 * i, np.log([0.1, 0.2])) for i in range(75)]
+    for ll, chain, found in zip(trials, chains, align(trials, chains), strict=True):
+        (alone,) = align([ll], [chain])
+        assert found.path.tolist() == alone.path.tolist()
+        np.testing.assert_allclose(found.smoothed, alone.smoothed, rtol=1e-9)
+    assert align([], []) == []
 
 
 def infeasible():
@@ -60,7 +53,7 @@ def infeasible():
 def test_infeasible_alignments_say_which_subtask_starves(case):
     ll, bands, subtask, reason = infeasible()[case]
     with pytest.raises(InfeasibleAlignment, match=reason) as caught:
-        align(ll, *bands)
+        align([ll], [Chain(*bands)])
     assert caught.value.subtask == subtask
     assert f"subtask {subtask} starves" in str(caught.value)
 
@@ -70,41 +63,13 @@ def test_infeasible_trial_in_a_batch_raises():
     bad = good.copy()
     bad[:, 2] = -np.inf
     with pytest.raises(InfeasibleAlignment, match="subtask 2"):
-        align_many([good, bad], [(np.zeros(3), np.zeros(2))] * 2)
-
-
-@pytest.mark.parametrize("varying", [True, False])
-@pytest.mark.parametrize("size", SIZES)
-def test_the_peer_in_jax_finds_the_same_path(size, varying):
-    ll, bands = random_problem(*size, seed=sum(size))
-    if not varying:
-        bands = tuple(np.tile(band[:1], (size[0] - 1, 1)) for band in bands)
-    paths, weights, *_ = brute(ll, bands)
-    best = jax.jit(viterbi)(
-        jnp.asarray(ll), *(jnp.asarray(b if varying or len(b) == 0 else b[0]) for b in bands)
-    )
-    assert best.path.tolist() == paths[weights.argmax()].tolist()
-    np.testing.assert_allclose(best.log_prob, weights.max(), rtol=1e-12)
+        align([good, bad], [Chain(np.zeros(3), np.zeros(2))] * 2)
 
 
 def test_nan_and_wrong_shapes_are_refused():
     ll, bands = random_problem(6, 3)
     with pytest.raises(ValueError, match=r"log_(stay|advance): shape .*expected"):
-        align(ll, bands[1], bands[1])
+        align([ll], [Chain(bands[1], bands[1])])
     ll[2, 1] = np.nan
     with pytest.raises(ValueError, match=r"log_likelihoods: NaN or \+inf at \[2, 1\]"):
-        align(ll, *bands)
-
-
-def test_single_precision_stays_so_and_moves_no_label():
-    """A long recording of states half a standard deviation apart: sums not rebased would drift by nats."""
-    rng = np.random.default_rng(5)
-    num = 60_000
-    signal = 0.5 * (np.arange(num) * 4 // num) + rng.normal(size=num)
-    ll = (-0.5 * (signal[:, None] - 0.5 * np.arange(4)) ** 2 - 20.0).astype(np.float32)
-    stay, advance = np.log(np.full(4, 0.999)), np.log(np.full(3, 0.001))
-    single, double = (
-        viterbi(*(jnp.asarray(a, kind) for a in (ll, stay, advance))) for kind in (np.float32, float)
-    )
-    assert single.path.tolist() == double.path.tolist()
-    np.testing.assert_allclose(single.log_prob, double.log_prob, rtol=1e-7)
+        align([ll], [Chain(*bands)])

@@ -7,7 +7,7 @@ import pytest
 from contact_scene import LEVELS, PLANTED, STEPS, planted
 from scipy import optimize, stats
 
-from hmmseg.hmm import em
+from hmmseg.hmm import learn
 from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import TAIL
@@ -64,10 +64,10 @@ def test_pieces_without_data_keep_what_they_had():
 
 
 def test_transitions_are_probabilities_with_the_mean_duration():
-    stay, advance = MeanShares((200,), np.array([0.25, 0.5, 0.25])).bands(0)
+    stay, advance = MeanShares((200,), np.array([0.25, 0.5, 0.25])).chain(0).bands
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
     np.testing.assert_allclose(np.exp(-advance), [50, 100])
-    stay, advance = MeanShares((5,), np.array([1e-9, 1.0])).bands(0)
+    stay, advance = MeanShares((5,), np.array([1e-9, 1.0])).chain(0).bands
     assert np.isfinite(stay).all() and np.isfinite(advance).all()
 
 
@@ -108,14 +108,14 @@ def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
 def test_evidence_does_not_decrease(monkeypatch):
     """ECM with 5 inner steps a parameter, floors and weak pulls: small steps back are allowed."""
     seen = []
-    expectation = em.expectation
+    expectation = learn.expectation
 
     def recorded(*arguments):
         alignments = expectation(*arguments)
         seen.append(sum(a.log_evidence for a in alignments))
         return alignments
 
-    monkeypatch.setattr(em, "expectation", recorded)
+    monkeypatch.setattr(learn, "expectation", recorded)
     fit([planted(seed)[0] for seed in range(2)], STEPS)
     # The second pass scores widths and levels for the first time, against narrower densities.
     gains = np.diff(seen[1:])

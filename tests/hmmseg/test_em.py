@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from hmmseg.hmm.chain import InfeasibleAlignment
-from hmmseg.hmm.em import em
+from hmmseg.hmm import Chain, InfeasibleAlignment, em
 from hmmseg.segmentation.fit import MeanShares
 
 STAY = 0.8
@@ -32,10 +31,8 @@ class Levels:
 
 @dataclass(frozen=True)
 class Fixed:
-    ends = (None, None)
-
-    def bands(self, trial):
-        return np.log([STAY, 1.0]), np.log([1 - STAY])
+    def chain(self, trial):
+        return Chain(np.log([STAY, 1.0]), np.log([1 - STAY]))
 
     def updated(self, responsibilities):
         return self

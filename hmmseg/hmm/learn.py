@@ -1,8 +1,9 @@
 """Expectation maximisation of a task's hidden Markov model, trials of any lengths pooled.
 
-One driver for every kind of recording. What the states look like is an `Emission`, how long they
-last a `Durations`; both hold the trials' data, so that the driver sees nothing but log-likelihoods
-(num_timesteps, num_states) and posterior state probabilities of the same shape.
+One driver for every kind of recording. What the states look like is an `Emission`, how long they last a
+`Durations`; both hold the trials' data, so that the driver sees nothing but log-likelihoods (num_timesteps,
+num_states) and posterior state probabilities of the same shape. A network's emissions need no driver: their
+gradient is that of `hmmseg.hmm.log_evidence` (docs/hmm.md).
 
 Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2), 1989.
 """
@@ -15,9 +16,12 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from hmmseg.hmm.alignment import AlignmentPosterior, Bands, align_many
+from hmmseg.hmm.chain import Chain
+from hmmseg.hmm.inference import align
+from hmmseg.hmm.results import AlignmentPosterior
 
 S = TypeVar("S")
+LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
 
 
 @runtime_checkable
@@ -37,13 +41,8 @@ class Emission(Protocol):
 class Durations(Protocol):
     """How states follow each other; frozen, an update is a new object."""
 
-    @property
-    def ends(self) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Log weights (num_states,) to begin and to end in each state; None: in the first, the last."""
-        ...
-
-    def bands(self, trial: int) -> Bands:
-        """Log weights to stay, advance by one, two ... states in one trial (see hmmseg.hmm.alignment)."""
+    def chain(self, trial: int) -> Chain:
+        """The chain of one trial."""
         ...
 
     def updated(self: S, responsibilities: Sequence[np.ndarray]) -> S:
@@ -51,14 +50,13 @@ class Durations(Protocol):
         ...
 
 
-LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
 E = TypeVar("E", bound=Emission)
 D = TypeVar("D", bound=Durations)
 
 
 @dataclass(frozen=True)
 class Learned(Generic[E, D]):
-    """A fitted model: the alignments are those under this emission and these durations."""
+    """A fitted model; every trial's most probable path and posterior are those under it."""
 
     emission: E
     durations: D
@@ -69,33 +67,35 @@ class Learned(Generic[E, D]):
     @property
     def log_evidence(self) -> float:
         """Log evidence of all trials [nats]."""
-        return sum(a.log_evidence for a in self.alignments)
+        return sum(each.log_evidence for each in self.alignments)
 
     @property
     def responsibilities(self) -> list[np.ndarray]:
         """Posterior state probabilities (num_timesteps, num_states) of every trial."""
-        return [a.smoothed for a in self.alignments]
+        return [each.smoothed for each in self.alignments]
 
 
 def expectation(emission: Emission, durations: Durations, num_trials: int) -> tuple[AlignmentPosterior, ...]:
-    """Alignment posteriors of all trials; raises InfeasibleAlignment where a trial has no path."""
-    initial, final = durations.ends
+    """Paths and posteriors of all trials; raises InfeasibleAlignment where a trial has no path."""
     tables = [emission.log_likelihoods(i) for i in range(num_trials)]
-    bands = [durations.bands(i) for i in range(num_trials)]
-    return tuple(align_many(tables, bands, log_initial=initial, log_final=final))
+    return tuple(align(tables, [durations.chain(i) for i in range(num_trials)]))
 
 
-def em(
-    emission: E,
-    durations: D,
-    num_trials: int,
-    max_iterations: int = 40,
-    tolerance: float = 1e-3,
-) -> Learned[E, D]:
+def em(emission: E, durations: D, num_trials: int, max_iterations: int = 40,
+       tolerance: float = 1e-3) -> Learned[E, D]:  # fmt: skip
     """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
 
-    The last step is an expectation. Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too
-    short for its states, ValueError on NaN.
+    The last step is an expectation.
+
+    Args:
+        emission, durations: where it starts.
+        num_trials: of the data that these hold.
+        max_iterations: after which it ends unconverged.
+        tolerance: nats.
+
+    Raises:
+        InfeasibleAlignment: a trial is too short for its states.
+        ValueError: NaN.
     """
     before = -np.inf
     for iteration in range(1, max_iterations + 1):

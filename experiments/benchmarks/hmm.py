@@ -1,0 +1,217 @@
+"""Alignment by hmmseg.hmm beside hmmlearn's kernel and dynamax: the same inputs and path, one run.
+
+    python -m experiments.benchmarks.hmm [--small] [--parallel]
+
+Writes experiments/results/benchmark_hmm.json and docs/figures/benchmarks.png. Every time is the least
+processor time of several repeats, one thread, libraries in turn. General libraries take a matrix of
+transitions and have no end-state constraint: the last row of what they are given forbids all states but
+the last; dynamax takes trials of one length. With --parallel (for an accelerator) the recursions run by
+associative scans, on wall time, on one stream of 1e6 and of 1e7 samples and on 4,096 trials, into
+benchmark_hmm_parallel.json; no accelerator was at hand when this was written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hmmseg.hmm as hmm
+from experiments.benchmarks.timing import least
+from experiments.saving import save
+from hmmseg.jaxconfig import configure
+
+RESULTS = Path(__file__).parents[1] / "results"
+FIGURE = Path(__file__).parents[2] / "docs" / "figures" / "benchmarks.png"
+STATES = 9
+INSIDE, CALLED, HMMLEARN, DYNAMAX = "inside jit", "as called", "hmmlearn's kernel", "dynamax"
+Functions = dict[str, Callable[[], object]]
+
+
+def problem(num_samples: int, seed: int = 0) -> np.ndarray:
+    """Log-likelihoods (num_samples, STATES) of a signal that goes through levels two sd apart, in turn."""
+    state = np.minimum(np.arange(num_samples) * STATES // num_samples, STATES - 1)
+    signal = 2.0 * state + np.random.default_rng(seed).normal(size=num_samples)
+    return -0.5 * (signal[:, None] - 2.0 * np.arange(STATES)) ** 2
+
+
+def general(chain: hmm.Chain) -> tuple[np.ndarray, np.ndarray]:
+    """Initial and transition probabilities, which libraries of general models take."""
+    return np.eye(STATES)[0], np.diag(np.exp(chain.bands[0])) + np.diag(np.exp(chain.bands[1]), 1)
+
+
+def ended(x: np.ndarray) -> np.ndarray:
+    """Log-likelihoods that force the last state at the end."""
+    out = np.array(x)
+    out[-1, :-1] = -np.inf
+    return out
+
+
+def one_stream(num_samples: int) -> tuple[Functions, Functions]:
+    """Functions that align one recording, and that smooth it."""
+    x, chain = problem(num_samples), hmm.left_to_right([num_samples / STATES] * STATES)
+    start, matrix = general(chain)
+    inside, forced = jnp.asarray(x), ended(x)
+    best, soft = jax.jit(lambda x: hmm.viterbi(x, chain)), jax.jit(lambda x: hmm.smooth(x, chain))
+    paths: Functions = {
+        INSIDE: lambda: np.asarray(best(inside).starts),
+        CALLED: lambda: hmm.viterbi(x, chain).starts,
+    }
+    smoothers: Functions = {INSIDE: lambda: soft(inside).smoothed.block_until_ready(),
+                            CALLED: lambda: hmm.smooth(x, chain)}  # fmt: skip
+    try:
+        from hmmlearn import _hmmc
+
+        paths[HMMLEARN] = lambda: first_of(_hmmc.viterbi(start, matrix, forced)[1])
+        smoothers[HMMLEARN] = lambda: (_hmmc.forward_log(start, matrix, forced),
+                                       _hmmc.backward_log(start, matrix, forced))  # fmt: skip
+    except ImportError:
+        pass
+    try:
+        from dynamax.hidden_markov_model.inference import hmm_posterior_mode, hmm_smoother
+
+        mode, smoother = jax.jit(hmm_posterior_mode), jax.jit(lambda *a: hmm_smoother(*a).smoothed_probs)
+        given = [jnp.asarray(a) for a in (start, matrix, forced)]
+        paths[DYNAMAX] = lambda: first_of(mode(*given))
+        smoothers[DYNAMAX] = lambda: smoother(*given).block_until_ready()
+    except ImportError:
+        pass
+    return paths, smoothers
+
+
+def many(num: int) -> Functions:
+    """Functions that align trials of ragged lengths up to 200 in one batch."""
+    lengths = np.random.default_rng(1).integers(150, 201, num)
+    tables = [problem(int(n), seed) for seed, n in enumerate(lengths)]
+    chain = hmm.left_to_right([22.0] * STATES)
+    start, matrix = general(chain)
+    padded = np.zeros((num, 200, STATES))
+    for into, x in zip(padded, tables, strict=True):
+        into[: len(x)] = x
+    together = jnp.asarray(padded)
+    batch = jax.jit(jax.vmap(lambda x, n: hmm.viterbi(x, chain, n).starts))
+    functions: Functions = {INSIDE: lambda: np.asarray(batch(together, lengths)),
+                            CALLED: lambda: hmm.viterbi(tables, chain).starts}  # fmt: skip
+    try:
+        from hmmlearn import _hmmc
+
+        forced = [ended(x) for x in tables]
+        functions[HMMLEARN] = lambda: np.array([first_of(_hmmc.viterbi(start, matrix, x)[1]) for x in forced])
+    except ImportError:
+        pass
+    try:
+        from dynamax.hidden_markov_model.inference import hmm_posterior_mode
+
+        mode = jax.jit(jax.vmap(hmm_posterior_mode, (None, None, 0)))
+        given = [jnp.asarray(a) for a in (start, matrix, padded)]
+        functions[DYNAMAX] = lambda: mode(*given).block_until_ready()  # of the padding, too
+    except ImportError:
+        pass
+    return functions
+
+
+def first_of(path: object) -> np.ndarray:
+    """Where each state begins in a path (num_samples,)."""
+    return np.searchsorted(np.asarray(path), np.arange(STATES))
+
+
+def measured(functions: Functions, seconds: float) -> dict:
+    """Times of all, and whether those that give where states begin agree."""
+    starts = [found for f in functions.values() if isinstance(found := f(), np.ndarray)]
+    agree = all((found == starts[0]).all() for found in starts[1:])
+    return {"seconds": least(functions, seconds), "same": agree}
+
+
+def on_accelerator(scale: int) -> dict:
+    """Wall times of the parallel recursions on the default device."""
+    found: dict = {"device": str(jax.devices()[0])}
+    for num_samples in (1_000_000 // scale, 10_000_000 // scale):
+        x = jnp.asarray(problem(num_samples))
+        chain = hmm.left_to_right([num_samples / STATES] * STATES)
+        best = jax.jit(lambda x, chain=chain: hmm.viterbi(x, chain, parallel=True).starts)
+        found[f"one stream of {num_samples:,}"] = wall(lambda x=x, best=best: best(x).block_until_ready())
+    trials = jnp.asarray(np.stack([problem(200, seed) for seed in range(4096 // scale)]))
+    chain = hmm.left_to_right([22.0] * STATES)
+    batch = jax.jit(jax.vmap(lambda x: hmm.viterbi(x, chain, parallel=True).starts))
+    found[f"{len(trials):,} trials"] = wall(lambda: batch(trials).block_until_ready())
+    return found
+
+
+def wall(function: Callable[[], object], repeats: int = 5) -> float:
+    """Least wall time [s] of a call after one that warms up."""
+    function()
+    best = np.inf
+    for _ in range(repeats):
+        began = time.perf_counter()
+        function()
+        best = min(best, time.perf_counter() - began)
+    return best
+
+
+def draw(document: dict) -> None:
+    """Times of every library over ours inside jit, one group of bars a case."""
+    from hmmseg.plot.style import BLUE, GREY, RED, SKY, canvas
+
+    with canvas(FIGURE, 6.4, 2.6) as figure:
+        axes = figure.subplots()
+        for i, (name, colour) in enumerate(
+            zip((INSIDE, CALLED, HMMLEARN, DYNAMAX), (BLUE, SKY, GREY, RED), strict=True)
+        ):
+            times = [case["seconds"] for case in document["cases"].values()]
+            at = [(c, t[name] / t[INSIDE]) for c, t in enumerate(times) if name in t]
+            axes.bar([c + 0.2 * (i - 1.5) for c, _ in at], [r for _, r in at], 0.18, color=colour, label=name)
+        axes.axhline(1.0, color="k", linewidth=0.6)
+        axes.set(yscale="log", ylabel="processor time over hmmseg's inside jit", xticks=range(len(times)))
+        axes.set_xticklabels([title.replace(": ", ":\n") for title in document["cases"]])
+        axes.legend(ncols=4, loc="upper left", bbox_to_anchor=(0.0, 1.18), frameon=False)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--small", action="store_true", help="a tenth of the samples and repeats")
+    parser.add_argument(
+        "--parallel", action="store_true", help="associative scans on this machine's accelerator"
+    )
+    args = parser.parse_args()
+    configure()
+    scale, seconds = (10, 0.2) if args.small else (1, 1.0)
+    if args.parallel:
+        document = on_accelerator(scale)
+        save(RESULTS / "benchmark_hmm_parallel.json", document)
+    else:
+        trial, stream = one_stream(200), one_stream(1_000_000 // scale)
+        document = {
+            "versions": {name: importlib.metadata.version(name) for name in ("jax", "numpy", "hmmseg")},
+            "small": args.small,
+            "cases": {
+                "path: one trial, 200 x 9": measured(trial[0], seconds),
+                f"path: {4096 // scale:,} trials, 150 to 200 x 9": measured(many(4096 // scale), seconds),
+                f"path: one stream, {1_000_000 // scale:,} x 9": measured(stream[0], seconds),
+                "posterior: one trial, 200 x 9": measured(trial[1], seconds),
+                f"posterior: one stream, {1_000_000 // scale:,} x 9": measured(stream[1], seconds),
+            },
+        }
+        for name in ("hmmlearn", "dynamax"):
+            try:
+                document["versions"][name] = importlib.metadata.version(name)
+            except importlib.metadata.PackageNotFoundError:
+                document["versions"][name] = "not installed"
+        save(RESULTS / "benchmark_hmm.json", document)
+        draw(document)
+    print(json.dumps(document, indent=1))
+
+
+if __name__ == "__main__":
+    main()

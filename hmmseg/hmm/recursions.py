@@ -1,0 +1,345 @@
+"""The recursions over a chain's states and time, as pure JAX functions in double precision.
+
+Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods without NaN; `w` (num_timesteps
+- 1 or 1, num_bands, num_states) log weights by their target, w[t, d, k] of going from k - d to k between
+the samples t and t + 1, -inf where k < d, one row where they do not vary; `n` int32, how many rows are
+no padding. A table of the recursion has a row for every timestep; what stands beyond row n - 1 means
+nothing.
+
+A chain is triangular: no path returns to a state it has left. So there are two ways to run it. Row by
+row is the least work, and the fastest on a CPU. State by state, each state is a scalar linear recurrence
+in time, driven by the states before it, v[t] = (v[t - 1] + a[t]) + b[t] in the semiring, and linear
+recurrences are solved in logarithmic time by an associative scan (Blelloch, CMU-CS-90-190, 1990). This
+is the parallel inference of Hassan, Särkkä and García-Fernández, IEEE Trans. Signal Process. 69, 2021,
+with elements of two numbers instead of matrices of num_states x num_states.
+
+Rabiner, Proc. IEEE 77(2), 1989; sampling: Scott, J. Am. Stat. Assoc. 97, 2002.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+NEVER = -jnp.inf  # physics: the logarithm of no weight
+BLOCK = 256  # numerics: rows that are searched together for where a path entered its state
+
+Plus = Callable[[Array, Array], Array]
+
+
+def log_add(a: Array, b: Array) -> Array:
+    """log(exp(a) + exp(b)), also where both are -inf."""
+    top = jnp.maximum(a, b)
+    gap = jnp.where(top == NEVER, 0.0, jnp.minimum(a, b) - top)
+    return top + jnp.log1p(jnp.exp(gap))
+
+
+def finite(top: Array) -> Array:
+    """What to take out of log weights of which `top` is the largest: nothing where it is -inf."""
+    return jnp.where(jnp.isfinite(top), top, 0.0)
+
+
+def log_sum(values: Array, axis: int) -> Array:
+    """log of the sum of exponentials along an axis, also where all are -inf."""
+    top = finite(values.max(axis, keepdims=True))
+    return jnp.log(jnp.exp(values - top).sum(axis)) + top.squeeze(axis)
+
+
+def numbers(count: int) -> Array:
+    """0, 1, ... as int32, like every index here."""
+    return jnp.arange(count, dtype=jnp.int32)
+
+
+def argmax(values: Array, axis: int = 0) -> Array:
+    """The first place of the largest value, int32.
+
+    Of parts that are lowered alike when JAX is set to 32 bits by then, which lax.argmax is not.
+    """
+    places = lax.broadcasted_iota(jnp.int32, values.shape, axis)
+    return jnp.where(values == values.max(axis, keepdims=True), places, values.shape[axis] - 1).min(axis)
+
+
+def pick(key: Array, logits: Array, axis: int = 0) -> Array:
+    """A place along an axis drawn by log weights (Gumbel, 1954)."""
+    uniform = (jax.random.bits(key, logits.shape, jnp.uint32).astype(jnp.float64) + 0.5) * 2.0**-32
+    return argmax(logits - jnp.log(-jnp.log(uniform)), axis)
+
+
+def row(table: Array, t: Array) -> Array:
+    """table[t]; of the one row where nothing varies in time."""
+    return table[0] if len(table) == 1 else lax.dynamic_index_in_dim(table, t, keepdims=False)
+
+
+def forwards(values: Array, d: int) -> Array:
+    """Of each state the value d states before it, -inf where there is none."""
+    pads = [(0, 0, 0)] * (values.ndim - 1) + [(d, -d, 0)]
+    return lax.pad(values, jnp.array(NEVER, values.dtype), pads)
+
+
+def backwards(values: Array, d: int) -> Array:
+    """Of each state the value d states after it, -inf where there is none."""
+    pads = [(0, 0, 0)] * (values.ndim - 1) + [(-d, d, 0)]
+    return lax.pad(values, jnp.array(NEVER, values.dtype), pads)
+
+
+def by_device(parallel: bool | None, by_row: Callable[..., Any], by_state: Callable[..., Any],
+              *args: Array) -> Any:  # fmt: skip
+    """The recursion row by row on a CPU, state by state elsewhere, unless `parallel` says which."""
+    if parallel is None:
+        return lax.platform_dependent(*args, cpu=by_row, default=by_state)
+    return (by_state if parallel else by_row)(*args)
+
+
+def forward(x: Array, w: Array, initial: Array, n: Array, plus: Plus,
+            parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
+    """Weights [t, k] of all paths (the best path, for `plus` a maximum) that are in state k at sample t.
+
+    Of sums each row is known up to a constant, and the constant of row n - 1 comes second: sums grow with the
+    recording, and their rounding would show in the probabilities.
+    """
+
+    def by_row(x: Array, w: Array, initial: Array, n: Array) -> tuple[Array, Array]:
+        table = jnp.full(x.shape, NEVER).at[0].set(initial + x[0])
+
+        def step(t: Array, carry: tuple) -> tuple:
+            table, *taken = carry
+            before, weight = row(table, t - 1), row(w, t - 1)
+            now = reduce(plus, [forwards(before, d) + weight[d] for d in range(w.shape[1])]) + row(x, t)
+            if taken:
+                top = finite(now.max())
+                now, taken = now - top, [taken[0] + top]
+            return lax.dynamic_update_index_in_dim(table, now, t, 0), *taken
+
+        start: tuple = (table, jnp.zeros(())) if plus is log_add else (table,)
+        found = lax.fori_loop(jnp.int32(1), n, step, start) if len(x) > 1 else start
+        return found[0], (found[1] if plus is log_add else jnp.zeros(()))
+
+    def by_state(x: Array, w: Array, initial: Array, n: Array) -> tuple[Array, Array]:
+        first = (initial + x[0])[:, None]
+        keep = jnp.pad((x[1:] + w[:, 0]).T, ((0, 0), (1, 0)), constant_values=NEVER)
+        num = w.shape[1] - 1  # columns before this one
+
+        def state(before: Array, k: Array) -> tuple[Array, Array]:
+            enter = [before[d - 1, :-1] + w[:, d, k] for d in range(1, num + 1)]
+            enter = [jnp.broadcast_to(jnp.array(NEVER), (len(x) - 1,)), *enter]
+            column = solve(keep[k], jnp.append(first[k], reduce(plus, enter) + x[1:, k]), plus)
+            return jnp.concatenate([column[None], before[: max(num - 1, 0)]])[: max(num, 1)], column
+
+        start = jnp.full((max(num, 1), len(x)), NEVER)
+        return lax.scan(state, start, numbers(x.shape[1]))[1].T, jnp.zeros(())
+
+    return by_device(parallel, by_row, by_state, x, w, initial, n)
+
+
+def backward(x: Array, w: Array, final: Array, n: Array, parallel: bool | None) -> Array:
+    """Summed weights [t, k] of all that may follow state k at sample t, each row up to a constant."""
+
+    def by_row(x: Array, w: Array, final: Array, n: Array) -> Array:
+        table = lax.dynamic_update_index_in_dim(jnp.full(x.shape, NEVER), final, n - 1, 0)
+
+        def step(i: Array, table: Array) -> Array:
+            t = n - 1 - i
+            after, weight = row(table, t) + row(x, t), row(w, t - 1)
+            now = reduce(log_add, [backwards(after + weight[d], d) for d in range(w.shape[1])])
+            return lax.dynamic_update_index_in_dim(table, now - finite(now.max()), t - 1, 0)
+
+        return lax.fori_loop(jnp.int32(0), n - 1, step, table) if len(x) > 1 else table
+
+    def by_state(x: Array, w: Array, final: Array, n: Array) -> Array:
+        over = numbers(len(x)) >= n - 1  # from here on nothing more may follow
+        keep = jnp.pad((x[1:] + w[:, 0]).T, ((0, 0), (0, 1)), constant_values=NEVER)
+        num = w.shape[1] - 1
+
+        def state(after: Array, k: Array) -> tuple[Array, Array]:
+            leave = [after[d - 1, 1:] + (backwards(x[1:] + w[:, d], d))[:, k] for d in range(1, num + 1)]
+            leave = [jnp.broadcast_to(jnp.array(NEVER), (len(x) - 1,)), *leave]
+            enter = jnp.where(over, final[k], jnp.append(reduce(log_add, leave), NEVER))
+            column = solve(jnp.where(over, NEVER, keep[k]), enter, log_add, reverse=True)
+            return jnp.concatenate([column[None], after[: max(num - 1, 0)]])[: max(num, 1)], column
+
+        start = jnp.full((max(num, 1), len(x)), NEVER)
+        return lax.scan(state, start, numbers(x.shape[1]), reverse=True)[1].T
+
+    return by_device(parallel, by_row, by_state, x, w, final, n)
+
+
+def solve(a: Array, b: Array, plus: Plus, reverse: bool = False) -> Array:
+    """v (num_timesteps,) of v[t] = plus(v[t - 1] + a[t], b[t]), from v[-1] = -inf."""
+
+    def join(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
+        return first[0] + second[0], plus(first[1] + second[0], second[1])
+
+    return lax.associative_scan(join, (a, b), reverse=reverse)[1]
+
+
+def trace_back(table: Array, w: Array, k: Array, n: Array) -> Array:
+    """Starts (num_states,) of the best path that ends in state k, from its table; a tie goes to staying.
+
+    Looks for the last entry into each state in blocks of rows, so that the path is no walk from row to row.
+    """
+    num_timesteps, num_states = table.shape
+    states, size = numbers(num_states), min(BLOCK, num_timesteps - 1)
+    starts = jnp.where(states > k, n, 0)
+    if size == 0:
+        return starts
+    shifts = numbers(w.shape[1])
+
+    def look(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        end, k, starts = carry  # the path is in state k at sample `end`
+        base = jnp.clip(end - size, 0, num_timesteps - 1 - size)
+        before = lax.dynamic_slice_in_dim(table, base, size)[:, jnp.maximum(k - shifts, 0)]
+        weight = w[:, :, k] if len(w) == 1 else lax.dynamic_slice_in_dim(w, base, size)[:, :, k]
+        jump = argmax(before + weight, 1)
+        at = base + 1 + numbers(size)
+        last = jnp.max(jnp.where((jump > 0) & (at <= end), at, 0))
+        jump = jnp.where(last > 0, jump[jnp.maximum(last - base - 1, 0)], 0)
+        starts = jnp.where((states > k - jump) & (states <= k), last, starts)
+        return jnp.where(last > 0, last - 1, base), k - jump, starts
+
+    start = (n - 1, k, starts)
+    return lax.while_loop(lambda carry: (carry[0] > 0) & (carry[1] > 0), look, start)[2]
+
+
+def one_by_one(core: Callable, parallel: bool | None) -> Callable:
+    """The function, whose vmap runs recordings one after the other on a CPU, which keeps each in its cache.
+
+    The rule may be applied after the function was traced, outside of the setting to double precision in
+    which that was done.
+    """
+    run = jax.custom_batching.custom_vmap(core)
+
+    @run.def_vmap
+    def rule(axis_size: int, in_batched: Sequence[bool], *args: Array):  # type: ignore[no-untyped-def]
+        def in_turn(*args: Array):  # type: ignore[no-untyped-def]
+            moving = [a for a, moves in zip(args, in_batched, strict=True) if moves]
+
+            def each(moving: Sequence[Array]):  # type: ignore[no-untyped-def]
+                rest = iter(moving)
+                return run(*(next(rest) if moves else a for a, moves in zip(args, in_batched, strict=True)))
+
+            return lax.map(each, moving)
+
+        together = jax.vmap(core, in_axes=[0 if moves else None for moves in in_batched])
+        with jax.enable_x64(True):
+            found = by_device(parallel, in_turn, together, *args)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return run
+
+
+def best_path(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
+              parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
+    """Starts (num_states,) and log weight of the most probable path."""
+
+    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array]:
+        table, _ = forward(x, w, initial, n, jnp.maximum, parallel)
+        last = row(table, n - 1) + final
+        k = argmax(last)
+        return trace_back(table, w, k, n), last[k]
+
+    return one_by_one(core, parallel)(x, w, initial, final, n)
+
+
+def posterior(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
+              parallel: bool | None) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Log evidence, and probabilities: of states (num_timesteps, num_states), of moves.
+
+    The moves (num_timesteps - 1, num_bands, num_states) are as `w`, of staying too.
+    """
+
+    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array, Array]:
+        before, taken = forward(x, w, initial, n, log_add, parallel)
+        states, moves = joined(w, before, backward(x, w, final, n, parallel), n)
+        return log_sum(row(before, n - 1) + final, 0) + taken, states, moves
+
+    return one_by_one(core, parallel)(x, w, initial, final, n)
+
+
+def probabilities(log_weights: Array, axis: int | tuple[int, ...]) -> Array:
+    """What is in proportion to the weights and sums to one along axes; zeros where all weights are."""
+    weights = jnp.exp(log_weights - finite(log_weights.max(axis, keepdims=True)))
+    total = weights.sum(axis, keepdims=True)
+    return weights / jnp.maximum(total, 1.0)  # the largest weight is one, or all are zeros
+
+
+def joined(w: Array, before: Array, after: Array, n: Array) -> tuple[Array, Array]:
+    """Probabilities of states and moves, from both passes."""
+    states = jnp.where((numbers(len(before)) < n)[:, None], before + after, NEVER)
+    states = lax.optimization_barrier(probabilities(states, 1))  # else computed again for every band
+    came = [forwards(before[:-1], d) + w[:, d] for d in range(w.shape[1])]  # from where to each state
+    most = finite(reduce(jnp.maximum, came))
+    came = [jnp.exp(each - most) for each in came]
+    share = states[1:] / jnp.maximum(sum(came), 1.0)
+    return states, jnp.stack([share * each for each in came], 1)
+
+
+def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, *, parallel: bool | None) -> Array:
+    """Log of the summed weight of all paths."""
+
+    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> Array:
+        table, taken = forward(x, w, initial, n, log_add, parallel)
+        return log_sum(row(table, n - 1) + final, 0) + taken
+
+    return one_by_one(core, parallel)(x, w, initial, final, n)
+
+
+def draw(x: Array, w: Array, initial: Array, final: Array, n: Array, key: Array,
+         num_draws: int, parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
+    """Log evidence, and starts (num_draws, num_states) of paths drawn from the posterior.
+
+    Forward filtering, backward sampling.
+    """
+    table, taken = forward(x, w, initial, n, log_add, parallel)
+    states, shifts = numbers(x.shape[1])[None], numbers(w.shape[1])[None]
+    ends = row(table, n - 1) + final
+    last = pick(key, jnp.broadcast_to(ends, (num_draws, len(ends))), 1)
+
+    def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        t, (k, starts) = n - 1 - i, carry
+        source = row(table, t - 1)[jnp.maximum(k[:, None] - shifts, 0)]
+        logits = source + row(w, t - 1).T[k]
+        jump = pick(jax.random.fold_in(key, t), logits, 1)
+        entered = (states > (k - jump)[:, None]) & (states <= k[:, None])
+        return k - jump, jnp.where(entered, t, starts)
+
+    starts = jnp.where(states > last[:, None], n, 0)
+    return log_sum(ends, 0) + taken, lax.fori_loop(jnp.int32(0), n - 1, step, (last, starts))[1]
+
+
+def rank(x: Array, w: Array, initial: Array, final: Array, n: Array, count: int) -> tuple[Array, Array]:
+    """Starts (count, num_states) and log weights (count,) of the best paths; -inf where fewer are possible.
+
+    Every state keeps its `count` best histories, each by the jump that led to it and the rank of what it
+    continues.
+    """
+    (num_timesteps, num_states), num_bands = x.shape, w.shape[1]
+    states = numbers(num_states)[None]
+    first = jnp.full((num_states, count), NEVER).at[:, 0].set(initial + x[0])
+
+    def step(t: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        before, pointers = carry
+        weight = row(w, t - 1)
+        ways = [forwards(before.T, d).T + weight[d][:, None] for d in range(num_bands)]
+        best, pointer = lax.top_k(jnp.concatenate(ways, axis=1), count)
+        pointers = lax.dynamic_update_index_in_dim(pointers, pointer.astype(jnp.int32), t, 0)
+        return best + row(x, t)[:, None], pointers
+
+    pointers = jnp.zeros((num_timesteps, num_states, count), jnp.int32)
+    best, pointers = lax.fori_loop(jnp.int32(1), n, step, (first, pointers))
+    log_prob, ends = lax.top_k((best + final[:, None]).ravel(), count)
+    state, place = (ends // count).astype(jnp.int32), (ends % count).astype(jnp.int32)
+
+    def back(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        t, (k, place, starts) = n - 1 - i, carry
+        pointer = row(pointers, t)[k, place]
+        jump, place = pointer // count, pointer % count
+        entered = (states > (k - jump)[:, None]) & (states <= k[:, None])
+        return k - jump, place, jnp.where(entered, t, starts)
+
+    starts = jnp.where(states > state[:, None], n, 0)
+    return lax.fori_loop(jnp.int32(0), n - 1, back, (state, place, starts))[2], log_prob
