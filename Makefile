@@ -96,6 +96,7 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 REAL := $(or $(RECORDINGS),../shared/real)
 real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECORDINGS; fills docs/results.md, draws their figures
 	$(BIN)/python -m experiments.real.hiro_snap $(REAL)/hiro_snap
+	$(BIN)/python -m experiments.real.hiro_network $(REAL)/hiro_snap
 	$(BIN)/python -m experiments.real.hiro_gap $(REAL)/hiro_snap
 	$(BIN)/python -m experiments.real.kth_handover $(REAL)/kth_handover
 	$(BIN)/python -m experiments.real.way_eeg_gal $(REAL)/way_eeg_gal_p1
