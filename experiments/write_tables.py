@@ -17,13 +17,12 @@ from experiments import (
     patch_heldout,
     table_calibration,
     table_gap,
-    table_real,
     table_robots,
     table_sequences,
     table_speed,
     wrist,
 )
-from experiments.table_real import real
+from experiments.table_real import hiro_network, real
 from experiments.table_text import as_csv, covered, load, markdown, milliseconds, percent
 from hmmseg.contact.decompose import PROPERTIES
 
@@ -104,7 +103,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("README.md", "alignment", table_speed.alignment, "bench"),
-    ("docs/hmm.md", "hiro_network", table_real.hiro_network, "real"),
+    ("docs/hmm.md", "hiro_network", hiro_network, "real"),
     ("docs/benchmarks.md", "alignment", table_speed.alignment, "bench"),
     ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),
     ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
