@@ -16,11 +16,10 @@ from hmmseg.sequence.features import filled
 from hmmseg.sequence.learner import FLOORS, Learner
 
 COARSE_CELLS = 300  # numerics: a trial, on the grid on which courses are learned
-MULTIPLES = (2, 3)  # chosen: stretches a named state, and one more
+MULTIPLES = (1, 2, 3)  # chosen: stretches a named state, and one more
 START_FLOORS = (0.1, 0.4)  # numerics: of the partitions of single trials from which EM starts
 TEACHERS = 4  # numerics: trials whose partition is a start for all trials
 SAME = 0.005  # numerics: of a trial: courses whose changes are as close are one
-MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch: a quiet channel says no more than the others
 
 
 @dataclass(frozen=True)
@@ -28,20 +27,15 @@ class Course:
     """One way to align all trials.
 
     `probability` [(num_cells, num_stretches), ...]: of stretches, on the coarse grid. `ends` (num_trials,
-    num_stretches - 1): where they end, as shares of the trial. `cost` [a, b] (num_stretches + 1, ...): of
-    stretches a <= k < b as one state, nats as if each cell were one independent observation. `share`: of
-    independent observations in what the stretches leave.
+    num_stretches - 1): where they end, as shares of the trial. `moments` (3, num_stretches, num_features): of
+    each stretch, pooled over trials, the number of cells, the sum of the features and that of their squares.
+    `share`: independent observations in a cell.
     """
 
     probability: list[np.ndarray]
     ends: np.ndarray
-    cost: np.ndarray
+    moments: np.ndarray
     share: float
-
-    @property
-    def observations(self) -> float:
-        """Independent observations in all trials."""
-        return self.share * sum(len(p) for p in self.probability)
 
 
 def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
@@ -86,8 +80,8 @@ def _taught(
     emissions, probability = learner.run(
         [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
-    cost = merged_costs(values, [p.argmax(1) for p in probability], number, MERGE_FLOOR) / features
-    return Course(probability, ends, cost, learner.independent_share(emissions, probability) * features)
+    moments = _moments(values, [p.argmax(1) for p in probability], number)
+    return Course(probability, ends, moments, learner.independent_share(emissions, probability) * features)
 
 
 def _alike(one: Course, other: Course) -> bool:
@@ -105,20 +99,7 @@ def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def merged_costs(
-    values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, floor: float
-) -> np.ndarray:
-    """Cost [a, b] (number + 1, number + 1) of stretches a <= k < b as one state, pooled over trials."""
+def _moments(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int) -> np.ndarray:
     stacked = np.arcsinh(np.vstack([filled(v) for v in values]))
-    path = np.concatenate(paths)
-    one_hot = np.eye(number)[path]
-    pad = np.zeros((1, stacked.shape[1]))
-    count = np.concatenate([[0.0], np.cumsum(one_hot.sum(0))])
-    first = np.concatenate([pad, np.cumsum(one_hot.T @ stacked, 0)])
-    second = np.concatenate([pad, np.cumsum(one_hot.T @ stacked**2, 0)])
-    n = count[None] - count[:, None]
-    safe = np.where(n > 0, n, 1.0)[..., None]
-    mean = (first[None] - first[:, None]) / safe
-    variance = np.maximum((second[None] - second[:, None]) / safe - mean**2, 0.0)
-    cost = np.maximum(n, 0) / 2 * np.log(variance + floor**2).sum(-1)
-    return np.where(np.arange(number + 1)[None] > np.arange(number + 1)[:, None], cost, np.inf)
+    mine = np.eye(number)[np.concatenate(paths)].T
+    return np.array([mine @ each for each in (np.ones_like(stacked), stacked, stacked**2)])
