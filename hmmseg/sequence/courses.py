@@ -16,10 +16,11 @@ from hmmseg.sequence.features import filled
 from hmmseg.sequence.learner import FLOORS, Learner
 
 COARSE_CELLS = 300  # numerics: a trial, on the grid on which courses are learned
-MULTIPLES = (1, 2, 3)  # chosen: stretches a named state, and one more
+MULTIPLES = (2, 3)  # chosen: stretches a named state, and one more
 START_FLOORS = (0.1, 0.4)  # numerics: of the partitions of single trials from which EM starts
 TEACHERS = 4  # numerics: trials whose partition is a start for all trials
 SAME = 0.005  # numerics: of a trial: courses whose changes are as close are one
+MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch: a quiet channel says no more than the others
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,20 @@ class Course:
     """One way to align all trials.
 
     `probability` [(num_cells, num_stretches), ...]: of stretches, on the coarse grid. `ends` (num_trials,
-    num_stretches - 1): where they end, as shares of the trial. `moments` (3, num_stretches, num_features): of
-    each stretch, pooled over trials, the number of cells, the sum of the features and that of their squares.
-    `share`: independent observations in a cell.
+    num_stretches - 1): where they end, as shares of the trial. `cost` [a, b] (num_stretches + 1, ...): of
+    stretches a <= k < b as one state, nats as if each cell were one independent observation. `share`: of
+    independent observations in what the stretches leave.
     """
 
     probability: list[np.ndarray]
     ends: np.ndarray
-    moments: np.ndarray
+    cost: np.ndarray
     share: float
+
+    @property
+    def observations(self) -> float:
+        """Independent observations in all trials."""
+        return self.share * sum(len(p) for p in self.probability)
 
 
 def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
@@ -45,13 +51,21 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
     trials teach first, and their stretches end where the labels are.
     """
     most = max(num_states, min(map(len, values)) // 2)
-    found: list[Course] = []
-    for number in dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES):
-        for i in _teachers(len(values), labels):
-            for floor in START_FLOORS:
-                course = _taught(values, number, i, floor, labels[i])
-                if not any(_alike(course, other) for other in found):
-                    found.append(course)
+    numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
+    starts = [(number, i, floor) for number in numbers for i in _teachers(len(values), labels)
+              for floor in START_FLOORS]  # fmt: skip
+    taught = [_taught(values, number, i, floor, labels[i]) for number, i, floor in starts]
+    for least in (
+        1,
+        num_states,
+    ):  # who has not even as many changes as are named is no reading, if others have
+        found: list[Course] = []
+        for probability, share in taught:
+            course = _course(values, probability, share, least)
+            if len(course.cost) > num_states and not any(_alike(course, other) for other in found):
+                found.append(course)
+        if found:
+            break
     return found
 
 
@@ -62,10 +76,9 @@ def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:
     return list(dict.fromkeys([*first, *spread]))[:TEACHERS]
 
 
-def _taught(
-    values: Sequence[np.ndarray], number: int, teacher: int, floor: float, known: np.ndarray
-) -> Course:
-    """The course that starts from the optimal partition of one trial, whose stretches teach the others."""
+def _taught(values: Sequence[np.ndarray], number: int, teacher: int, floor: float, known: np.ndarray
+            ) -> tuple[list[np.ndarray], float]:  # fmt: skip
+    """Stretches that start from the optimal partition of one trial and teach the others; their `share`."""
     names, features = [f"{k}" for k in range(number)], values[0].shape[1]
     temper = 1 / features  # while learning, a cell counts as one observation
     learner = Learner(values, names, [False] * number)
@@ -79,9 +92,15 @@ def _taught(
     aligned = learner.align(taught, learner.law(start))
     emissions, probability = learner.run(
         [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
+    return probability, learner.independent_share(emissions, probability) * features
+
+
+def _course(values: Sequence[np.ndarray], probability: list[np.ndarray], share: float, least: int) -> Course:
+    probability = merged(values, probability, share, least)
+    number = probability[0].shape[1]
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
-    moments = _moments(values, [p.argmax(1) for p in probability], number)
-    return Course(probability, ends, moments, learner.independent_share(emissions, probability) * features)
+    cost = merged_costs(values, [p.argmax(1) for p in probability], number, MERGE_FLOOR) / values[0].shape[1]
+    return Course(probability, ends, cost, share)
 
 
 def _alike(one: Course, other: Course) -> bool:
@@ -99,7 +118,45 @@ def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _moments(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int) -> np.ndarray:
+def merged(
+    values: Sequence[np.ndarray], probability: list[np.ndarray], share: float, least: int
+) -> list[np.ndarray]:
+    """Probabilities (num_cells, num_stretches) of stretches, merged where their difference may be chance.
+
+    By Schwarz's criterion (Ann. Stat. 6, 1978): a change pays for a mean and a spread of each feature, and for
+    the place that was sought for it in each trial, where a cell holds `share` independent observations. At
+    least `least` stretches stay.
+    """
+    features = values[0].shape[1]
+    observations = share * sum(map(len, values))
+    places = float(np.log([len(v) for v in values]).sum())
+    price = features * np.log(max(observations, 1.0)) + places
+    while (number := probability[0].shape[1]) > least:
+        cost = merged_costs(values, [p.argmax(1) for p in probability], number, FLOORS[-1])
+        k = np.arange(number - 1)
+        loss = (cost[k, k + 2] - cost[k, k + 1] - cost[k + 1, k + 2]) * share / features
+        weakest = int(np.nan_to_num(loss).argmin())
+        if loss[weakest] > price:
+            break
+        probability = [np.delete(p, weakest + 1, 1) + p[:, [weakest + 1]] * (np.arange(number - 1) == weakest)
+                       for p in probability]  # fmt: skip
+    return probability
+
+
+def merged_costs(
+    values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, floor: float
+) -> np.ndarray:
+    """Cost [a, b] (number + 1, number + 1) of stretches a <= k < b as one state, pooled over trials."""
     stacked = np.arcsinh(np.vstack([filled(v) for v in values]))
-    mine = np.eye(number)[np.concatenate(paths)].T
-    return np.array([mine @ each for each in (np.ones_like(stacked), stacked, stacked**2)])
+    path = np.concatenate(paths)
+    one_hot = np.eye(number)[path]
+    pad = np.zeros((1, stacked.shape[1]))
+    count = np.concatenate([[0.0], np.cumsum(one_hot.sum(0))])
+    first = np.concatenate([pad, np.cumsum(one_hot.T @ stacked, 0)])
+    second = np.concatenate([pad, np.cumsum(one_hot.T @ stacked**2, 0)])
+    n = count[None] - count[:, None]
+    safe = np.where(n > 0, n, 1.0)[..., None]
+    mean = (first[None] - first[:, None]) / safe
+    variance = np.maximum((second[None] - second[:, None]) / safe - mean**2, 0.0)
+    cost = np.maximum(n, 0) / 2 * np.log(variance + floor**2).sum(-1)
+    return np.where(np.arange(number + 1)[None] > np.arange(number + 1)[:, None], cost, np.inf)

@@ -75,8 +75,8 @@ def filled(x: np.ndarray) -> np.ndarray:
 
 
 def local_slopes(x: np.ndarray, step: float, window: int) -> np.ndarray:
-    """Slope (num_cells, num_channels) of the line through the `window` cells before, around or behind each cell,
-    whichever is straightest.
+    """Slope (num_cells, num_channels) of the straightest line through `window` cells that end at, lie around
+    or begin at each cell.
 
     Around an abrupt change no line is straight, and the slope does not know of it beforehand: a centred
     difference would begin half a window too early (edge-preserving filters: Kuwahara et al., 1976).

@@ -106,7 +106,7 @@ def _fine(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndar
 def _named(data: list[SequenceFeatures], boundaries: list[np.ndarray], course: Course, found: Naming,
            probability: float, factor: int) -> NamedCourse:  # fmt: skip
     """A course on the fine grid, and what labels say of how far boundaries lie off its changes."""
-    number = course.moments.shape[1]
+    number = len(course.cost) - 1
     values = [each.values for each in data]
     learner = Learner(values, [f"{k}" for k in range(number)], [False] * number)
     stretches = _fine(course, factor, values)

@@ -20,8 +20,6 @@ from scipy.special import gammaln
 from hmmseg.sequence.courses import Course
 
 LEAST_SHARE = 1e-3  # numerics: of a trial, for a duration's logarithm
-MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch: a quiet channel says no more than the others
-HALVINGS = 50  # numerics: of an interval
 NEAR = 0.02  # chosen: of a trial: boundaries as close are the same
 
 
@@ -109,36 +107,13 @@ def naming(
 def _weights(course: Course, weighing: Weighing) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log weights of stretches a <= k < b as one named state [a, b], of those from a on as the last [a], and
     as the last followed by a settled one from e on [a, e]."""
-    evidence = -merged_costs(course, weighing.independent)
+    temper = weighing.independent * course.share / (weighing.independent + course.observations)
+    evidence = np.where(np.isfinite(course.cost), -temper * course.cost, -np.inf)
     edges = np.column_stack([np.zeros(len(course.ends)), course.ends, np.ones(len(course.ends))])
     durations = np.maximum(edges[:, None] - edges[:, :, None], LEAST_SHARE)
     groups = evidence + weighing.shares * np.log(durations).mean(0)
     end = evidence + evidence[:, -1] + weighing.settled
     return groups, np.logaddexp(evidence[:, -1], _sum(end, 1)), end
-
-
-def merged_costs(course: Course, independent: float) -> np.ndarray:
-    """Cost [a, b] (num_stretches + 1, num_stretches + 1) [nats] of stretches a <= k < b as one state.
-
-    All observations together count as fewer than `independent`, and none of the stretches as more than an
-    equal share of them that its own observations fill: a long rest is no more proof than a short touch.
-    """
-    seen = course.share * course.moments[0, :, 0]
-    total = independent * seen.sum() / (independent + seen.sum())
-    low, high = 0.0, float(seen.max())
-    for _ in range(HALVINGS):  # the share: sum of min(seen, share) = total
-        middle = (low + high) / 2
-        low, high = (middle, high) if np.minimum(seen, middle).sum() < total else (low, middle)
-    counts = np.minimum(seen, high) / np.maximum(course.moments[0, :, 0], 1e-9)
-    n, first, second = np.cumsum(
-        np.pad(course.moments * counts[:, None], ((0, 0), (1, 0), (0, 0))), axis=1
-    )  # fmt: skip
-    n, first, second = (each[None] - each[:, None] for each in (n, first, second))
-    safe = np.where(n > 0, n, 1.0)
-    variance = np.maximum(second / safe - (first / safe) ** 2, 0.0)
-    cost = (np.maximum(n, 0.0) / 2 * np.log(variance + MERGE_FLOOR**2)).mean(-1)
-    number = np.arange(len(cost))
-    return np.where(number[None] > number[:, None], cost, np.inf)
 
 
 def label_weights(course: Course, labels: Sequence[np.ndarray], weighing: Weighing) -> np.ndarray:
