@@ -19,6 +19,7 @@ COARSE_CELLS = 300  # numerics: a trial, on the grid on which courses are learne
 MULTIPLES = (2, 3)  # chosen: stretches a named state, and one more
 START_FLOORS = (0.1, 0.4)  # numerics: of the partitions of single trials from which EM starts
 TEACHERS = 4  # numerics: trials whose partition is a start for all trials
+SURELY = 6.2  # numerics: nats; odds of 500, below which fits are left out
 SAME = 0.005  # numerics: of a trial: courses whose changes are as close are one
 MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch: a quiet channel says no more than the others
 
@@ -55,18 +56,27 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
     starts = [(number, i, floor) for number in numbers for i in _teachers(len(values), labels)
               for floor in START_FLOORS]  # fmt: skip
     taught = [_taught(values, number, i, floor, labels[i]) for number, i, floor in starts]
+    share = float(np.median([share for _, share in taught]))
+    price = _price(values, share)
     for least in (
         1,
         num_states,
     ):  # who has not even as many changes as are named is no reading, if others have
-        found: list[Course] = []
-        for probability, share in taught:
-            course = _course(values, probability, share, least)
-            if len(course.cost) > num_states and not any(_alike(course, other) for other in found):
-                found.append(course)
+        found: list[tuple[float, Course]] = []
+        for probability, own_share in taught:
+            stretches = merged(values, probability, share, price, least)
+            cost = float(np.diagonal(_costs(values, stretches, FLOORS[-1]), 1).sum()) * share
+            course = _course(values, stretches, own_share)
+            if len(course.cost) > num_states and not any(_alike(course, other) for _, other in found):
+                found.append((cost, course))
         if found:
             break
-    return found
+    if least == 1:
+        return [course for _, course in found]
+    best = min(
+        cost for cost, _ in found
+    )  # all have as many stretches as named: EM's worse ends are no readings
+    return [course for cost, course in found if cost <= best + SURELY]
 
 
 def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:
@@ -95,12 +105,23 @@ def _taught(values: Sequence[np.ndarray], number: int, teacher: int, floor: floa
     return probability, learner.independent_share(emissions, probability) * features
 
 
-def _course(values: Sequence[np.ndarray], probability: list[np.ndarray], share: float, least: int) -> Course:
-    probability = merged(values, probability, share, least)
+def _course(values: Sequence[np.ndarray], probability: list[np.ndarray], share: float) -> Course:
     number = probability[0].shape[1]
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
-    cost = merged_costs(values, [p.argmax(1) for p in probability], number, MERGE_FLOOR) / values[0].shape[1]
-    return Course(probability, ends, cost, share)
+    return Course(probability, ends, _costs(values, probability, MERGE_FLOOR), share)
+
+
+def _costs(values: Sequence[np.ndarray], probability: Sequence[np.ndarray], floor: float) -> np.ndarray:
+    number, features = probability[0].shape[1], values[0].shape[1]
+    return merged_costs(values, [p.argmax(1) for p in probability], number, floor) / features
+
+
+def _price(values: Sequence[np.ndarray], share: float) -> float:
+    """What a change has to gain [nats]: a mean and a spread of each feature, and a place sought in each trial
+    (Schwarz, Ann. Stat. 6, 1978); a cell holds `share` independent observations."""
+    observations = share * sum(map(len, values))
+    places = float(np.log([len(v) for v in values]).sum())
+    return values[0].shape[1] * float(np.log(max(observations, 1.0))) + places
 
 
 def _alike(one: Course, other: Course) -> bool:
@@ -118,28 +139,21 @@ def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def merged(
-    values: Sequence[np.ndarray], probability: list[np.ndarray], share: float, least: int
-) -> list[np.ndarray]:
-    """Probabilities (num_cells, num_stretches) of stretches, merged where their difference may be chance.
+def merged(values: Sequence[np.ndarray], probability: list[np.ndarray], share: float, price: float,
+           least: int) -> list[np.ndarray]:  # fmt: skip
+    """Probabilities (num_cells, num_stretches) of stretches, merged where they may differ by chance.
 
-    By Schwarz's criterion (Ann. Stat. 6, 1978): a change pays for a mean and a spread of each feature, and for
-    the place that was sought for it in each trial, where a cell holds `share` independent observations. At
-    least `least` stretches stay.
+    Neighbours stay apart that gain `price`; at least `least` stretches stay.
     """
-    features = values[0].shape[1]
-    observations = share * sum(map(len, values))
-    places = float(np.log([len(v) for v in values]).sum())
-    price = features * np.log(max(observations, 1.0)) + places
     while (number := probability[0].shape[1]) > least:
-        cost = merged_costs(values, [p.argmax(1) for p in probability], number, FLOORS[-1])
+        cost = _costs(values, probability, FLOORS[-1]) * share
         k = np.arange(number - 1)
-        loss = (cost[k, k + 2] - cost[k, k + 1] - cost[k + 1, k + 2]) * share / features
-        weakest = int(np.nan_to_num(loss).argmin())
+        loss = np.nan_to_num(cost[k, k + 2] - cost[k, k + 1] - cost[k + 1, k + 2])
+        weakest = int(loss.argmin())
         if loss[weakest] > price:
             break
-        probability = [np.delete(p, weakest + 1, 1) + p[:, [weakest + 1]] * (np.arange(number - 1) == weakest)
-                       for p in probability]  # fmt: skip
+        into = np.arange(number - 1) == weakest
+        probability = [np.delete(p, weakest + 1, 1) + p[:, [weakest + 1]] * into for p in probability]
     return probability
 
 

@@ -17,11 +17,11 @@ def test_cells_average_samples_and_stay_empty_where_there_are_none():
     t = np.array([0.0, 0.1, 0.2, 1.0, 1.1, 3.0])
     trial = Trial("x", t, {"a": np.array([1.0, 2.0, np.nan, 5.0, 7.0, 9.0])})
     edges, means = cell_means(trial, ("a",), 1.0)
-    np.testing.assert_allclose(edges, [0, 1, 2, 3])
-    np.testing.assert_allclose(means[:, 0], [1.5, 6.0, 9.0])
+    np.testing.assert_allclose(edges, [-0.05, 0.95, 1.95, 2.95, 3.95])  # between two samples
+    np.testing.assert_allclose(means[:, 0], [1.5, 6.0, np.nan, 9.0])
     edges, means = cell_means(trial, ("a",), 0.5)
     assert np.isnan(means[3, 0])
-    assert edges[-1] == pytest.approx(3.0)
+    assert edges[-1] == pytest.approx(3.45)
 
 
 def test_features_do_not_depend_on_units():
