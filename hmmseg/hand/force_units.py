@@ -41,9 +41,14 @@ def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     assert gripper is not None
     found = abs(tool.inertia)
     stated = gripper.tool_mass
-    if stated is None and LIGHTEST < found < HEAVIEST:
-        return ()
-    if stated is not None and _nearest(stated / found)[1] > np.log(2):
+    likely = LIGHTEST < found < HEAVIEST if stated is None else _nearest(stated / found)[1] > np.log(2)
+    if likely and tool.weighed and abs(tool.mass / tool.inertia - 1) > NEAR:
+        said = "is stated to weigh" if stated is not None else "weighs, as it turns,"
+        names = ", ".join(gripper.wrench[:3])
+        return (f"{trial.file}: columns {names}: the tool {said} {tool.mass:.3g} kg and moves like one of "
+                f"{tool.inertia:.3g} kg; expected one mass: gains, axes or tool_mass under [gripper] are "
+                "wrong",)  # fmt: skip
+    if likely:
         return ()
     unit, _ = _nearest((USUAL if stated is None else stated) / found)
     expected = f"{LIGHTEST:g} to {HEAVIEST:g} kg" if stated is None else f"{stated:g} kg in rig.toml"

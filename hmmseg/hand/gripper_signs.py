@@ -90,11 +90,32 @@ def counts_closing(trial: Trial, rig: Rig) -> InputError:
 
 
 def lifts_pull(trial: Trial, rig: Rig, load: float) -> InputError:
-    """The line for lifts that take weight [N] off the hand."""
+    """The line for lifts that take weight [N] off the hand, whichever sign is stated."""
+    problem = f"say that what is lifted pulls up with {abs(load):.3g} N: the sign is the other way round"
+    return _other_sign(trial, rig, problem)
+
+
+def goes_against(trial: Trial, rig: Rig) -> InputError:
+    """The line for a stated sign that free motion contradicts, where nothing is lifted that would tell."""
+    problem = "go against the hand's own acceleration in free motion: the sign is the other way round"
+    return _other_sign(trial, rig, problem)
+
+
+def borne_out(trial: Trial, rig: Rig, load: float) -> str:
+    """The warning where a lift tells one sign and free motion the other: readings that go with the pose."""
     gripper = rig.gripper
     assert gripper is not None
     where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
-    problem = f"say that what is lifted pulls up with {abs(load):.3g} N: the sign is the other way round"
+    return (
+        f"{where} bear {load:.3g} N of what is lifted, but go against the hand's own acceleration in free "
+        "motion: they change with the pose, and loads are wrong by as much"
+    )
+
+
+def _other_sign(trial: Trial, rig: Rig, problem: str) -> InputError:
+    gripper = rig.gripper
+    assert gripper is not None
+    where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
     said = not gripper.reaction if gripper.reaction is not None else True
     return InputError(where, problem, f"reaction = {str(said).lower()} under [gripper]")
 

@@ -40,9 +40,9 @@ class Tool:
     `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
     [N s/m]; `jerked` [kg s]: of how the acceleration changes, which is by how much later than the wrench the
     pose was taken, times the inertia; `noise` [N]: scale of one component of F in free motion about the
-    model; `since` [s]: when the drift has added nothing to the offset, `drift_sd`
-    [N/s]: its standard error; `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns
-    tell it.
+    model; `since` [s]: when the drift has added nothing to the offset, `drift_sd` [N/s]: its standard error;
+    `against`: the reading goes against a stated sign; `centre_of_mass` (3,) [m] in the tool's axes, None
+    where no torques or turns tell it.
     """
 
     axes: np.ndarray
@@ -56,6 +56,7 @@ class Tool:
     noise: float
     since: float
     drift_sd: float
+    against: bool = False
     centre_of_mass: np.ndarray | None = None
 
 
@@ -134,9 +135,10 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     _check(where, gripper, fitted.inertia, float(error[0]))
     mass = fitted.mass if fitted.mass is not None else fitted.inertia
     offset, drift = axes @ fitted.offset, axes @ fitted.drift
+    against = gripper.reaction is not None and fitted.inertia < -SURE * float(error[0])
     return Tool(
         axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, offset, drift, scale,
-        since, float(error[2:].max()),
+        since, float(error[2:].max()), against,
     )  # fmt: skip
 
 
@@ -216,10 +218,7 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
 
 
 def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
-    """InputError where free motion contradicts what the rig says, or cannot tell what it leaves open."""
-    if inertia < -SURE * error and gripper.reaction is not None:
-        problem = "go against the hand's own acceleration in free motion: the sign is the other way round"
-        raise InputError(where, problem, f"reaction = {str(not gripper.reaction).lower()} under [gripper]")
+    """InputError where free motion cannot tell what the rig leaves open."""
     left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
     if (left_open or gripper.reaction is None) and abs(inertia) < SURE * error:
         problem = "do not show the hand's own mass in free motion, so nothing tells how the sensor stands"

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmmseg.hand.carried import ACTIVE, contradiction, grip_force_of, held_by
+from hmmseg.hand.carried import ACTIVE, Held, contradiction, grip_force_of, held_by
 from hmmseg.hand.force_units import tool_warnings
-from hmmseg.hand.gripper_signs import lifts_pull
+from hmmseg.hand.gripper_signs import borne_out, goes_against, lifts_pull
 from hmmseg.hand.opening import Grip
 from hmmseg.hand.pose import Pose, pose_of, smooth
 from hmmseg.hand.quaternion_order import order_warnings
@@ -76,8 +76,13 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
     pressing = grip_force_of(trial, gripper)
     held = held_by(trial, rig, pose, opening, pressing)
+    signs: tuple[str, ...] = ()
     if held.lifts and max(held.lifts) < 0:
-        raise lifts_pull(trial, rig, min(held.lifts))
+        held, rig, signs = _other_sign(trial, rig, pose, opening, pressing, held)
+    elif held.lifts and held.tool.against:
+        signs = (borne_out(trial, rig, max(held.lifts)),)
+    elif held.tool.against:
+        raise goes_against(trial, rig)
     if held.grips and not held.lifts:
         text = contradiction(trial, rig, pose, opening, held)
         if text is not None:
@@ -85,7 +90,22 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     loaded = [grip for grip, load in zip(held.grips, held.loads, strict=True) if load is None or load != 0]
     found = as_fingers(trial, rig, pose, held.tool, opening, held.force, loaded or held.grips, pressing)
     order = order_warnings(trial, rig, held.tool, held.free)
-    return replace(found, warnings=(*order, *tool_warnings(trial, rig, held.tool)))
+    return replace(found, warnings=(*signs, *(order or tool_warnings(trial, rig, held.tool))))
+
+
+def _other_sign(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None,
+                held: Held) -> tuple[Held, Rig, tuple[str, ...]]:  # fmt: skip
+    """What is held with the other sign, where lifts pull up and none is stated; else InputError.
+
+    What is lifted hangs on the hand: that tells the sign before the hand's own inertia does.
+    """
+    assert rig.gripper is not None
+    for reaction in (True, False) if rig.gripper.reaction is None else ():
+        other = rig.model_copy(update={"gripper": rig.gripper.model_copy(update={"reaction": reaction})})
+        found = held_by(trial, other, pose, opening, pressing)
+        if found.lifts and max(found.lifts) > 0:
+            return found, other, (borne_out(trial, other, max(found.lifts)),)
+    raise lifts_pull(trial, rig, min(held.lifts))
 
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,

@@ -58,25 +58,25 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
     taught = [_taught(values, number, i, floor, labels[i]) for number, i, floor in starts]
     share = float(np.median([share for _, share in taught]))
     price = _price(values, share)
-    for least in (
-        1,
-        num_states,
-    ):  # who has not even as many changes as are named is no reading, if others have
-        found: list[tuple[float, Course]] = []
-        for probability, own_share in taught:
-            stretches = merged(values, probability, share, price, least)
-            cost = float(np.diagonal(_costs(values, stretches, FLOORS[-1]), 1).sum()) * share
-            course = _course(values, stretches, own_share)
-            if len(course.cost) > num_states and not any(_alike(course, other) for _, other in found):
-                found.append((cost, course))
-        if found:
-            break
-    if least == 1:
-        return [course for _, course in found]
-    best = min(
-        cost for cost, _ in found
-    )  # all have as many stretches as named: EM's worse ends are no readings
-    return [course for cost, course in found if cost <= best + SURELY]
+
+    def cost(stretches: list[np.ndarray]) -> float:
+        return float(np.diagonal(_costs(values, stretches, FLOORS[-1]), 1).sum()) * share
+
+    shown = [merged(values, probability, share, price, 1) for probability, _ in taught]
+    count = min(shown, key=lambda each: cost(each) + price * each[0].shape[1])[0].shape[1]
+    fits = [(probability, own) for probability, own in taught if probability[0].shape[1] > num_states + 1]
+    if (
+        count <= num_states
+    ):  # no change but those that are named: one model, of whose fits only the best count
+        exact = [(merged(values, probability, share, price, num_states), own) for probability, own in taught]
+        best = min(cost(probability) for probability, _ in exact)
+        fits = [(probability, own) for probability, own in exact if cost(probability) <= best + SURELY]
+    found: list[Course] = []
+    for probability, own in fits or taught:
+        course = _course(values, probability, own)
+        if not any(_alike(course, other) for other in found):
+            found.append(course)
+    return found
 
 
 def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:
