@@ -52,7 +52,7 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
     trials teach first, and their stretches end where the labels are.
     """
     most = max(num_states, min(map(len, values)) // 2)
-    numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
+    numbers = dict.fromkeys((num_states, *(min(m * num_states + 1, most) for m in MULTIPLES)))
     starts = [(number, i, floor) for number in numbers for i in _teachers(len(values), labels)
               for floor in START_FLOORS]  # fmt: skip
     taught = [_taught(values, number, i, floor, labels[i]) for number, i, floor in starts]

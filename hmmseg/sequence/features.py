@@ -16,6 +16,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
 
 CELLS_PER_TRIAL = 1500  # numerics: resolves a boundary to under 0.1 % of a trial's duration
+FEWEST = 20  # numerics: changes of a channel; of fewer nothing is said of its rate
 SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's duration
 
 
@@ -42,6 +43,19 @@ class SequenceFeatures:
     values: np.ndarray
 
 
+def without_old(values: np.ndarray) -> np.ndarray:
+    """A channel (num_timesteps,) whose repeated readings are missing (NaN), where it is read at a lower rate.
+
+    So it is where no two neighbours both change: what comes between two readings is the last one again.
+    """
+    changes = np.flatnonzero(np.diff(values) != 0) + 1
+    if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
+        return values
+    begun = np.concatenate([[0], changes])
+    since = np.arange(values.size) - begun[np.searchsorted(begun, np.arange(values.size), side="right") - 1]
+    return np.where(since % period == 0, values, np.nan)
+
+
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
     """Edges (num_cells + 1,) and mean of each channel (num_cells, num_channels), NaN in empty cells.
 
@@ -55,7 +69,7 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     cell = np.minimum(((trial.t - start) / step).astype(int), num_cells - 1)
     means = np.full((num_cells, len(channels)), np.nan)
     for j, name in enumerate(channels):
-        x = trial.channels[name]
+        x = without_old(trial.channels[name])
         finite = np.isfinite(x)
         count = np.bincount(cell[finite], minlength=num_cells)
         total = np.bincount(cell[finite], x[finite], minlength=num_cells)
