@@ -19,7 +19,6 @@ COARSE_CELLS = 300  # numerics: a trial, on the grid on which courses are learne
 MULTIPLES = (2, 3)  # chosen: stretches a named state, and one more
 START_FLOORS = (0.1, 0.4)  # numerics: of the partitions of single trials from which EM starts
 TEACHERS = 4  # numerics: trials whose partition is a start for all trials
-SURELY = 6.2  # numerics: nats; odds of 500, below which fits are left out
 SAME = 0.005  # numerics: of a trial: courses whose changes are as close are one
 MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch: a quiet channel says no more than the others
 
@@ -45,11 +44,14 @@ class Course:
         return self.share * sum(len(p) for p in self.probability)
 
 
-def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
+def find_courses(
+    values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]
+) -> tuple[list[Course], Course | None]:
     """Courses of trials `values` [(num_cells, num_features), ...] on a coarse grid, all different.
 
     `labels` [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled
-    trials teach first, and their stretches end where the labels are.
+    trials teach first, and their stretches end where the labels are. Beside them the best fit of as many
+    stretches as are named, where the recordings show no more.
     """
     most = max(num_states, min(map(len, values)) // 2)
     numbers = dict.fromkeys((num_states, *(min(m * num_states + 1, most) for m in MULTIPLES)))
@@ -64,19 +66,17 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
 
     shown = [merged(values, probability, share, price, 1) for probability, _ in taught]
     count = min(shown, key=lambda each: cost(each) + price * each[0].shape[1])[0].shape[1]
-    fits = [(probability, own) for probability, own in taught if probability[0].shape[1] > num_states + 1]
-    if (
-        count <= num_states
-    ):  # no change but those that are named: one model, of whose fits only the best count
-        exact = [(merged(values, probability, share, price, num_states), own) for probability, own in taught]
-        best = min(cost(probability) for probability, _ in exact)
-        fits = [(probability, own) for probability, own in exact if cost(probability) <= best + SURELY]
+    exact = None
+    if count <= num_states:  # no change shows but those that are named
+        every = [(merged(values, probability, share, price, num_states), own) for probability, own in taught]
+        exact = _course(values, *min(every, key=lambda each: cost(each[0])))
     found: list[Course] = []
-    for probability, own in fits or taught:
+    for probability, own in taught:
         course = _course(values, probability, own)
-        if not any(_alike(course, other) for other in found):
+        wide = probability[0].shape[1] > num_states or num_states == most
+        if wide and not any(_alike(course, other) for other in found):
             found.append(course)
-    return found
+    return found, exact
 
 
 def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:

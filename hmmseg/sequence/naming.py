@@ -133,14 +133,16 @@ def probabilities(namings: Sequence[Naming]) -> np.ndarray:
     return weights / weights.sum()
 
 
-def best_choice(courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray) -> Choice:
-    """The choice that is expected to lie nearest to what is right, were one of all courses and choices true.
+def best_choice(
+    courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray, first: int | None = None
+) -> Choice:
+    """Of the first courses (all for None), the choice expected to lie nearest to what is right, were one true.
 
     Near is what the law by which boundaries lie off their changes makes of a distance.
     """
     best, answer = -np.inf, None
-    for i, (course, own) in enumerate(zip(courses, namings, strict=True)):
-        close, right = np.zeros((2, *own.probability.shape))
+    for i, (course, own) in enumerate(zip(courses[:first], namings[:first], strict=True)):
+        close, right = np.zeros_like(own.probability), np.zeros_like(own.probability)
         for weight, other, its in zip(probability, courses, namings, strict=True):
             apart = np.median(np.abs(course.ends[:, :, None] - other.ends[:, None]), axis=0)
             close += weight * its.probability @ np.exp(-apart / WEIGHING.lag).T
