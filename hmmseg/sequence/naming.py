@@ -136,7 +136,7 @@ def probabilities(namings: Sequence[Naming]) -> np.ndarray:
 def best_choice(
     courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray, first: int | None = None
 ) -> Choice:
-    """Of the first courses (all for None), the choice expected to lie nearest to what is right, were one true.
+    """Of the first courses (all for None), the choice expected to lie nearest to what is right.
 
     Near is what the law by which boundaries lie off their changes makes of a distance.
     """
