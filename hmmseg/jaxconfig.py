@@ -60,9 +60,15 @@ def configure(steady: bool = False) -> None:
 _configured: list[bool] = []
 
 
+def keep_programs() -> None:
+    """Have JAX keep compiled programs in our cache folder where `configure` has been called, once JAX is
+    imported; where its user has a folder for them, they go there."""
+    if _configured:
+        _keep_programs()
+
+
 @functools.cache
 def _keep_programs() -> None:
-    """Have JAX keep compiled programs in our cache folder, unless its user has one for it."""
     import jax
 
     folder = cache_folder()
@@ -84,8 +90,7 @@ def double_precision(function: Callable[P, R]) -> Callable[P, R]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         import jax
 
-        if _configured:
-            _keep_programs()
+        keep_programs()
         if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
             return function(*args, **kwargs)
         with jax.enable_x64(True):
