@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
+.PHONY: oldest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -39,6 +39,14 @@ golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ agai
 
 wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
 	$(BIN)/python .ci/check_wheel.py
+
+OLDEST := build/oldest
+oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares, in an environment of its own
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
+	$(BIN)/uv pip install --quiet --python $(OLDEST) --resolution lowest-direct '.[mujoco]'
+	$(OLDEST)/bin/hmmseg doctor
+	$(OLDEST)/bin/hmmseg demo --figures build/oldest_demo
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
 	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs

@@ -15,6 +15,9 @@ from hmmseg.levels import CONTRADICTS
 UNITS = decompose.UNITS | {"friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
 
+# limit: SI units; no hand lifts, spans or slips on what lies beyond
+LIMITS = {"weight": (1e-4, 1e4), "width": (1e-5, 10.0), "height": (1e-5, 10.0), "friction": (1e-4, 1e3)}
+
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
     """Measured (value, standard deviation) of every property given, by object and property.
@@ -37,7 +40,7 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
         for key, entry in entries.items():
             if key not in UNITS:
                 raise InputError(f"{where}: key {name}.{key}", "unknown property", nearest(key, UNITS))
-            actual[name][key] = _parse_entry(entry, UNITS[key], f"{where}: key {name}.{key}")
+            actual[name][key] = _parse_entry(entry, key, f"{where}: key {name}.{key}")
     return actual
 
 
@@ -96,7 +99,8 @@ def _shown(value: float, sd: float, unit: str) -> str:
     return f"{value * factor:.{digits}f} +- {sd * factor:.{digits}f}{name}"
 
 
-def _parse_entry(entry: Any, unit: str, where: str) -> tuple[float, float]:
+def _parse_entry(entry: Any, prop: str, where: str) -> tuple[float, float]:
+    unit = UNITS[prop]
     if not isinstance(entry, dict):
         raise InputError(where, f"found {entry!r}", "a table with unit, value and sd")
     for key in entry:
@@ -104,16 +108,13 @@ def _parse_entry(entry: Any, unit: str, where: str) -> tuple[float, float]:
             raise InputError(f"{where}.{key}", "unknown key", nearest(key, ("unit", "value", "sd")))
     if entry.get("unit") != unit:
         raise InputError(f"{where}.unit", f"found {entry.get('unit')!r}", f'"{unit}"')
-    value = _number(entry.get("value"), f"{where}.value", "a number > 0")
-    sd = _number(entry.get("sd", 0.0), f"{where}.sd", "a number >= 0")
-    if value <= 0:
-        raise InputError(f"{where}.value", f"found {value!r}", "a number > 0")
-    if sd < 0:
-        raise InputError(f"{where}.sd", f"found {sd!r}", "a number >= 0")
-    return value, sd
+    low, high = LIMITS[prop]
+    value = number(entry.get("value"), f"{where}.value", f"a number > 0, from {low:g} to {high:g}", low, high)
+    return value, number(entry.get("sd", 0.0), f"{where}.sd", "a number >= 0", 0.0, high)
 
 
-def _number(value: Any, where: str, expected: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(where, f"found {value!r}", expected)
+def number(value: Any, where: str, expected: str, low: float, high: float) -> float:
+    """The value as a float; InputError unless it is a number from `low` to `high`."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise InputError(where, f"found {value!r:.40}", expected)
     return float(value)

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.schema import read_toml
+from hmmseg.io.schema import LARGEST, read_toml
 from hmmseg.io.units import si_factor
+from simgap.simulators.user import LONGEST
 
 THINGS = ("joint", "actuator", "sensor", "body", "site")
 AXES = {"body": ("x", "y", "z", "qw", "qx", "qy", "qz"), "site": ("x", "y", "z", "qw", "qx", "qy", "qz")}
@@ -73,6 +74,17 @@ def read_map(path: Path) -> Map:
         raise InputError(f"{path}: columns", "missing", "a table [columns.NAME] for each column of the logs")
     time = raw.get("time", {})
     time = {"column": time} if isinstance(time, str) else time
+    if not isinstance(time, dict) or not isinstance(time.get("column", ""), str):
+        raise InputError(
+            f"{path}: time", f"found {time!r:.40}", 'a column\'s name, or {column = "...", unit = "..."}'
+        )
+    window, keyframe = _number(raw, "window", str(path)), raw.get("keyframe")
+    if window is not None and not 0 < window <= LONGEST:
+        raise InputError(f"{path}: window", f"found {window:g}", f"seconds above 0, {LONGEST:g} at most")
+    if keyframe is not None and not isinstance(keyframe, str):
+        raise InputError(
+            f"{path}: keyframe", f"found {keyframe!r:.40}", "the name of a keyframe of the model"
+        )
     found = {name: _mapped(name, entry, f"{path}: columns.{name}") for name, entry in columns.items()}
     if all(m.kind == "command" for m in found.values()):
         raise InputError(
@@ -83,8 +95,8 @@ def read_map(path: Path) -> Map:
         found,
         time.get("column", "t"),
         _unit(time.get("unit"), f"{path}: time.unit"),
-        _number(raw, "window", str(path)),
-        raw.get("keyframe"),
+        window,
+        keyframe,
         _patterns(raw.get("uncertain", []), f"{path}: uncertain"),
         _deviations(raw.get("sd", {}), f"{path}: sd"),
     )
@@ -159,6 +171,6 @@ def _number(entry: Mapping[str, Any], key: str, where: str, default: Any = None)
     if key not in entry:
         return default
     value = entry[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}.{key}", f"{value!r}", "a number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise InputError(f"{where}.{key}", f"{value!r:.40}", "a number")
     return float(value)
