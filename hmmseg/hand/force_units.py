@@ -26,9 +26,9 @@ def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
     names = [name for name in FORCE_CHANNELS if name in trial.channels]
     if rig.noise.force is None or not names or check_forces(trial, rig):
         return []
-    shown = _noise([trial.channels[name] for name in names])
+    shown = noise_of([trial.channels[name] for name in names])
     unit, off = _nearest(rig.noise.force / shown) if shown > 0 else ("", np.inf)
-    if off > NEAR or (UNITS[unit][1] > 1 and _followed([trial.channels[name] for name in names]) > WHITE):
+    if off > NEAR or (UNITS[unit][1] > 1 and whiteness([trial.channels[name] for name in names]) > WHITE):
         return []  # a filter makes noise smaller, too, but neighbours alike
     stated = f"where [noise] force = {rig.noise.force:g} N in rig.toml"
     problem = f"has noise of {shown:.2g} {stated}: it looks like {unit}"
@@ -70,14 +70,14 @@ def _quiet(channels: list[np.ndarray]) -> list[np.ndarray]:
     return pieces[: max(1, len(pieces) // 4)]
 
 
-def _followed(channels: list[np.ndarray]) -> float:
+def whiteness(channels: list[np.ndarray]) -> float:
     """Correlation of neighbouring second differences of noise, -2/3 where it is white."""
     pieces = _quiet(channels)
     total = sum(float(piece @ piece) for piece in pieces)
     return sum(float(piece[1:] @ piece[:-1]) for piece in pieces) / total if total > 0 else 0.0
 
 
-def _noise(channels: list[np.ndarray]) -> float:
+def noise_of(channels: list[np.ndarray]) -> float:
     """Standard deviation of one sample's noise: that of the stretch at the end of the quiet quarter."""
     pieces = _quiet(channels)
     return float(np.sqrt(np.mean(pieces[-1] ** 2) / 6)) if pieces else 0.0

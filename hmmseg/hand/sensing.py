@@ -1,0 +1,286 @@
+"""Which readings of a hand are none: what a working sensor cannot have read is named and left out.
+
+One model of a sensor stands behind it. Its readings scatter, so that neighbours repeat each other to the last
+digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow; they stay
+within a few times the range of all others; a position moves no farther between two samples than its velocity
+carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of missing
+readings is a fault where its length has next to no chance under that model, so that coarse sensors, forces that
+are held for some samples and recordings without any noise pass. What is left out is missing from there on, to
+the segmentation and to the properties alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmmseg.hand.force_units import noise_of, whiteness
+from hmmseg.io.plausibility import position_pairs, scale_to_velocity
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
+from hmmseg.io.trial import Trial
+from hmmseg.robust import robust_sd
+
+CHANCE = 1e-4  # chosen: probability a channel below which a run of repeated or missing readings is a fault
+SCATTERS = -1 / 3  # numerics: correlation of second differences: -2/3 of white noise, positive of smooth motion
+FAR = 5.0  # limit: ranges of all other readings that one may be off by; an impact is less
+FEW = 0.01  # limit: share of readings that are so far off: of more the others are no rule
+LEAP = 20.0  # limit: noise sds that a step exceeds; changes of speed between samples make up to 24 of a tenth
+FASTEST = 1.5  # limit: times what the fastest velocity covers in an interval; healthy joints: up to 1.2
+SWEPT = 0.1  # limit: share of a position's range that its velocity covers while it stands still
+MIN_ALIVE = 30  # numerics: readings that tell a channel's own noise
+MOST = 200  # numerics: longest runs of a channel that are looked at
+LISTED = 3  # look: stretches in a line
+STEPS = 3  # limit: of one encoder; of more it is the hand that moves so (backlash)
+SPARSE = 1 / 3  # limit: share of missing readings that is remarked on
+WHOLE = 0.1  # limit: share of rows that are whole, of which fewer are remarked on
+PAUSE, USUAL = 0.6, 5.0  # limit: s, in which a subtask may hide, and usual intervals: a jump of the clock
+DISAGREE = 1.5  # limit: factor by which displacements and velocities may differ in most joints
+CARTESIAN = ("x1", "y1", "x2", "y2")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that a channel shows and no working sensor does.
+
+    `spans`: stretches [s] whose readings are left out; none where it is only remarked on. `blames`: channels
+    whose readings are no measure of anything by it.
+    """
+
+    channel: str
+    problem: str
+    spans: tuple[tuple[float, float], ...] = ()
+    blames: tuple[str, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """What is wrong, and when."""
+        listed = [f"{a:.2f} to {b:.2f} s" for a, b in self.spans[:LISTED]]
+        more = f" and {len(self.spans) - LISTED} more times" if len(self.spans) > LISTED else ""
+        when = f" from {', '.join(listed)}{more}" if listed else ""
+        return f"{self.channel} {self.problem}{when}"
+
+
+def sensed(trial: Trial, rig: Rig) -> Trial:
+    """The trial without readings that are none, its faults named in `faults` and `warnings`."""
+    channels = {name: values.copy() for name, values in trial.channels.items()}
+    found = [*_missing(trial), *_clock(trial.t)]
+    kinds = _kinds(trial, rig)
+    for names, _ in kinds:
+        for name in names:
+            found += _far_off(name, trial.t, channels[name])
+    seen = {name: values.copy() for name, values in channels.items()}
+    rates = dict(position_pairs(trial))
+    for names, noise in kinds:
+        for name in names:
+            fault, stuck = _repeated(name, trial.t, seen, names, noise, rates.get(name))
+            channels[name][stuck] = np.nan
+            found += [] if fault is None else [fault]
+    found += _leaps(trial.t, channels, rates)
+    trial = replace(trial, channels=channels)
+    found += _disagreeing(trial)
+    lines = tuple(f"{trial.file}: {fault.line}" for fault in found)
+    return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
+
+
+def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
+    """Channels by what they measure, as each is judged by its fellows, and the noise that the rig states."""
+    noise = rig.noise
+    if rig.gripper is not None:
+        g = rig.gripper
+        kinds = [(g.wrench[:3], None), (g.wrench[3:], None), (tuple(g.position.values()), None),
+                 (tuple(g.opening), None)]  # fmt: skip
+    else:
+        places = JOINTS if rig.jointed else CARTESIAN
+        rates = tuple(("d" if rig.jointed else "v") + name for name in places)
+        kinds = [(FORCE_CHANNELS, noise.force), (places, noise.angle if rig.jointed else noise.position),
+                 (rates, noise.velocity)]  # fmt: skip
+    there = [([name for name in names if name in trial.channels], sd) for names, sd in kinds]
+    return [(names, sd) for names, sd in there if names]
+
+
+def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
+    """Few readings that lie far beyond the range of all others; they are set to NaN in `values`."""
+    there = np.flatnonzero(np.isfinite(values))
+    few = max(1, int(FEW * there.size))
+    if there.size < 4 * few:
+        return []
+    order = there[np.argsort(np.abs(values[there] - np.median(values[there])))]
+    reach = np.ptp(values[order[:-few]])
+    wild = order[-few:]
+    wild = np.sort(wild[np.abs(values[wild] - np.median(values[there])) > FAR * reach])
+    if not wild.size or reach == 0:
+        return []
+    worst = values[wild[np.argmax(np.abs(values[wild]))]]
+    values[wild] = np.nan
+    problem = f"reads {worst:.3g}, where its other readings span {reach:.3g}: left out"
+    return [Fault(name, problem, tuple((t[i], t[i]) for i in wild))]
+
+
+def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
+              stated: float | None, rate: str | None) -> tuple[Fault | None, np.ndarray]:  # fmt: skip
+    """Runs of one value that a working sensor cannot have read, and which samples (num_timesteps,) they are.
+
+    `fellows`: channels of its kind, itself among them; `stated`: noise of one reading; `rate`: the channel of
+    its velocity.
+    """
+    values = seen[name]
+    there = np.flatnonzero(np.isfinite(values))
+    shown = values[there]
+    same = np.diff(shown) == 0
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
+    stuck = np.zeros(values.size, bool)
+    standing: dict[float, list[tuple[float, float]]] = {}
+    for start, stop in runs[np.argsort(runs[:, 0] - runs[:, 1])][:MOST]:
+        value, at = float(shown[start]), there[start : stop + 1]
+        if stop - start < 2 or (value == 0 and _both_zero(name, at, seen)):
+            continue
+        chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
+        unlikely = np.log(shown.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
+        if unlikely or (rate is not None and _swept(at, t, values, seen[rate])):
+            stuck[at] = True
+            standing.setdefault(value, []).append((float(t[at[0]]), float(t[at[-1]])))
+    if not standing:
+        return None, stuck
+    value, spans = max(standing.items(), key=lambda entry: sum(b - a for a, b in entry[1]))
+    every = tuple(sorted(span for some in standing.values() for span in some))
+    if not (shown != value).any():
+        problem = f"reads {value:.4g} in every row"
+    elif len(spans) > 1 and abs(value) == np.abs(shown).max():
+        problem = f"goes no farther than {value:.4g}: it saturates"
+    else:
+        problem = f"repeats {value:.4g} to the last digit"
+    return Fault(name, f"{problem}, and is left out", every), stuck
+
+
+def _both_zero(name: str, at: np.ndarray, seen: dict[str, np.ndarray]) -> bool:
+    """Whether the other finger's force is exactly zero as well: sensors that hide what is small."""
+    other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
+    return other is not None and bool(np.mean(other[at] == 0) > 0.5)
+
+
+def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
+    """Whether a velocity that lives carries a position far while that repeats itself (samples `at`)."""
+    v, alive = np.nan_to_num(rate[at]), _lives(rate[at])
+    way = np.cumsum(np.diff(t[at]) * (v[1:] + v[:-1]) / 2)
+    return bool(alive and np.ptp(way) > SWEPT * max(np.ptp(values[np.isfinite(values)]), np.ptp(way) / 2))
+
+
+def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
+                      fellows: list[str], stated: float | None) -> float:  # fmt: skip
+    """How likely a reading repeats the one before: by the channel's resolution and noise, and its fellows'.
+
+    What the channel reads besides `value` counts, or where it reads nothing else, what its fellows do. 1
+    where readings do not scatter, as far as they and the rig show.
+    """
+    own = np.where(seen[name] == value, np.nan, seen[name])
+    others = [seen[fellow] for fellow in fellows if fellow != name]
+    alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if _lives(v)]
+    steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(v[np.isfinite(v)])) for v in alive)])
+    steps = steps[steps > 0]
+    if not steps.size:
+        return 1.0
+    noise = noise_of(alive)
+    if noise == 0 or whiteness(alive) > SCATTERS:
+        if stated is None or all(_rests(v[at]) for v in others):  # of no noise, or of motion above it
+            return 1.0
+        noise = stated
+    by_noise = float(steps.min()) / (2 * np.sqrt(np.pi) * noise)
+    differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
+    pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
+    return min(max(by_noise, (repeats + 1) / (pairs + 2)), 1.0)
+
+
+def _lives(values: np.ndarray) -> bool:
+    """Whether a channel does more than repeat itself."""
+    return not _rests(values)
+
+
+def _rests(values: np.ndarray) -> bool:
+    """Whether a stretch of a channel mostly repeats itself."""
+    steps = np.diff(values[np.isfinite(values)])
+    return not steps.size or bool(np.mean(steps == 0) > 0.5)
+
+
+def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
+    """A position that steps as its velocity does not, alone among them; what that leaves open is set to NaN.
+
+    Where several positions step, it is the hand that does (backlash).
+    """
+    stepping = {}
+    for name, rate in rates.items():
+        there = np.flatnonzero(np.isfinite(channels[name]) & np.isfinite(channels[rate]))
+        if there.size < MIN_ALIVE:
+            continue
+        q, v, times = channels[name][there], channels[rate][there], t[there]
+        more = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
+        covered = float(np.max(np.abs(v))) * np.diff(times)
+        far = np.abs(more) > np.maximum(LEAP * robust_sd(more), FASTEST * covered)
+        if far.any():
+            stepping[name] = there, np.where(far, more, 0.0)
+    if len(stepping) != 1:
+        return []
+    name, (there, steps) = next(iter(stepping.items()))
+    at, offset = np.flatnonzero(steps), np.concatenate([[0.0], np.cumsum(steps)])
+    if at.size > STEPS:
+        return []
+    away = np.abs(offset) > np.abs(steps[at]).min() / 2
+    problem = f"jumps by {steps[at[0]]:.3g} at {t[there[at[0] + 1]]:.2f} s, as its velocity does not"
+    if away[-1]:  # it never comes back: either side may be the right one
+        channels[name][:] = np.nan
+        spans = ((float(t[0]), float(t[-1])),)
+        return [Fault(name, f"{problem}: which side is right nothing tells, so it is left out", spans)]
+    inside = there[away]
+    channels[name][inside[0] : inside[-1] + 1] = np.nan
+    return [Fault(name, f"{problem}, and is left out", ((float(t[inside[0]]), float(t[inside[-1]])),))]
+
+
+def _disagreeing(trial: Trial) -> list[Fault]:
+    """Positions that go farther or less far than their velocities carry them, most of them alike."""
+    pairs = position_pairs(trial)
+    slopes = np.array([scale_to_velocity(trial, *pair) for pair in pairs])
+    known = slopes[np.isfinite(slopes) & (slopes > 0)]
+    if known.size <= len(pairs) / 2 or abs(np.log(np.median(known))) < np.log(DISAGREE):
+        return []
+    places = tuple(position for position, _ in pairs)
+    problem = (
+        f"and the other positions go {1 / np.median(known):.2g} times as far as their velocities carry "
+        "them: one of the two scales is wrong"
+    )
+    return [Fault(places[0], problem, blames=places)]
+
+
+def _missing(trial: Trial) -> list[Fault]:
+    """Channels with few readings, or none for longer than elsewhere in them, and rows hardly ever whole."""
+    gone = {name: ~np.isfinite(values) for name, values in trial.channels.items()}
+    out = []
+    for name, lost in gone.items():
+        share = float(lost.mean())
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]]))).reshape(-1, 2)
+        long = []
+        for start, stop in edges:
+            chance = (lost.sum() - (stop - start) + 1) / (lost.size - (stop - start) + 2)
+            unlikely = np.log(lost.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
+            if unlikely and trial.t[stop - 1] - trial.t[start] > PAUSE:
+                long.append((float(trial.t[start]), float(trial.t[stop - 1])))
+        if long:
+            out.append(Fault(name, "has no readings", tuple(long)))
+        elif share > SPARSE:
+            out.append(Fault(name, f"lacks {share:.0%} of its readings"))
+    if len(out) == len(gone) and len({fault.problem + str(fault.spans) for fault in out}) == 1:
+        return [replace(out[0], channel="every channel")]
+    whole = float((~np.any(list(gone.values()), axis=0)).mean())
+    if not out and whole < WHOLE:
+        return [Fault("every row" if whole == 0 else f"all but {whole:.0%} of the rows", "without some reading")]
+    return out
+
+
+def _clock(t: np.ndarray) -> list[Fault]:
+    """Jumps of the clock, or stretches without rows."""
+    steps = np.diff(t)
+    wide = np.flatnonzero(steps > max(PAUSE, USUAL * float(np.quantile(steps, 0.95))))
+    usual = float(np.median(steps))
+    return [
+        Fault("t", f"jumps by {steps[i]:.3g} s at {t[i]:.2f} s, where rows are {usual:.2g} s apart: rows are "
+              "missing, or the clock was set") for i in wide[:LISTED]
+    ]  # fmt: skip
