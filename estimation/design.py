@@ -42,7 +42,7 @@ from estimation.observations import (
     gravity_factor,
 )
 from estimation.unknowns import FORCE, PROPERTIES, RISE, Unknown, coefficients_of, determined
-from hmmseg.contact.decompose import height_equations
+from hmmseg.contact.decompose import FREE, height_equations
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS
 from hmmseg.segmentation.align import AlignedTrials
@@ -61,7 +61,8 @@ class Design:
     `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
     free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
     that free motion shows and the rig does not admit, `doubt`: the like of the pads; `level_rises`: by
-    move between equal heights, the mean rise that was recorded [m].
+    move between equal heights, the mean rise that was recorded [m]; `moved` (4,): by how much the zeros
+    of forces move within a trial [N].
     """
 
     unknowns: tuple[Unknown, ...]
@@ -83,6 +84,7 @@ class Design:
     unexpected: tuple[Nuisance, ...] = ()
     doubt: PadDoubt = field(default_factory=PadDoubt)
     level_rises: dict[int, float] = field(default_factory=dict)
+    moved: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
@@ -119,8 +121,9 @@ def build(
     columns = coefficients_of(unknowns, objects, rises)  # M, 3, Q
     coefficients = np.repeat(np.repeat(columns[None, None], raw.shape[1], axis=1), len(trials), axis=0)
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
-    free_mean, free_variance = free_means(weighed, noise)
-    surprise = unexpected_bias(free_mean, free_variance, rig)
+    free_steps = [step.index for step in aligned.subtasks if step.state == FREE]
+    free_mean, free_variance, moved = free_means(weighed, noise, free_steps, rig)
+    surprise = np.maximum(unexpected_bias(free_mean, free_variance, rig), moved)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
     slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that tell no unknown
@@ -157,7 +160,7 @@ def build(
         slope=np.repeat([False, True], [where[0].size, steep[0].size]),
         free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
         scale_count=np.array(counts), slope_sd=doubt.slope_sd(),
-        unexpected=tuple(d for d in deviations if d.name in surprising),
+        unexpected=tuple(d for d in deviations if d.name in surprising), moved=moved,
         doubt=doubt, level_rises=level_rises(raw, rises),
     )  # fmt: skip
 

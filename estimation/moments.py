@@ -8,6 +8,7 @@ import numpy as np
 
 from estimation.combinations import Terms
 from estimation.compliance import (
+    middle_share,
     misstated,
     possible_share,
     shared_error,
@@ -17,6 +18,7 @@ from estimation.compliance import (
 )
 from estimation.nuisance import PadDoubt
 from estimation.observations import (
+    MIN_FREE,
     Noise,
     WeighedTrial,
     channel_values,
@@ -25,6 +27,9 @@ from estimation.observations import (
 from estimation.unknowns import DISTANCE, FORCE, RISE
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.levels import SURE
+
+ZERO_SHARE = 0.05  # limit: of the largest force: a zero that moves by less matters less than other errors
 
 # Slopes that show the pads, by their names in `Weights.slopes`: the channel they are of, whose samples.
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
@@ -69,6 +74,7 @@ def pad_doubt(
     """
     admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
     found, possible, shared = {}, {DISTANCE: 0.0, RISE: 0.0}, {}
+    surest = {DISTANCE: (0.0, np.inf), RISE: (0.0, np.inf)}
     for channel, stiffness in (
         (DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness),
     ):  # fmt: skip
@@ -82,6 +88,9 @@ def pad_doubt(
             of_kind = np.isfinite(slopes[..., k])
             one = [values[..., k][of_kind] for values in (slopes, variance, alike)]
             apart = shared_error(one[2], one[1])
+            if one[0].size:
+                middle, error = middle_share(one[0], one[1], 0.0)
+                surest[channel] = min(surest[channel], (middle, float(np.hypot(error, apart))), key=sd_of)
             said = misstated(one[0], one[1], stated, admitted if stated else 0.0, apart)
             found[channel] = max(found[channel], said, key=lambda share_and_odds: share_and_odds[1])
         if not stated:
@@ -93,7 +102,13 @@ def pad_doubt(
     return PadDoubt(
         -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], normal, shear,
         (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
+        seen=((-surest[DISTANCE][0], surest[DISTANCE][1]), surest[RISE]),
     )  # fmt: skip
+
+
+def sd_of(found: tuple[float, float]) -> float:
+    """The second of a value and its standard deviation."""
+    return found[1]
 
 
 def _usual(weighed: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +127,7 @@ def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.nda
 def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
     """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
     out = []
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # of a channel without readings
         for move in moves:
             part = {k: noise.variance[k] / n for k, n in weighed.weights.counts[move].items()}
             out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
@@ -142,12 +157,39 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
 
 
-def free_means(weighed: Sequence[WeighedTrial], noise: Noise) -> tuple[np.ndarray, np.ndarray]:
-    """Mean forces in free motion (num_trials, 4) and their variances."""
+def free_means(
+    weighed: Sequence[WeighedTrial], noise: Noise, free_steps: Sequence[int], rig: Rig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N].
+
+    A zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
+    the rig's own bias allow, is no better known in a grip than these stretches differ.
+    """
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.weights.free_count, 1.0) for a in weighed])
-    variance = np.array([noise.variance[name] for name in FORCE_CHANNELS])
-    return mean, variance[None, :] / count[:, None]
+    of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
+    variance = of_sample[None, :] / count[:, None]
+    moved = np.stack([_moved_zero(a, free_steps, of_sample, rig) for a in weighed])
+    return mean, variance + moved**2, moved.max(axis=0)
+
+
+def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
+    """Largest distance (4,) [N] of a free stretch's mean forces from the mean of all, 0 where noise explains it."""
+    out = np.zeros(len(FORCE_CHANNELS))
+    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.weights.free > 0) for k in free_steps]
+    for i, name in enumerate(FORCE_CHANNELS):
+        force = getattr(a.signals, name)
+        pieces = [force[span & np.isfinite(force)] for span in spans]
+        pieces = [piece for piece in pieces if piece.size >= MIN_FREE]
+        if len(pieces) < 2:
+            continue
+        middles = np.array([np.median(piece) for piece in pieces])
+        errors = np.sqrt(np.array([variance[i] / piece.size for piece in pieces]))
+        allowed = SURE * np.hypot(errors.max() + errors, rig.systematic.force_bias[i])
+        off = np.abs(middles - middles.mean())
+        if (off > allowed).any() and off.max() > ZERO_SHARE * float(np.nanmax(np.abs(force))):
+            out[i] = off.max()
+    return out
 
 
 def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:

@@ -65,7 +65,7 @@ class PadDoubt:
     the share. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
     how much pads may give, by what the recordings show, whose stiffness the rig leaves unstated; 0 where it
     states one. `usual_normal`, `usual_shear`: forces of one finger as they usually are in a grip, and where a
-    block is put down [N].
+    block is put down [N]. `seen`: those shares and their sds whatever the odds, infinite where nothing tells.
     """
 
     normal: float = 0.0
@@ -77,6 +77,7 @@ class PadDoubt:
     odds: tuple[float, float] = (0.0, 0.0)
     doubted: bool = False
     apart: tuple[float, float] = (0.0, 0.0)
+    seen: tuple[tuple[float, float], tuple[float, float]] = ((0.0, np.inf), (0.0, np.inf))
 
     def extra_sd(self, kind: str) -> float:
         """Prior standard deviation of the share, "normal" or "shear", beyond what the rig admits."""

@@ -47,7 +47,7 @@ class Draws:
     `apart`: largest distance of the chain's mean scales from those of importance-weighted draws, in
     posterior sds; None where these are too few. `method`: "emcee", or "laplace" for those draws, which
     stand in where the chain did not converge. `prior_ess`: share of draws left effective by the
-    unknowns' priors.
+    unknowns' priors. `impossible`: unknowns whose every draw has a sign that no such property has.
     """
 
     scales: np.ndarray
@@ -61,6 +61,7 @@ class Draws:
     method: str
     prior_ess: float
     apart: float | None
+    impossible: tuple[int, ...] = ()
 
     @property
     def flat(self) -> np.ndarray:
@@ -68,10 +69,24 @@ class Draws:
         return self.chain.reshape(-1, self.chain.shape[-1])
 
     @property
+    def shortfall(self) -> str:
+        """The first criterion of convergence that fails, with its number; empty where none does."""
+        if self.ess < MIN_ESS:
+            return f"effective sample size of {self.ess:.0f}; {MIN_ESS:.0f} are needed"
+        if self.rhat > MAX_RHAT:
+            return f"R-hat of {self.rhat:.3f}; at most {MAX_RHAT:g} is allowed"
+        if self.apart is not None and self.apart > MAX_APART:
+            return (f"its means are {self.apart:.2f} sd from those of independent draws; at most {MAX_APART:g} "
+                    "is allowed")  # fmt: skip
+        if self.prior_ess < MIN_EFFICIENCY:
+            return (f"what the recording shows and the priors of the properties have {self.prior_ess:.2%} of the "
+                    f"draws in common; at least {MIN_EFFICIENCY:.0%} are needed")  # fmt: skip
+        return ""
+
+    @property
     def converged(self) -> bool:
-        """Whether ESS and R-hat reach what this module asks for, priors taken in."""
-        agreed = self.apart is None or self.apart <= MAX_APART
-        return agreed and self.ess >= MIN_ESS and self.rhat <= MAX_RHAT and self.prior_ess >= MIN_EFFICIENCY
+        """Whether all criteria are met, priors taken in."""
+        return not self.shortfall
 
 
 def independence_move(independent: Proposal) -> emcee.moves.MHMove:
@@ -124,12 +139,12 @@ def sample(
             ess, rhat, method, apart = float(1 / (weight**2).sum()), 1.0, "laplace", None
     thin = max(chain.shape[0] * chain.shape[1] // KEPT, 1)
     scales = chain[:, thin - 1 :: thin]
-    rest, prior_ess = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
+    rest, prior_ess, impossible = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
     num, deviations = len(post.design.unknowns), len(post.design.nuisances)
     rest = rest.reshape(*scales.shape[:2], -1)
     return Draws(
         scales, rest[..., :num], rest[..., num : num + deviations], rest[..., num + deviations :],
-        ess, rhat, acceptance, steps, method, prior_ess, apart,
+        ess, rhat, acceptance, steps, method, prior_ess, apart, impossible,
     )  # fmt: skip
 
 
@@ -152,12 +167,13 @@ def _apart(chain: np.ndarray, drawn: np.ndarray, weight: np.ndarray) -> float:
 
 def draw_unknowns(
     post: Posterior, theta: np.ndarray, random: np.random.RandomState
-) -> tuple[np.ndarray, float]:
+) -> tuple[np.ndarray, float, tuple[int, ...]]:
     """Draws (W, Q + N + 6) of unknowns, deviations and common shares, one for each row of scales.
 
     They come from the conditional Gaussian, whose prior of the unknowns is flat, and are resampled
     by the unknowns' own prior (systematically, so order is kept). Also the share of draws that this
-    leaves effective: next to 1 where the recording decides.
+    leaves effective (next to 1 where the recording decides), and the unknowns of whose draws the prior allows
+    none: these stay as the recording has them.
     """
     parts = []
     for k in range(0, len(theta), BATCH):
@@ -166,14 +182,18 @@ def draw_unknowns(
         parts.append(mean + np.linalg.solve(np.swapaxes(chol, 1, 2), z[..., None])[..., 0])
     out = np.concatenate(parts)
     out[:, : post.reference.size] += post.reference
-    log_weight = np.zeros(len(out))
+    log_weight, impossible = np.zeros(len(out)), []
     for i, u in enumerate(post.design.unknowns):
-        log_weight += priors.log_prior(u.prop, np.array(list(u.terms.values())), out[:, i])
+        of_prior = priors.log_prior(u.prop, np.array(list(u.terms.values())), out[:, i])
+        if np.isfinite(of_prior).any():
+            log_weight += of_prior
+        else:
+            impossible.append(i)
     if not np.isfinite(log_weight).any():
-        return out, 0.0
+        return out, 0.0, tuple(impossible)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return out[_resampled(weight, random)], float(1 / (weight**2).sum() / len(weight))
+    return out[_resampled(weight, random)], float(1 / (weight**2).sum() / len(weight)), tuple(impossible)
 
 
 def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:

@@ -30,6 +30,11 @@ class Unknown:
         return len(self.terms) == 1
 
     @property
+    def properties(self) -> tuple[str, ...]:
+        """`object.property` of all that enter."""
+        return tuple(f"{obj}.{self.prop}" for obj in self.terms)
+
+    @property
     def name(self) -> tuple[str, str]:
         """(object, property); objects of a combination joined as in `b + c`."""
         text = ""

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.hand.signals import Signals, central_differences
+from hmmseg.io.plausibility import position_pairs
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 
@@ -21,8 +22,9 @@ ALIKE = 0.1
 
 
 def timely(signals: Signals, trial: Trial, rig: Rig) -> Signals:
-    """The signals with central differences for velocities that are late differences of positions."""
-    return differenced(signals) if come_late(trial, rig) else signals
+    """The signals with central differences for velocities that are late differences of positions, or none."""
+    dead = any(not np.isfinite(trial.channels[rate]).any() for _, rate in position_pairs(trial))
+    return differenced(signals) if dead or come_late(trial, rig) else signals
 
 
 def come_late(trial: Trial, rig: Rig) -> bool:

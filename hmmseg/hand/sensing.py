@@ -22,13 +22,16 @@ from hmmseg.io.trial import Trial
 from hmmseg.robust import robust_sd
 
 CHANCE = 1e-4  # chosen: probability a channel below which a run of repeated or missing readings is a fault
-SCATTERS = -1 / 3  # numerics: correlation of second differences: -2/3 of white noise, positive of smooth motion
+SCATTERS = (
+    -1 / 3
+)  # numerics: correlation of second differences: -2/3 of white noise, positive of smooth motion
 FAR = 5.0  # limit: ranges of all other readings that one may be off by; an impact is less
 FEW = 0.01  # limit: share of readings that are so far off: of more the others are no rule
-LEAP = 20.0  # limit: noise sds that a step exceeds; changes of speed between samples make up to 24 of a tenth
-FASTEST = 1.5  # limit: times what the fastest velocity covers in an interval; healthy joints: up to 1.2
+LEAP = 20.0  # limit: noise sds that a step exceeds
+FASTEST = 1.2  # limit: times what the fastest velocity around it covers; a sudden stop is off by half
 SWEPT = 0.1  # limit: share of a position's range that its velocity covers while it stands still
 MIN_ALIVE = 30  # numerics: readings that tell a channel's own noise
+ROUNDING = 1e-6  # numerics: of a channel's range: less noise is that of arithmetic
 MOST = 200  # numerics: longest runs of a channel that are looked at
 LISTED = 3  # look: stretches in a line
 STEPS = 3  # limit: of one encoder; of more it is the hand that moves so (backlash)
@@ -76,6 +79,10 @@ def sensed(trial: Trial, rig: Rig) -> Trial:
             fault, stuck = _repeated(name, trial.t, seen, names, noise, rates.get(name))
             channels[name][stuck] = np.nan
             found += [] if fault is None else [fault]
+    still = [rate for rate in rates.values() if not _lives(seen[rate])]
+    if still and len(still) == len(rates) and any(_lives(seen[name]) for name in rates):
+        found.append(Fault(", ".join(still), "stand still though positions move, and are left out"))
+        channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
     found += _leaps(trial.t, channels, rates)
     trial = replace(trial, channels=channels)
     found += _disagreeing(trial)
@@ -181,7 +188,8 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     if not steps.size:
         return 1.0
     noise = noise_of(alive)
-    if noise == 0 or whiteness(alive) > SCATTERS:
+    reach = max(float(np.ptp(v[np.isfinite(v)])) for v in alive)
+    if noise <= ROUNDING * reach or whiteness(alive) > SCATTERS:
         if stated is None or all(_rests(v[at]) for v in others):  # of no noise, or of motion above it
             return 1.0
         noise = stated
@@ -214,8 +222,10 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
             continue
         q, v, times = channels[name][there], channels[rate][there], t[there]
         more = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
-        covered = float(np.max(np.abs(v))) * np.diff(times)
+        near = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
+        covered = near * np.diff(times)
         far = np.abs(more) > np.maximum(LEAP * robust_sd(more), FASTEST * covered)
+        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # what happened in a gap no velocity tells
         if far.any():
             stepping[name] = there, np.where(far, more, 0.0)
     if len(stepping) != 1:
@@ -271,7 +281,9 @@ def _missing(trial: Trial) -> list[Fault]:
         return [replace(out[0], channel="every channel")]
     whole = float((~np.any(list(gone.values()), axis=0)).mean())
     if not out and whole < WHOLE:
-        return [Fault("every row" if whole == 0 else f"all but {whole:.0%} of the rows", "without some reading")]
+        return [
+            Fault("every row" if whole == 0 else f"all but {whole:.0%} of the rows", "without some reading")
+        ]
     return out
 
 
