@@ -56,8 +56,8 @@ class ForceScale:
         size = f"{g:.2g} times too large" if g > 1 else f"{1 / g:.2g} times too small"
         return (
             f"forces and [fingertip] contradict each other: forces are read {size} with a probability of "
-            f"{self.probability:.0%}, or the pads are not as stated; weights allow for both, and a block that "
-            "was weighed would tell"
+            f"{self.probability:.0%}, or the pads are not as stated; weights allow for both, and a weighed "
+            "block would tell"
         )
 
 

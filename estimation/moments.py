@@ -174,7 +174,7 @@ def free_means(
 
 
 def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """Largest distance (4,) [N] of a free stretch's mean forces from the mean of all, 0 where noise explains it."""
+    """How far (4,) [N] a free stretch's forces are from the mean of all, at most; 0 if by noise."""
     out = np.zeros(len(FORCE_CHANNELS))
     spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.weights.free > 0) for k in free_steps]
     for i, name in enumerate(FORCE_CHANNELS):

@@ -76,11 +76,12 @@ class Draws:
         if self.rhat > MAX_RHAT:
             return f"R-hat of {self.rhat:.3f}; at most {MAX_RHAT:g} is allowed"
         if self.apart is not None and self.apart > MAX_APART:
-            return (f"its means are {self.apart:.2f} sd from those of independent draws; at most {MAX_APART:g} "
-                    "is allowed")  # fmt: skip
+            return (
+                f"means {self.apart:.2f} sd from those of independent draws; at most {MAX_APART:g} is allowed"
+            )
         if self.prior_ess < MIN_EFFICIENCY:
-            return (f"what the recording shows and the priors of the properties have {self.prior_ess:.2%} of the "
-                    f"draws in common; at least {MIN_EFFICIENCY:.0%} are needed")  # fmt: skip
+            shared = f"recording and priors have {self.prior_ess:.2%} of the draws in common"
+            return f"{shared}; at least {MIN_EFFICIENCY:.0%} are needed"
         return ""
 
     @property

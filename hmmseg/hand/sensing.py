@@ -1,12 +1,12 @@
 """Which readings of a hand are none: what a working sensor cannot have read is named and left out.
 
-One model of a sensor stands behind it. Its readings scatter, so that neighbours repeat each other to the last
-digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow; they stay
-within a few times the range of all others; a position moves no farther between two samples than its velocity
-carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of missing
-readings is a fault where its length has next to no chance under that model, so that coarse sensors, forces that
-are held for some samples and recordings without any noise pass. What is left out is missing from there on, to
-the segmentation and to the properties alike.
+One model of a sensor stands behind it. Its readings scatter, so that neighbours repeat each other to the
+last digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow;
+they stay within a few times the range of all others; a position moves no farther between two samples than its
+velocity carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of
+missing readings is a fault where its length has next to no chance under that model, so that coarse sensors,
+forces that are held for some samples and recordings without noise pass. What is left out is missing from
+there on, to the segmentation and to the properties alike.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
     worst = values[wild[np.argmax(np.abs(values[wild]))]]
     values[wild] = np.nan
     problem = f"reads {worst:.3g}, where its other readings span {reach:.3g}: left out"
-    return [Fault(name, problem, tuple((t[i], t[i]) for i in wild))]
+    return [Fault(name, problem, tuple((float(t[i]), float(t[i])) for i in wild))]
 
 
 def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
@@ -184,13 +184,13 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     others = [seen[fellow] for fellow in fellows if fellow != name]
     alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if _lives(v)]
     steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(v[np.isfinite(v)])) for v in alive)])
-    steps = steps[steps > 0]
-    if not steps.size:
+    steps, together = steps[steps > 0], all(_rests(v[at]) for v in others)
+    if not steps.size or (together and name not in FORCE_CHANNELS):  # a hand that waits
         return 1.0
     noise = noise_of(alive)
     reach = max(float(np.ptp(v[np.isfinite(v)])) for v in alive)
     if noise <= ROUNDING * reach or whiteness(alive) > SCATTERS:
-        if stated is None or all(_rests(v[at]) for v in others):  # of no noise, or of motion above it
+        if stated is None or together:  # of no noise, or of motion above it
             return 1.0
         noise = stated
     by_noise = float(steps.min()) / (2 * np.sqrt(np.pi) * noise)
