@@ -79,7 +79,7 @@ def sensed(trial: Trial, rig: Rig) -> Trial:
             fault, stuck = _repeated(name, trial.t, seen, names, noise, rates.get(name))
             channels[name][stuck] = np.nan
             found += [] if fault is None else [fault]
-    still = [rate for rate in rates.values() if not _lives(seen[rate])]
+    still = [rate for rate in rates.values() if _reach(seen[rate]) == 0]
     if still and len(still) == len(rates) and any(_lives(seen[name]) for name in rates):
         found.append(Fault(", ".join(still), "stand still though positions move, and are left out"))
         channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
@@ -170,7 +170,7 @@ def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) 
     """Whether a velocity that lives carries a position far while that repeats itself (samples `at`)."""
     v, alive = np.nan_to_num(rate[at]), _lives(rate[at])
     way = np.cumsum(np.diff(t[at]) * (v[1:] + v[:-1]) / 2)
-    return bool(alive and np.ptp(way) > SWEPT * max(np.ptp(values[np.isfinite(values)]), np.ptp(way) / 2))
+    return bool(alive and np.ptp(way) > SWEPT * max(_reach(values), np.ptp(way) / 2))
 
 
 def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
@@ -184,11 +184,11 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     others = [seen[fellow] for fellow in fellows if fellow != name]
     alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if _lives(v)]
     steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(v[np.isfinite(v)])) for v in alive)])
-    steps, together = steps[steps > 0], all(_rests(v[at]) for v in others)
+    steps, together = steps[steps > 0], all(_rests(v, at) for v in others)
     if not steps.size or (together and name not in FORCE_CHANNELS):  # a hand that waits
         return 1.0
     noise = noise_of(alive)
-    reach = max(float(np.ptp(v[np.isfinite(v)])) for v in alive)
+    reach = max(_reach(v) for v in alive)
     if noise <= ROUNDING * reach or whiteness(alive) > SCATTERS:
         if stated is None or together:  # of no noise, or of motion above it
             return 1.0
@@ -204,10 +204,17 @@ def _lives(values: np.ndarray) -> bool:
     return not _rests(values)
 
 
-def _rests(values: np.ndarray) -> bool:
-    """Whether a stretch of a channel mostly repeats itself."""
-    steps = np.diff(values[np.isfinite(values)])
-    return not steps.size or bool(np.mean(steps == 0) > 0.5)
+def _rests(values: np.ndarray, at: np.ndarray | slice = slice(None)) -> bool:
+    """Whether a stretch of a channel mostly repeats itself, but for rounding."""
+    stretch = values[at]
+    steps = np.diff(stretch[np.isfinite(stretch)])
+    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _reach(values)) > 0.5)
+
+
+def _reach(values: np.ndarray) -> float:
+    """How far a channel's readings go apart, 0 of none."""
+    there = values[np.isfinite(values)]
+    return float(np.ptp(there)) if there.size else 0.0
 
 
 def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:

@@ -85,7 +85,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     loaded = [grip for grip, load in zip(held.grips, held.loads, strict=True) if load is None or load != 0]
     found = as_fingers(trial, rig, pose, held.tool, opening, held.force, loaded or held.grips, pressing)
     order = order_warnings(trial, rig, held.tool, held.free)
-    return replace(found, warnings=(*order, *tool_warnings(trial, rig, held.tool)))
+    return replace(found, warnings=(*found.warnings, *order, *tool_warnings(trial, rig, held.tool)))
 
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,
