@@ -8,21 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from estimation.actual import Actual
-from estimation.channel_noise import Noise
-from estimation.design import Design
-from estimation.doubtful_pads import designs, sample_either
-from estimation.force_scale import force_scale, uneven
-from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.observations import WeighedTrial, aligned_weights
-from estimation.predictive import PredictiveCheck, check
-from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
-from estimation.rolling import without_roll
-from estimation.sampler import Draws
-from estimation.sliding import with_slides
-from estimation.summary import summary
-from estimation.tables import properties_table
-from estimation.unknowns import Unknown
+from estimation.checks import (
+    PredictiveCheck,
+    check,
+    dense,
+    force_scale,
+    misfits,
+    soft_pads,
+    uneven,
+    unnamed,
+    unrepeated,
+    unstated_pads,
+)
+from estimation.design import Design, Unknown
+from estimation.friction import FrictionPosterior, friction_posteriors
+from estimation.observations import Noise, WeighedTrial, aligned_weights, with_slides, without_roll
+from estimation.report import Actual, inference_data, properties_table, summary
+from estimation.sampler import Draws, designs, sample_either
 from hmmseg.contact.decompose import (
     ABOVE_GROUND,
     FREE,
@@ -134,19 +136,19 @@ class Identification(Tabled):
 
     def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None):
         """Every property with its 68 and 95 % interval, against measured values where given; the axes."""
-        from estimation.plot.estimates import draw_estimates
+        from estimation.plots import draw_estimates
 
         return draw_estimates(self.to_json()["properties"], actual, None if path is None else Path(path))
 
     def plot_posterior(self, actual: Actual | None = None, path: str | Path | None = None):
         """Corner plot of the joint posterior; its axes (num_properties, num_properties)."""
-        from estimation.plot.corner import draw_corner
+        from estimation.plots import draw_corner
 
         return draw_corner(self.draws, self.names, None if path is None else Path(path), actual)
 
     def plot_check(self, trial: int = 0, path: str | Path | None = None):
         """One trial's recorded samples in the band that the posterior predicts; the axes."""
-        from estimation.plot.predictive import draw_check
+        from estimation.plots import draw_check
 
         return draw_check(self, trial, None if path is None else Path(path))
 
@@ -157,14 +159,12 @@ class Identification(Tabled):
         return pd.DataFrame(self.draws, columns=[".".join(name) for name in self.names])
 
     def to_arviz(self):
-        """ArviZ InferenceData of the properties' posterior, dimensions (chain, draw)."""
-        import arviz
-
+        """The properties' posterior as ArviZ has it, dimensions (chain, draw)."""
         if self.sampled is None:
             raise ValueError("no property was determined, so there is no posterior")
         chain = self.sampled.chain
         names = [f"{obj}.{prop}" for obj, prop in (*self.names, *(u.name for u in self.combinations))]
-        return arviz.from_dict(posterior={name: chain[..., i] for i, name in enumerate(names)})
+        return inference_data({name: chain[..., i] for i, name in enumerate(names)})
 
 
 @double_precision

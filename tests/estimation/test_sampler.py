@@ -8,15 +8,14 @@ import pytest
 from estimation_scene import TRUE, UNIT, drawn, make_design
 
 from estimation import priors, sampler
-from estimation.mode import find_mode
-from estimation.posterior import posterior
-from estimation.proposal import proposal
+from estimation.posterior import find_mode, posterior
 from estimation.sampler import (
     GROUPS,
     MIN_ESS,
     draw_unknowns,
     effective_sample_size,
     importance,
+    proposal,
     sample,
     split_rhat,
 )
