@@ -16,9 +16,7 @@ import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
 from hmmseg.contact.equations import block_width
-from hmmseg.hand.bridging import with_heights
-from hmmseg.hand.rates import timely
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
