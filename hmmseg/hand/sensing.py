@@ -24,7 +24,8 @@ from hmmseg.io.plausibility import Finding, all_changed, check_forces, position_
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.io.units import UNITS
-from hmmseg.robust import robust_sd
+from hmmseg.levels import SURE
+from hmmseg.robust import robust_sd, white_sd
 
 NEAR = 0.3  # limit: relative; noise is stated to within so much, and units differ by factors of 4 and more
 LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with what hangs below its sensor
@@ -208,6 +209,8 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
     """
     values = seen[name]
     there = np.flatnonzero(np.isfinite(values))
+    if there.size < MIN_ALIVE:
+        return None, np.zeros(values.size, bool)
     shown = values[there]
     same = np.diff(shown) == 0
     runs = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
@@ -243,9 +246,13 @@ def _both_zero(name: str, at: np.ndarray, seen: dict[str, np.ndarray]) -> bool:
 
 def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
     """Whether a velocity that lives carries a position far while that repeats itself (samples `at`)."""
-    v, alive = np.nan_to_num(rate[at]), _lives(rate[at])
-    way = np.cumsum(np.diff(t[at]) * (v[1:] + v[:-1]) / 2)
-    return bool(alive and np.ptp(way) > SWEPT * max(_reach(values), np.ptp(way) / 2))
+    known = rate[at][np.isfinite(rate[at])]
+    if known.size < MIN_ALIVE // 3 or _rests(rate, at):
+        return False
+    v, steps = np.nan_to_num(rate[at]), np.diff(t[at])
+    way = float(np.ptp(np.cumsum(steps * (v[1:] + v[:-1]) / 2)))
+    by_noise = white_sd(known, 1) * float(np.median(steps)) * np.sqrt(steps.size)
+    return bool(way > max(SWEPT * _reach(values), SURE * by_noise))
 
 
 def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
