@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 from hmmseg._lazy import lazily
 
 if TYPE_CHECKING:
-    from estimation.actual import read_actual
     from estimation.api import identify
     from estimation.identification import Identification
+    from estimation.report import read_actual
 
 __all__ = ["Identification", "identify", "read_actual"]
 
 _HOMES = {
     "Identification": "estimation.identification",
     "identify": "estimation.api",
-    "read_actual": "estimation.actual",
+    "read_actual": "estimation.report",
 }
 
 __getattr__, __dir__ = lazily(__name__, _HOMES)

@@ -187,7 +187,7 @@ def run(
     healthy: Sequence[Path] = (),
 ) -> Diagnosis:
     """Diagnose, and put table, figures and page where `out` has them go."""
-    from estimation.actual import read_actual
+    from estimation.report import read_actual
     from hmmseg.segmentation.align import align
     from simgap.gap.diagnose import STAGES
     from simgap.gap.diagnose import diagnose as find

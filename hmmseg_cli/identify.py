@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from estimation.tables import properties_table
+from estimation.report import properties_table
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli.console import (
@@ -57,7 +57,7 @@ def run(
     description = read_task(task)
     if not isinstance(description, BlockTask):
         raise InputError(str(task), "a plain ordered task has no blocks to identify", "objects and moves")
-    from estimation.actual import read_actual
+    from estimation.report import read_actual
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
 
@@ -71,7 +71,7 @@ def run(
         found = _bayes(out, recordings, description, hand)
         body, segmentations = found.to_json(), found.segmentations
     if measured is not None:
-        from estimation.actual import compare, disagreements
+        from estimation.report import compare, disagreements
 
         body["actual"] = compare(body["properties"], measured, hand.tolerance.property or 0.0)
         for line in disagreements(body["properties"], body["actual"]):

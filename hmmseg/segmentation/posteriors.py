@@ -13,9 +13,8 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_offset, block_y, corner_drop, hanging
-from hmmseg.hand.rates import one_sided
 from hmmseg.hand.roll import slow_roll
-from hmmseg.hand.signals import Signals, central_differences
+from hmmseg.hand.signals import Signals, central_differences, one_sided
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known

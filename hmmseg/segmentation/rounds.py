@@ -16,9 +16,7 @@ from typing import Protocol, overload, runtime_checkable
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
-from hmmseg.hand.grouping import group_size
-from hmmseg.hand.rates import come_late, differenced
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import Signals, come_late, differenced, group_size, task_space
 from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask

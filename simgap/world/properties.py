@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from estimation.actual import LIMITS, number, read_actual
+from estimation.report import LIMITS, number, read_actual
 from hmmseg.contact.decompose import UNITS
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from fault_scene import CARTESIAN, FREE, mended
 
+from estimation.checks import dense
 from estimation.identification import identify_aligned
-from estimation.remarks import dense
 from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig

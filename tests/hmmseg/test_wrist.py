@@ -10,9 +10,8 @@ from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.contact.decompose import decompose, revealed_by
 from hmmseg.errors import InputError
-from hmmseg.hand.opening import closings, grip_of
-from hmmseg.hand.pose import pose_of
-from hmmseg.hand.tool import applied_force, free_tool
+from hmmseg.hand.tool import applied_force, free_tool, pose_of
+from hmmseg.hand.wrist import closings, grip_of
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial, trial_of

@@ -1,4 +1,4 @@
-"""Properties measured apart from the trials (`actual.toml`): read, and compared with what was identified."""
+"""Properties in words, numbers and tables, and against what was measured apart from the trials."""
 
 from __future__ import annotations
 
@@ -7,10 +7,23 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from rich.table import Table
+
 from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import CONTRADICTS
+
+INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
+
+
+def summary(draws: np.ndarray, unit: str) -> dict:
+    """Unit, mean, sd, median and intervals of posterior draws (num_draws,)."""
+    out = {"unit": unit, "mean": float(draws.mean()), "sd": float(draws.std(ddof=1))}
+    out |= {"median": float(np.median(draws))}
+    return out | {name: np.percentile(draws, q) for name, q in INTERVALS.items()}
+
 
 UNITS = decompose.UNITS | {"friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
@@ -118,3 +131,46 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise InputError(where, f"found {value!r:.40}", expected)
     return float(value)
+
+
+SHOWN = {"weight": (1.0, "N", 4), "width": (100.0, "cm", 4), "height": (100.0, "cm", 4)}
+
+
+def properties_table(body: dict[str, Any], measured=None) -> Table:
+    """The properties for people to read, lengths in cm as the paper has them."""
+    table = Table(title=f"properties ({body['method']})", title_justify="left")
+    for head in ("block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())):
+        table.add_column(head, no_wrap=head != "estimate")
+    for obj, entries in body["properties"].items():
+        for prop, entry in entries.items():
+            cells = [obj, prop, *_cells(prop, entry)]
+            if measured:
+                value = measured.get(obj, {}).get(prop)
+                factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
+                against = body.get("actual", {}).get(obj, {}).get(prop, {})
+                mark = "  disagrees" if against.get("disagrees") else ""
+                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}{mark}")
+            table.add_row(*cells)
+    return table
+
+
+def _cells(prop: str, entry: dict[str, Any] | None) -> tuple[str, str]:
+    if entry is None:
+        return "unknown", ""
+    factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
+    if entry.get("mean") is None:
+        return f">= {entry['lower_bound']:.{digits}f}", ""
+    low, high = (f"{v * factor:.{digits}f}" for v in entry["interval_95"])
+    return (
+        f"{entry['mean'] * factor:.{digits}f} +- {entry['sd'] * factor:.{digits}f} {unit}",
+        f"{low} to {high}",
+    )
+
+
+def inference_data(posterior: dict[str, np.ndarray]) -> Any:
+    """ArviZ's data of draws (chains, draws) by name: InferenceData, or from 1.0 on a DataTree."""
+    import arviz  # takes longer to import than an identification
+
+    if int(arviz.__version__.split(".")[0]) < 1:
+        return arviz.from_dict(posterior=posterior)
+    return arviz.from_dict({"posterior": posterior})

@@ -1,14 +1,16 @@
-"""What one grip itself says of the pads: how its readings change with the force that squeezes or shears.
+"""What grips themselves say of the pads: how readings change with the force that squeezes or shears.
 
 A pad that gives as the rig says leaves `block_width` and `block_y` alone, whatever the force. Where its
 compliance is truly (1 + e) times the nominal, the block's width reads e times the give too small, and its
 height e times the shear give too large; so the slope of either reading over the give, within one grip,
 shows -e or e whatever the block. Loading and unloading take part, so what viscosity adds to the one it
-takes from the other, and the rate is fitted beside it.
+takes from the other, and the rate is fitted as well. A landing, where the load goes from fingers to ground
+within a few samples, shows the shear give once more.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +20,7 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import TAIL
-from hmmseg.robust import robust_sd
+from hmmseg.robust import robust_sd, white_sd
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
 UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
@@ -183,3 +185,121 @@ def possible_share(shares: np.ndarray, variances: np.ndarray) -> float:
         return UNSTATED
     middle, error = middle_share(shares, variances, 0.0)
     return min(max(abs(middle), error), max(UNSTATED, abs(middle)))
+
+
+BEFORE = 4  # numerics: samples before the touch from which the fingers' height at it is extrapolated
+SURE, RELIEVED = (
+    4.0,
+    0.25,
+)  # chosen: noise sds, and share of the load, that a support bears once it is touched
+LEAST_GIVE = 1e-6  # numerics: m; a push that squeezes nothing tells nothing
+
+
+def landing(
+    t: np.ndarray, reading: np.ndarray, give: np.ndarray, place: np.ndarray,
+    touch: tuple[float, float], carry: np.ndarray, noise: float,
+) -> Slope | None:  # fmt: skip
+    """Weights whose sum with readings is the share e of the pads' give that the rig leaves out.
+
+    `t`, `reading` (block_y by the rig's pads), `give` (their shear's), `place` (weights of the place's mean,
+    summing to 1), `carry` (booleans): (num_timesteps,) in s and m; `touch`: mean and sd of the
+    moment [s]; `noise`: sd of one reading [m]. None where too few samples tell.
+
+    The height at the touch is a parabola through the last samples before it. Its error is how far a straight
+    line lies from that, or how far the last samples themselves bend from one to the next, if that is more.
+    """
+    moment, moment_sd = touch
+    usable = np.isfinite(reading) & np.isfinite(give)
+    before = np.flatnonzero(carry & usable & (t <= moment))[-BEFORE:]
+    if before.size < BEFORE or not np.any(place[usable] > 0):
+        return None
+    parabola, line = (_extrapolation(t[before] - moment, degree) for degree in (2, 1))
+    weights = np.where(usable, place, 0.0)
+    weights = weights / weights.sum()
+    count = 1 / float((weights**2).sum())
+    weights[before] -= parabola
+    y = reading[before]
+    change = float(weights @ np.where(usable, give, 0.0))
+    if abs(change) < LEAST_GIVE:
+        return None
+    bend = max(abs(float((parabola - line) @ y)), float(np.abs(np.diff(y, 2)).max()))
+    speed = float(np.polyfit(t[before] - moment, y, 1)[0])
+    variance = (speed * moment_sd) ** 2 + bend**2 + noise**2 * (float((parabola**2).sum()) + 1 / count)
+    return Slope(weights / change, variance / change**2, change=change)
+
+
+def first_push(
+    t: np.ndarray, net: np.ndarray, carry: np.ndarray, touch: tuple[float, float]
+) -> tuple[float, float]:
+    """Mean and sd of the touch [s] as forces have it, where that is before the boundary `touch`.
+
+    `net` (num_timesteps,) [N]: net vertical force in units of 1 + a / g, constant while carried. Where pads
+    yield, fingers go on after the touch as if they still carried; the support bears weight all the same.
+    """
+    held = net[carry & np.isfinite(net)]
+    if held.size < BEFORE:
+        return touch
+    level = float(np.median(held))
+    noise = robust_sd(held - level)
+    before = np.flatnonzero(np.isfinite(net) & (t <= touch[0]))
+    free = before[net[before] > level - max(SURE * noise, RELIEVED * abs(level))]
+    if not free.size or free[-1] == before[-1]:
+        return touch
+    last, first = t[free[-1]], t[before[before > free[-1]][0]]
+    return float(last + first) / 2, float(first - last) / 12**0.5
+
+
+def _extrapolation(t: np.ndarray, degree: int) -> np.ndarray:
+    """Weights (n,) that make of readings at times t the least-squares polynomial's value at 0."""
+    return np.linalg.pinv(np.vander(t, degree + 1))[-1]
+
+
+def slopes_within(
+    signals: Signals, values: Mapping[str, np.ndarray], groups: Mapping[str, np.ndarray],
+    scales: Mapping[str, float], rig: Rig,
+) -> dict[str, Slope]:  # fmt: skip
+    """Slopes of the width's and the height's readings over the pads' give, within one grip.
+
+    `values`: readings (num_timesteps,) by name; `groups`: booleans (num_timesteps,) of the samples while the
+    block is held ("distance"), before it is lifted ("pickup") and after ("place").
+    """
+    out = {}
+    held = {name: closed(signals, group) for name, group in groups.items()}
+    root2, pads = np.sqrt(2.0), unit_pads(rig)
+    sd_force = np.nan_to_num(signals.sd_force)  # what is not stated is not taken out
+    for name, key, place, sd, give, compliance, together in (
+        ("distance", "distance", -signals.distance, root2 * signals.sd_x, squeeze_give(signals, rig),
+         np.hypot(pads.normal1, pads.normal2), [held["distance"]]),
+        ("rise", "place", signals.y, signals.sd_y / root2, shear_give(signals, rig),
+         np.hypot(pads.shear1, pads.shear2) / 2, [held["pickup"], held["place"]]),
+    ):  # fmt: skip
+        known = sd[np.isfinite(sd)]
+        noise = float(np.median(known)) if known.size else 0.0
+        # What readings are rougher than places is noise of the forces: they ring, what they move does not.
+        rough = [_rough(values[key][group]) for group in together]
+        ringing = np.sqrt(max(max(rough, default=0.0) ** 2 - noise**2, 0.0))
+        sds = (max(sd_force * compliance, ringing), noise)
+        found = slope(signals.t, values[key], place, give, together, scales[key], sds)
+        if found is not None:
+            out[name] = found
+    return out
+
+
+def _rough(readings: np.ndarray) -> float:
+    """White noise (sd) of readings (num_samples,), 0 of too few [m]."""
+    there = readings[np.isfinite(readings)]
+    return white_sd(there) if there.size >= MIN_SAMPLES else 0.0
+
+
+def slope_of_landing(
+    signals: Signals, values: Mapping[str, np.ndarray], net: np.ndarray, carry: np.ndarray,
+    place: np.ndarray, touch: tuple[float, float], scales: Mapping[str, float], rig: Rig,
+) -> dict[str, Slope]:  # fmt: skip
+    """What the landing of one grip says of the pads, if anything.
+
+    `net` (num_timesteps,) [N]: net vertical force in units of 1 + a / g; `carry`, `place` (num_timesteps,):
+    samples before it and weights of the place's mean; `touch`: mean and sd of the boundary [s].
+    """
+    give, moment = shear_give(signals, rig), first_push(signals.t, net, carry, touch)
+    found = landing(signals.t, values["place"], give, place, moment, carry, scales["place"])
+    return {} if found is None else {"landing": found}
