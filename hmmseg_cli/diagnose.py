@@ -60,7 +60,12 @@ AgainstOption = Annotated[
 ]
 ModelFile = Annotated[
     Path | None,
-    typer.Option("--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit."),
+    typer.Option(
+        "--model",
+        metavar="M",
+        help="A robot's own model, as MuJoCo reads it (it needs --map), or the emissions (.npz) of a plain "
+        "ordered task, from hmmseg fit.",
+    ),
 ]
 HealthyOption = Annotated[
     list[Path] | None,
@@ -117,6 +122,8 @@ def diagnose(
     """The sim-to-real gap: where it lies, which unmodelled effect causes it, how far it shrinks."""
     with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
+        if model is not None and mjcf is None and model.suffix.lower() != ".npz":
+            model, mjcf = None, model  # a robot's, not the emissions of a task
         own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})

@@ -17,6 +17,7 @@ import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
 from hmmseg_cli import (
+    calibrate,
     decompose,
     demo,
     diagnose,
@@ -51,6 +52,7 @@ for _command in (
     identify.identify,
     watch.watch,
     simulate.simulate,
+    calibrate.calibrate,
     diagnose.diagnose,
     inspect.inspect,
     new.new,

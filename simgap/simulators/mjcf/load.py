@@ -72,7 +72,9 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     if mujoco.__version__ == "4.0.0":
         raise InputError("--mjcf", "MuJoCo 4.0.0 has a solver bug", "another version from 3 on")
     if not xml.is_file():
-        raise InputError(f"--mjcf {xml}", "no such file", "an MJCF file")
+        raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
+    if xml.suffix.lower() == ".mjb":
+        raise InputError(f"--mjcf {xml}", "is compiled: no sensor can be added", "its MJCF or URDF file")
     described = read_map(map_file)
     try:
         spec = mujoco.MjSpec.from_file(str(xml))

@@ -28,7 +28,7 @@ KINDS = {
     "site": ("position",),
 }
 KEYS = (*THINGS, "kind", "axis", "unit", "noise", "sign", "offset")
-TOP = ("columns", "time", "window", "keyframe")
+TOP = ("columns", "time", "window", "keyframe", "uncertain", "sd")
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Mapped:
 @dataclass(frozen=True)
 class Map:
     """The columns, the `time` column with its factor to s, windows' `length` [s], the `keyframe` to start
-    what no column tells from."""
+    what no column tells from; `uncertain`: patterns of what was never measured, `sd` by name of what was."""
 
     file: str
     columns: Mapping[str, Mapped]
@@ -58,7 +58,8 @@ class Map:
     time_factor: float = 1.0
     length: float | None = None
     keyframe: str | None = None
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    uncertain: tuple[str, ...] = ()
+    sd: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_map(path: Path) -> Map:
@@ -84,7 +85,25 @@ def read_map(path: Path) -> Map:
         _unit(time.get("unit"), f"{path}: time.unit"),
         _number(raw, "window", str(path)),
         raw.get("keyframe"),
+        _patterns(raw.get("uncertain", []), f"{path}: uncertain"),
+        _deviations(raw.get("sd", {}), f"{path}: sd"),
     )
+
+
+def _patterns(names: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise InputError(where, f"{names!r}", 'a list of names such as "joint:elbow.frictionloss"')
+    return tuple(names)
+
+
+def _deviations(stated: Any, where: str) -> dict[str, float]:
+    if not isinstance(stated, dict):
+        raise InputError(where, "is no table", '"body:arm.mass" = 0.01, say')
+    found = {name: _number(stated, name, where) for name in stated}
+    for name, sd in found.items():
+        if sd <= 0:
+            raise InputError(f"{where}.{name}", f"{sd:g}", "above 0")
+    return found
 
 
 def _mapped(column: str, entry: Any, where: str) -> Mapped:
