@@ -36,7 +36,7 @@ def body(
                 f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()
             },
             "log_evidence": _evidence(verdict, verdict.causes),
-            "heldout_score": None,
+            "heldout_score": None if verdict.how_far is None else verdict.how_far.score,
             "property_shift": _shifts(found, causes),
         }
     elif verdict.causes and causes is not None:
