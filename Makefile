@@ -73,7 +73,11 @@ bench-long: $(INSTALLED)  ## time and memory over four decades of samples; fills
 	$(BIN)/python -m experiments.benchmarks.long_recordings $(or $(RECORDINGS),recordings/paper_blocks)
 	$(BIN)/python -m experiments.write_tables
 
-gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
+gap-ablation: $(INSTALLED)  ## what each special case of segmentation and estimate buys; fills docs/tables/special_cases.csv
+	$(BIN)/python -m experiments.ablation
+	$(BIN)/python -m experiments.write_tables
+
+results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_recordings $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.patch_heldout $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
