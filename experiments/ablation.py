@@ -113,12 +113,13 @@ def score(cases: Sequence[Case]) -> dict[str, float]:
         return {"refused": refused}
     r, e, u = (np.concatenate(v) for v in (residuals, errors, z))
     sd = np.abs(e[u != 0] / u[u != 0])
-    return {
+    found = {
         "median": float(np.nanmedian(np.abs(r))), "percentile_95": float(np.nanquantile(np.abs(r), 0.95)),
         "missed": int(np.isnan(r).sum()), "coverage_90": float(np.nanmean(np.concatenate(covered))),
         "error": float(np.sqrt(np.mean(e**2))), "width": float(np.exp(np.mean(np.log(sd)))),
         "z_rms": float(np.sqrt(np.mean(u**2))), "refused": refused,
     }  # fmt: skip
+    return {key: value for key, value in found.items() if np.isfinite(value)}
 
 
 def misfits(count: int) -> dict[str, int]:
@@ -134,7 +135,7 @@ def misfits(count: int) -> dict[str, int]:
     return {"right": right, "of": count * len(EDITED), "false_alarms": false}
 
 
-def measured(count: int, shared: Path, cases: dict[str, list[Case]]) -> dict[str, Any]:
+def measured(count: int, cases: dict[str, list[Case]]) -> dict[str, Any]:
     """Scores of all sets as the code stands."""
     return {"sets": {name: score(each) for name, each in cases.items()}, "misfits": misfits(count)}
 
@@ -175,16 +176,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--trials", type=int, default=3)
     parser.add_argument("--shared", type=Path, default=Path("../shared"))
-    parser.add_argument("--only", nargs="*", default=list(SPECIAL), metavar="NAME")
+    parser.add_argument("--only", nargs="*", metavar="NAME", help="add these to what was found before")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = dict(sets(given.trials, given.shared))
-    document = {"trials": given.trials, "full": measured(given.trials, given.shared, cases), "without": {}}
-    for name in given.only:
+    before = load("ablation") if given.only else None
+    document = before or {
+        "trials": given.trials, "full": measured(given.trials, cases), "without": {},
+    }  # fmt: skip
+    for name in given.only or SPECIAL:
         with ExitStack() as stack:
             for where, instead in SPECIAL[name]:
                 stack.enter_context(patch(where, instead))
-            document["without"][name] = measured(given.trials, given.shared, cases)
+            document["without"][name] = measured(given.trials, cases)
         print(name, flush=True)
         save(RESULTS / "ablation.json", document)
 
