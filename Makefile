@@ -73,11 +73,7 @@ bench-long: $(INSTALLED)  ## time and memory over four decades of samples; fills
 	$(BIN)/python -m experiments.benchmarks.long_recordings $(or $(RECORDINGS),recordings/paper_blocks)
 	$(BIN)/python -m experiments.write_tables
 
-gap-ablation: $(INSTALLED)  ## what each special case of segmentation and estimate buys; fills docs/tables/special_cases.csv
-	$(BIN)/python -m experiments.ablation
-	$(BIN)/python -m experiments.write_tables
-
-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
+gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_recordings $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.patch_heldout $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
@@ -119,6 +115,10 @@ wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and o
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
 	$(BIN)/python -m experiments.readme_figures
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
+
+ablation: $(INSTALLED)  ## what each special case of segmentation and estimate buys; fills docs/tables/special_cases.csv
+	$(BIN)/python -m experiments.ablation
+	$(BIN)/python -m experiments.write_tables
 
 results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
