@@ -124,6 +124,10 @@ readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session 
 	$(BIN)/python -m experiments.readme_figures
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
 
+ablation: $(INSTALLED)  ## what each special case of segmentation and estimate buys; fills docs/tables/special_cases.csv
+	$(BIN)/python -m experiments.ablation
+	$(BIN)/python -m experiments.write_tables
+
 results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
 	$(BIN)/python -m experiments.calibration recordings

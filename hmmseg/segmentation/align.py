@@ -137,7 +137,7 @@ class Piece:
     """One round of one recording (of a task done once: all of it), aligned.
 
     `first`, `last` [s] are its ends; `failed` counts subtasks from its own first. `remarks`: what was done
-    beside the task.
+    in addition to the task.
     """
 
     boundaries: tuple[BoundaryPosterior, ...]

@@ -330,7 +330,7 @@ def nearest_touch(touches: Touches, found: BoundaryPosterior) -> BoundaryPosteri
 def _held_side(
     t: np.ndarray, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
 ) -> tuple[float, float]:
-    """Stretch [s] nearest to interval n of the subtask that rests on the ground beside it."""
+    """Stretch [s] nearest to interval n of the subtask that rests on the ground, before or after it."""
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
     if after:

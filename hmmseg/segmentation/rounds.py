@@ -58,7 +58,7 @@ class InMemory:
 
 
 class OnDisk:
-    """Signals read anew whenever they are asked for.
+    """Signals read anew at each access.
 
     Whether velocities come late is judged by its beginning: a drive does not change its habits.
     """
@@ -100,7 +100,7 @@ class OnDisk:
 
 
 class Parts(Sequence[Signals]):
-    """Parts of recordings, read whenever one is asked for."""
+    """Parts of recordings, read at each access."""
 
     def __init__(self, parts: Sequence[tuple[Recorded, slice]]) -> None:
         self.parts = list(parts)
