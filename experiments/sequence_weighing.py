@@ -34,7 +34,7 @@ def known(world: World, labelled: int) -> Known:
     factor = max(1, round(float(np.median([len(each.values) for each in data])) / COARSE_CELLS))
     truth = np.array([shares(each, b) for each, b in zip(data, world.boundaries, strict=True)])
     labels = np.where(np.arange(len(truth))[:, None] < labelled, truth, np.nan)
-    found, _ = find_courses(
+    found = find_courses(
         [coarse(each.values, factor) for each in data], len(world.task.sequence), list(labels)
     )
     return found, labels, truth

@@ -44,39 +44,21 @@ class Course:
         return self.share * sum(len(p) for p in self.probability)
 
 
-def find_courses(
-    values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]
-) -> tuple[list[Course], Course | None]:
+def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
     """Courses of trials `values` [(num_cells, num_features), ...] on a coarse grid, all different.
 
     `labels` [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled
-    trials teach first, and their stretches end where the labels are. Beside them the best fit of as many
-    stretches as are named, where the recordings show no more.
+    trials teach first, and their stretches end where the labels are.
     """
     most = max(num_states, min(map(len, values)) // 2)
-    numbers = dict.fromkeys((num_states, *(min(m * num_states + 1, most) for m in MULTIPLES)))
-    starts = [(number, i, floor) for number in numbers for i in _teachers(len(values), labels)
-              for floor in START_FLOORS]  # fmt: skip
-    taught = [_taught(values, number, i, floor, labels[i]) for number, i, floor in starts]
-    share = float(np.median([share for _, share in taught]))
-    price = _price(values, share)
-
-    def cost(stretches: list[np.ndarray]) -> float:
-        return float(np.diagonal(_costs(values, stretches, FLOORS[-1]), 1).sum()) * share
-
-    shown = [merged(values, probability, share, price, 1) for probability, _ in taught]
-    count = min(shown, key=lambda each: cost(each) + price * each[0].shape[1])[0].shape[1]
-    exact = None
-    if count <= num_states:  # no change shows but those that are named
-        every = [(merged(values, probability, share, price, num_states), own) for probability, own in taught]
-        exact = _course(values, *min(every, key=lambda each: cost(each[0])))
     found: list[Course] = []
-    for probability, own in taught:
-        course = _course(values, probability, own)
-        wide = probability[0].shape[1] > num_states or num_states == most
-        if wide and not any(_alike(course, other) for other in found):
-            found.append(course)
-    return found, exact
+    for number in dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES):
+        for i in _teachers(len(values), labels):
+            for floor in START_FLOORS:
+                course = _taught(values, number, i, floor, labels[i])
+                if not any(_alike(course, other) for other in found):
+                    found.append(course)
+    return found
 
 
 def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:
@@ -86,9 +68,10 @@ def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:
     return list(dict.fromkeys([*first, *spread]))[:TEACHERS]
 
 
-def _taught(values: Sequence[np.ndarray], number: int, teacher: int, floor: float, known: np.ndarray
-            ) -> tuple[list[np.ndarray], float]:  # fmt: skip
-    """Stretches that start from the optimal partition of one trial and teach the others; their `share`."""
+def _taught(
+    values: Sequence[np.ndarray], number: int, teacher: int, floor: float, known: np.ndarray
+) -> Course:
+    """The course that starts from the optimal partition of one trial, whose stretches teach the others."""
     names, features = [f"{k}" for k in range(number)], values[0].shape[1]
     temper = 1 / features  # while learning, a cell counts as one observation
     learner = Learner(values, names, [False] * number)
@@ -102,26 +85,9 @@ def _taught(values: Sequence[np.ndarray], number: int, teacher: int, floor: floa
     aligned = learner.align(taught, learner.law(start))
     emissions, probability = learner.run(
         [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
-    return probability, learner.independent_share(emissions, probability) * features
-
-
-def _course(values: Sequence[np.ndarray], probability: list[np.ndarray], share: float) -> Course:
-    number = probability[0].shape[1]
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
-    return Course(probability, ends, _costs(values, probability, MERGE_FLOOR), share)
-
-
-def _costs(values: Sequence[np.ndarray], probability: Sequence[np.ndarray], floor: float) -> np.ndarray:
-    number, features = probability[0].shape[1], values[0].shape[1]
-    return merged_costs(values, [p.argmax(1) for p in probability], number, floor) / features
-
-
-def _price(values: Sequence[np.ndarray], share: float) -> float:
-    """What a change has to gain [nats]: a mean and a spread of each feature, and a place sought in each trial
-    (Schwarz, Ann. Stat. 6, 1978); a cell holds `share` independent observations."""
-    observations = share * sum(map(len, values))
-    places = float(np.log([len(v) for v in values]).sum())
-    return values[0].shape[1] * float(np.log(max(observations, 1.0))) + places
+    cost = merged_costs(values, [p.argmax(1) for p in probability], number, MERGE_FLOOR) / features
+    return Course(probability, ends, cost, learner.independent_share(emissions, probability) * features)
 
 
 def _alike(one: Course, other: Course) -> bool:
@@ -137,24 +103,6 @@ def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     count = np.add.reduceat(known.astype(float), starts, axis=0)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def merged(values: Sequence[np.ndarray], probability: list[np.ndarray], share: float, price: float,
-           least: int) -> list[np.ndarray]:  # fmt: skip
-    """Probabilities (num_cells, num_stretches) of stretches, merged where they may differ by chance.
-
-    Neighbours stay apart that gain `price`; at least `least` stretches stay.
-    """
-    while (number := probability[0].shape[1]) > least:
-        cost = _costs(values, probability, FLOORS[-1]) * share
-        k = np.arange(number - 1)
-        loss = np.nan_to_num(cost[k, k + 2] - cost[k, k + 1] - cost[k + 1, k + 2])
-        weakest = int(loss.argmin())
-        if loss[weakest] > price:
-            break
-        into = np.arange(number - 1) == weakest
-        probability = [np.delete(p, weakest + 1, 1) + p[:, [weakest + 1]] * into for p in probability]
-    return probability
 
 
 def merged_costs(

@@ -72,14 +72,10 @@ def _fit_unlabelled(data: list[SequenceFeatures], task: SequenceTask, mapping: F
         return _finish(data, task, mapping, learner, *_settle(learner, start), None)
     factor = max(1, round(float(np.median([len(v) for v in values])) / COARSE_CELLS))
     known = [shares(each, b) for each, b in zip(data, boundaries, strict=True)]
-    courses, exact = find_courses([coarse(v, factor) for v in values], num_states, known)
+    courses = find_courses([coarse(v, factor) for v in values], num_states, known)
     namings = [naming(course, num_states, known) for course in courses]
     probability = probabilities(namings)
-    first = None
-    if exact is not None:  # says where the boundaries are, and counts as all others together
-        courses, namings, first = [exact, *courses], [naming(exact, num_states, known), *namings], 1
-        probability = np.concatenate([[0.5], 0.5 * probability])
-    choice = best_choice(courses, namings, probability, first)
+    choice = best_choice(courses, namings, probability)
     learner = Learner(values, task.sequence, optional_states(task, choice.settled))
     learner.allowed = [forbidden(d, b, learner.num_states) for d, b in zip(data, boundaries, strict=True)]
     stretches = _fine(courses[choice.course], factor, values)

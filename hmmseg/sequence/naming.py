@@ -133,21 +133,15 @@ def probabilities(namings: Sequence[Naming]) -> np.ndarray:
     return weights / weights.sum()
 
 
-def best_choice(
-    courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray, first: int | None = None
-) -> Choice:
-    """Of the first courses (all for None), the choice expected to lie nearest to what is right.
-
-    Near is what the law by which boundaries lie off their changes makes of a distance.
-    """
+def best_choice(courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray) -> Choice:
+    """The choice with the most boundaries expected right, were one of all courses and choices true."""
     best, answer = -np.inf, None
-    for i, (course, own) in enumerate(zip(courses[:first], namings[:first], strict=True)):
-        close, right = np.zeros_like(own.probability), np.zeros_like(own.probability)
+    for i, (course, own) in enumerate(zip(courses, namings, strict=True)):
+        right = np.zeros_like(own.probability)
         for weight, other, its in zip(probability, courses, namings, strict=True):
             apart = np.median(np.abs(course.ends[:, :, None] - other.ends[:, None]), axis=0)
-            close += weight * its.probability @ np.exp(-apart / WEIGHING.lag).T
             right += weight * its.probability @ (apart < NEAR).T
-        total, cuts = _increasing(close)
+        total, cuts = _increasing(right)
         if total > best:
             later = own.settled[cuts[-1] + 1 :]
             settled = bool(later.size and own.settled.sum() > 0.5)
