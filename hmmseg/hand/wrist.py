@@ -525,8 +525,9 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     return replace(found, warnings=(*found.warnings, *signs, *named))
 
 
-def _with_other_sign(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None,
-                     held: Held) -> tuple[Held, Rig, tuple[str, ...]]:  # fmt: skip
+def _with_other_sign(
+    trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None, held: Held
+) -> tuple[Held, Rig, tuple[str, ...]]:
     """What is held with the other sign, where lifts pull up and none is stated; else InputError.
 
     What is lifted hangs on the hand: that tells the sign before the hand's own inertia does.

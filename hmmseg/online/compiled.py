@@ -23,7 +23,7 @@ if FOLDER is not None and "numba" not in sys.modules and "NUMBA_CACHE_DIR" not i
     digest = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py"))))
     os.environ["NUMBA_CACHE_DIR"] = str(FOLDER / "numba" / digest.hexdigest()[:16])
 
-import numba
+import numba  # noqa: E402
 
 
 def compiled(function: Callable) -> Any:
