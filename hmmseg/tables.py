@@ -37,7 +37,9 @@ def as_text(table: Table) -> str:
     from rich.console import Console
 
     out = io.StringIO()
-    Console(file=out, width=WIDTH, color_system=None).print(table, highlight=False, markup=False)
+    # In a notebook rich would display the table itself, and leave nothing to return.
+    console = Console(file=out, width=WIDTH, color_system=None, force_jupyter=False)
+    console.print(table, highlight=False, markup=False)
     return out.getvalue()
 
 
