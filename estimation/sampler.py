@@ -19,6 +19,7 @@ from estimation import priors
 from estimation.mode import Mode, find_mode
 from estimation.posterior import Posterior
 from estimation.proposal import Proposal, proposal
+from hmmseg.tables import Brief
 
 if TYPE_CHECKING:
     import emcee
@@ -37,8 +38,8 @@ MIN_EFFICIENCY = 0.05  # numerics: of them, for a check, and to stand in where t
 MAX_APART = 0.25  # numerics: of a posterior sd, between the chain's means of the scales and those draws'
 
 
-@dataclass(frozen=True)
-class Draws:
+@dataclass(frozen=True, repr=False)
+class Draws(Brief):
     """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
 
     `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest

@@ -13,10 +13,11 @@ import numpy as np
 from hmmseg.hand.kinematics import forward, jacobian
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import ROLL, Trial
+from hmmseg.tables import Brief
 
 
-@dataclass(frozen=True)
-class Signals:
+@dataclass(frozen=True, repr=False)
+class Signals(Brief):
     """Fingertip signals of one trial, arrays (num_timesteps,), NaN where missing.
 
     Positions [m], velocities [m/s] and forces [N]; `sd_*` are the standard deviations of one
