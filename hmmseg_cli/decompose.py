@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, TaskArgument
+from hmmseg_cli.console import JsonOption, Output, QuietOption, TaskArgument, UnusedSeed
 
 RigFile = Annotated[Path | None, typer.Option(
     "--rig", metavar="R", help="The hand: what it cannot reveal is left out, with the reason.")]  # fmt: skip
 
 
-def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, seed: SeedOption = 0,
+def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, seed: UnusedSeed = 0,
               quiet: QuietOption = False) -> None:  # fmt: skip
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task

@@ -17,18 +17,31 @@ from simgap.report.finding import sentence
 if TYPE_CHECKING:
     from simgap.robots.diagnose import RobotDiagnosis
 
+ROBOT = "A robot against your own model of it"
 SimulatorOption = Annotated[
     str | None,
-    typer.Option("--simulator", metavar="FILE.py:NAME", help="Your own model instead of the virtual blocks."),
+    typer.Option(
+        "--simulator",
+        metavar="FILE.py:NAME",
+        rich_help_panel="A robot against your own model of it",
+        help="Your own model instead of the virtual blocks.",
+    ),
 ]
 MjcfOption = Annotated[
-    Path | None, typer.Option("--mjcf", metavar="XML", help="Your own model, for MuJoCo; it needs --map.")
+    Path | None,
+    typer.Option(
+        "--mjcf",
+        metavar="XML",
+        rich_help_panel="A robot against your own model of it",
+        help="Your own model, for MuJoCo; it needs --map.",
+    ),
 ]
 MapOption = Annotated[
     Path | None,
     typer.Option(
         "--map",
         metavar="MAP.toml",
+        rich_help_panel="A robot against your own model of it",
         help="Which column of the logs is which joint, actuator, sensor "
         "or body of the MJCF model, in what unit.",
     ),
@@ -38,6 +51,7 @@ CandidateOption = Annotated[
     typer.Option(
         "--candidate",
         metavar="NAME",
+        rich_help_panel="A robot against your own model of it",
         help="Offer one more thing the MJCF model can set as a cause, such as joint:elbow.frictionloss.",
     ),
 ]

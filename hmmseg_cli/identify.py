@@ -19,11 +19,13 @@ from hmmseg_cli.console import (
     Output,
     QuietOption,
     ReportOption,
-    RigOption,
+    RigBeside,
     SeedOption,
-    TaskOption,
+    TaskBeside,
     TrialsArgument,
+    described,
     distinct_trials,
+    needed,
     read_trials,
 )
 from hmmseg_cli.segment import warn_of_misfit
@@ -40,13 +42,14 @@ MethodOption = Annotated[Method, typer.Option(help="Bayesian, or the paper's thr
 
 
 def identify(
-    trials: TrialsArgument, task: TaskOption, rig: RigOption, method: MethodOption = Method.BAYES,
-    actual: ActualOption = None, json: JsonOption = None, figures: FiguresOption = None,
-    report: ReportOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+    trials: TrialsArgument, task: TaskBeside = None, rig: RigBeside = None,
+    method: MethodOption = Method.BAYES, actual: ActualOption = None, json: JsonOption = None,
+    figures: FiguresOption = None, report: ReportOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
-        out.finish(run(out, trials, task, rig, method, actual))
+        found, hand = described(trials, task, rig)
+        out.finish(run(out, trials, found, needed(hand, trials), method, actual))
 
 
 def run(

@@ -12,7 +12,7 @@ import typer
 from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, check_folder
+from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed, check_folder
 
 
 class Hand(StrEnum):
@@ -30,7 +30,7 @@ FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Where th
 QUESTION = "Which hand: cartesian (fingertip positions), jointed (joint angles), gripper, or none"
 
 
-def new(folder: FolderArgument, hand: HandOption = None, json: JsonOption = None, seed: SeedOption = 0,
+def new(folder: FolderArgument, hand: HandOption = None, json: JsonOption = None, seed: UnusedSeed = 0,
         quiet: QuietOption = False) -> None:  # fmt: skip
     """A rig.toml and task.toml with comments, to fill in; asks what it must on a terminal."""
     from jinja2 import Environment, PackageLoader
