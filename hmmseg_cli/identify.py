@@ -44,7 +44,8 @@ MethodOption = Annotated[Method, typer.Option(help="Bayesian, or the paper's thr
 def identify(
     trials: TrialsArgument, task: TaskBeside = None, rig: RigBeside = None,
     method: MethodOption = Method.BAYES, actual: ActualOption = None, json: JsonOption = None,
-    figures: FiguresOption = None, report: ReportOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+    figures: FiguresOption = None, report: ReportOption = None, seed: SeedOption = 0,
+    quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
