@@ -37,8 +37,7 @@ from hmmseg_cli.diagnose_robot import (
     SimulatorOption,
     diagnose_robot,
 )
-from simgap.report.finding import sentence
-from simgap.report.tables import tables
+from simgap.report.finding import sentence, tables
 
 if TYPE_CHECKING:
     from simgap.gap.diagnose import Diagnosis
@@ -234,18 +233,18 @@ def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
     """Figures and page of a diagnosis against given simulated trials."""
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.figures.gap_generic import draw_signal
+    from hmmseg_cli.gap_figures import draw_generic
     from simgap.generic.effects import EFFECTS
 
     shows = {name: candidate.shows for name, candidate in EFFECTS.items()}
-    _show(out, found.body, files, task, lambda path: draw_signal(found, path), shows=shows)
+    _show(out, found.body, files, task, lambda path: draw_generic(found, path), shows=shows)
 
 
 def _draw(out: Output, found, recordings, task: BlockTask, rig: Rig, measured) -> None:
     """Figures and page of a diagnosis against the virtual model."""
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.figures.gap_signal import draw_signal
+    from hmmseg_cli.gap_figures import draw_signal
     from simgap.effects import catalogue
 
     shows = {name: effect.shows for name, effect in catalogue().items()}
@@ -266,7 +265,7 @@ def _show(
 ) -> None:
     """Figures where asked for, and the page, from the body alone; `signal` draws the recorded one."""
     from hmmseg.contact.decompose import subtasks
-    from hmmseg_cli.gap_report import Setting, page
+    from hmmseg_cli.pages import Setting, page
     from simgap.report.figures import draw_all, draw_how_far
 
     names = list(dict.fromkeys(s.label for s in subtasks(task)))

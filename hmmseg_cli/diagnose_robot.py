@@ -187,7 +187,7 @@ def diagnose_robot(
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
-    from simgap.report.tables import tables as usual
+    from simgap.report.finding import tables as usual
 
     out = []
     unseen = document["identifiability"]["unseen"]
@@ -218,13 +218,13 @@ def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
 
 def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any]) -> None:
     """Figures where asked for, and the page with the same figures inside."""
-    from hmmseg_cli.figures.gap_robot import Drawn, draw_all, draw_page
+    from hmmseg_cli.gap_figures import Drawn, draw_robot, draw_robot_page
 
     drawn = Drawn(found, document, found.warnings)
     if out.figures is not None:
-        draw_all(drawn, out.figure)
+        draw_robot(drawn, out.figure)
     if out.report is not None:
-        from hmmseg_cli.gap_report import Setting, page
+        from hmmseg_cli.pages import Setting, page
 
         setting = Setting(
             files=[r.name for r in found.composed.recordings],
@@ -232,5 +232,5 @@ def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any]) -> None:
             shows={n: e.says for n, e in found.composed.effects.items()},
             warnings=out.warnings,
         )
-        text = page(document, setting, lambda path: draw_page(drawn, path))
+        text = page(document, setting, lambda path: draw_robot_page(drawn, path))
         out.stage(out.report).write_text(text, encoding="utf-8")

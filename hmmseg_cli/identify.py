@@ -86,11 +86,9 @@ def run(
     for note in body.get("notes", ()):
         out.print(note)
     if out.figures is not None:
-        from hmmseg_cli.figures.identification import draw_all
-
-        draw_all(out, signals, recordings, segmentations, body, found, measured)
+        _draw(out, signals, recordings, segmentations, body, found, measured)
     if out.report is not None:
-        from hmmseg_cli.report import identification_page
+        from hmmseg_cli.pages import identification_page
 
         page = identification_page(signals, recordings, segmentations, body, found, measured, out.warnings)
         out.stage(out.report).write_text(page, encoding="utf-8")
@@ -127,3 +125,23 @@ def _bayes(out: Output, recordings, task: BlockTask, hand):
     for warning in found.warnings:
         out.warn(warning)
     return found
+
+
+def _draw(
+    out: Output, signals: Sequence[Signals], trials: Sequence[Trial], segmentations: Sequence[Segmentation],
+    body: dict[str, Any], found: Identification | None, actual: Actual | None,
+) -> None:  # fmt: skip
+    """Signals with subtasks a trial, estimates, and of a Bayesian result corner and predictive check."""
+    from estimation.plot.corner import draw_corner
+    from estimation.plot.estimates import draw_estimates
+    from estimation.plot.predictive import draw_check
+    from hmmseg.plot.signals import draw_signals
+
+    for i, (s, trial, segmentation) in enumerate(zip(signals, trials, segmentations, strict=True)):
+        stem = Path(trial.name).stem
+        draw_signals(s, segmentation, out.figure(f"{stem}_segments.png"))
+        if found is not None:
+            draw_check(found, i, out.figure(f"{stem}_predictive.png"))
+    draw_estimates(body["properties"], actual, out.figure("estimates.png"))
+    if found is not None and found.names:
+        draw_corner(found.draws, found.names, out.figure("corner.png"), actual)

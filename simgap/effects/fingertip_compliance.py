@@ -47,7 +47,7 @@ def _phrase(means, rig):
 
 def _patched(document, found):
     """The pads' own numbers, each with what it was and what rig.toml says of it."""
-    from simgap.patch.fields import interval_comment, number, table
+    from simgap.patch.write import interval_comment, number, table
 
     pads = table(document, "fingertip")
     names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]

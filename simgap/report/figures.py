@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hmmseg.plot.style import BLUE, GREY, RED, canvas
-from simgap.report.causes import plain_name
-from simgap.report.finding import CHANNELS, by_place, share_of
+from simgap.report.finding import CHANNELS, by_place, plain_name, share_of
 
 Body = Mapping[str, Any]
 

@@ -1,12 +1,50 @@
-"""A diagnosis in words, from its JSON alone: what it is, how sure, what remains, what to do."""
+"""A diagnosis in words and tables, from its JSON alone: what it is, how sure, what remains, what to do."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hmmseg.numbers import between, estimate, percent, plain, shown_as
-from simgap.report.causes import checks, plain_name
+from rich.table import Table
+
+from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
+
+if TYPE_CHECKING:
+    from simgap.effects.base import Effect
+
+
+def plain_name(
+    effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
+) -> str:
+    """An effect, or several joined by +, in plain words; `means`: its parameters, `rig`: the model's pads."""
+    return " and ".join(_one(name, means or {}, rig or {}) for name in effect.split("+"))
+
+
+def _one(name: str, means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
+    called, _, effect = _words(name)
+    own = {k.removeprefix(f"{name}."): v for k, v in means.items()}
+    return effect.phrase(own, rig) if own and effect is not None and effect.phrase is not None else called
+
+
+def checks(effects: Sequence[str]) -> list[str]:
+    """What to look at on the rig, one line an effect."""
+    return [check for _, check, _ in map(_words, effects) if check]
+
+
+def _words(name: str) -> tuple[str, str, Effect | None]:
+    """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
+    from simgap.robot_effects import words
+
+    robots = words(name)
+    if robots is not None:
+        return *robots, None
+    from simgap.effects import catalogue  # slow to import
+
+    known = catalogue().get(name)
+    if known is None:
+        return name.replace("_", " "), "", None
+    return known.called or name.replace("_", " "), known.check, known
+
 
 Body = Mapping[str, Any]
 CHANNELS = {
@@ -199,3 +237,45 @@ def by_place(body: Body) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
 def share_of(cells: Sequence[Mapping[str, Any]]) -> float:
     """Their share of the gap together."""
     return float(sum(c["share"] for c in cells))
+
+
+def tables(body: Mapping[str, Any]) -> list[Table]:
+    """Probabilities, parameters of the cause and the largest cells, for people to read."""
+    likely = Table(title="probabilities", title_justify="left")
+    likely.add_column("candidate", no_wrap=True)
+    likely.add_column("probability", justify="right")
+    for name, value in sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]:
+        likely.add_row(name, f"{value:.3f}")
+    out = [likely]
+    if body["causes"]:
+        values = Table(title="parameters", title_justify="left")
+        for head in ("parameter", "estimate", "90 % interval"):
+            values.add_column(head, no_wrap=True)
+        for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
+            low, high = p["interval_90"]
+            shown = shown_as(p["unit"])
+            values.add_row(name, estimate(p["mean"], p["sd"], shown), interval(low, high, shown))
+        out.append(values)
+    if body["next_experiment"] is not None:
+        following = Table(title="next experiment", title_justify="left", show_header=False)
+        asked = body["next_experiment"]
+        gain = f"by {asked['expected_gain_nats']:.0f} nats at least"
+        following.add_row(asked["do"])
+        following.add_row(f"expected to tell {', '.join(asked['separates'])} apart, {gain}")
+        out.append(following)
+    if body["where"]:
+        cells = Table(title="where the gap is largest", title_justify="left")
+        for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
+            cells.add_column(head, no_wrap=True)
+        for row in body["where"][:8]:
+            low, high = row["band"]
+            cells.add_row(
+                row["trial"],
+                row["channel"],
+                row["subtask"],
+                f"{low:g}-{high:g}",
+                f"{100 * row['share']:.0f} %",
+                f"{row['z']:.1f}",
+            )
+        out.append(cells)
+    return out

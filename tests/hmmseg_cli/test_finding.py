@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
-from hmmseg_cli.gap_report import Setting, page
+from hmmseg_cli.pages import Setting, page
 from simgap.effects import catalogue
-from simgap.report.causes import checks, plain_name
-from simgap.report.finding import headline, moving, remains, sentences, to_do
+from simgap.report.finding import checks, headline, moving, plain_name, remains, sentences, to_do
 from simgap.robot_effects import families
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
