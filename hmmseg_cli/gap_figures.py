@@ -1,4 +1,4 @@
-"""Figures of a diagnosis that need more than its JSON: recorded, simulated and corrected where they part most."""
+"""Figures of a diagnosis beyond its JSON: recorded, simulated and corrected where they part most."""
 
 from __future__ import annotations
 

@@ -128,8 +128,8 @@ def _bayes(out: Output, recordings, task: BlockTask, hand):
 
 
 def _draw(
-    out: Output, signals: Sequence[Signals], trials: Sequence[Trial], segmentations: Sequence[Segmentation],
-    body: dict[str, Any], found: Identification | None, actual: Actual | None,
+    out: Output, signals: Sequence[Any], trials: Sequence[Any], segmentations: Sequence[Any],
+    body: dict[str, Any], found: Any, actual: Any,
 ) -> None:  # fmt: skip
     """Signals with subtasks a trial, estimates, and of a Bayesian result corner and predictive check."""
     from estimation.plot.corner import draw_corner

@@ -1,4 +1,4 @@
-"""The virtual model of a corrected rig: trials performed, recordings replayed, and whether it predicts better."""
+"""The virtual model of a corrected rig: trials, replays, and whether it predicts better."""
 
 from __future__ import annotations
 
