@@ -11,6 +11,7 @@ import typer
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, read_task
+from hmmseg.numbers import percent
 from hmmseg_cli.console import (
     FiguresOption,
     Grouped,
@@ -37,7 +38,7 @@ from hmmseg_cli.diagnose_robot import (
     SimulatorOption,
     diagnose_robot,
 )
-from simgap.report.finding import sentence, tables
+from simgap.report.finding import plain_name, sentence, settles, tables
 
 if TYPE_CHECKING:
     from simgap.gap.diagnose import Diagnosis
@@ -146,24 +147,27 @@ def refuse(problem: str, given: dict[str, Any]) -> None:
 
 
 def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
-    """Write the corrected model; a warning where there is no cause to correct, or where it predicts worse."""
-    from simgap.patch import files, reproduced
+    """Write the corrected model; a warning where there is no cause to correct, or where it leaves as much of
+    trials that took no part."""
+    from simgap.patch import files
 
     if (folder / "rig.toml").resolve() == rig.resolve():
         raise InputError(f"--patch {folder}", f"would replace the input {rig}", "another folder")
-    frame = found.problem.frame
     written = files(rig.read_text(encoding="utf-8"), found.body)
     if not written:
         out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
         return
-    nominal, corrected = reproduced(written, found.body, found.search.trials, frame.task, frame.rig)
-    text = f"forces differ from the recorded ones by {corrected:.3g} N with it, {nominal:.3g} N without"
-    if not corrected < nominal:
-        out.warn(f"--patch {folder}: the corrected model is no better ({text}); nothing is written")
+    gone = (found.body["shrinkage"] or {}).get("fraction")
+    if gone is not None and gone <= 0:
+        out.warn(f"--patch {folder}: the cause takes nothing off held-out trials; nothing is written")
         return
     for name, text in written.items():
         out.stage(folder / name).write_text(text, encoding="utf-8")
-    out.print(f"the corrected model is in {folder}: {', '.join(written)}; {text}")
+    share = "" if gone is None else f"; with it the gap shrinks by {percent(gone)} on held-out trials"
+    out.print(
+        f"{' and '.join(map(plain_name, found.body['causes']))}: put into {folder / 'rig.toml'}{share}. "
+        f"hmmseg simulate takes it with --rig, and the ranges for training are in ranges.json"
+    )
 
 
 def run(
@@ -193,7 +197,8 @@ def run(
     for warning in found.warnings:
         out.warn(warning)
     pads = rig.fingertip.model_dump()
-    out.print(sentence(found.body, pads), *tables(found.body))
+    more = settles(found.body, measured is not None)
+    out.print(sentence(found.body, pads), *filter(None, [more]), *tables(found.body))
     _draw(out, found, recordings, task, rig, measured)
     return found
 

@@ -32,8 +32,8 @@ LABELS = {
 }
 
 
-def _signal(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
-    """A recorded signal in the figure's unit."""
+def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
+    """A recorded signal in task space, SI."""
     import jax
     import jax.numpy as jnp
 
@@ -44,12 +44,12 @@ def _signal(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     force = dict(zip(FORCE_CHANNELS, w.force[trial].T, strict=True))
     x1, y1, x2, y2 = position.T
     table = {
-        "x": (x1 + x2) * 50,
-        "y": (y1 + y2) * 50,
-        "distance": (x2 - x1) * 100,
-        "offset": (y2 - y1) * 100,
-        "vx": (velocity[:, 0] + velocity[:, 2]) * 50,
-        "vy": (velocity[:, 1] + velocity[:, 3]) * 50,
+        "x": (x1 + x2) / 2,
+        "y": (y1 + y2) / 2,
+        "distance": x2 - x1,
+        "offset": y2 - y1,
+        "vx": (velocity[:, 0] + velocity[:, 2]) / 2,
+        "vy": (velocity[:, 1] + velocity[:, 3]) / 2,
         "fx": force["fx1"] + force["fx2"],
         "fy": force["fy1"] + force["fy2"],
         "grip": np.minimum(force["fx1"], -force["fx2"]),
@@ -66,21 +66,25 @@ def draw_signal(found: Diagnosis, path: Path) -> None:
     t, there = frame.world.t[r, :n], found.problem.whitening.weight[r, :n, c] > 0
     with canvas(path, height=3.4) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        above.plot(t, _signal(found, r, cell.channel)[:n], color=BLUE)
+        factor = 100.0 if "cm" in LABELS[cell.channel] else 1.0
+        recorded = _recorded(found, r, cell.channel)[:n]
+        above.plot(t, factor * recorded, color="black", lw=1.2, label="recorded")
+        off = found.problem.whitening.weight[r, :n, c]
+        for residual, colour, name in ((found.before, RED, "simulated"), (found.after, BLUE, "corrected")):
+            left = np.divide(residual[r, :n, c], off, out=np.full(n, np.nan), where=off > 0)
+            above.plot(t, factor * (recorded - left), ".", color=colour, ms=2, label=name)
         above.set_ylabel(LABELS[cell.channel])
+        above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
         inside = t[frame.arrays.subtask[r, :n] == cell.subtask]
         for axes in (above, below):
             for event in frame.world.events[r]:
                 axes.axvline(event, color=GREY, lw=0.5)
             axes.axvspan(inside[0], inside[-1], color=ORANGE, alpha=0.2, lw=0)
-        below.plot(t[there], found.before[r, :n, c][there], ".", color=RED, ms=3, label="without the effect")
-        below.plot(
-            t[there], found.after[r, :n, c][there], ".", color=BLUE, ms=3, label="with the verdict's effect"
-        )
+        below.plot(t[there], found.before[r, :n, c][there], ".", color=RED, ms=3)
+        below.plot(t[there], found.after[r, :n, c][there], ".", color=BLUE, ms=3)
         below.set_yscale("symlog", linthresh=3)
         below.set(xlabel="time [s]", ylabel="residual [sd]")
-        below.legend()
-        above.set_title(f"Largest excess: {cell.channel} in {frame.files[r]} (shaded subtask)")
+        above.set_title(f"{cell.channel} in {frame.files[r]}, largest gap shaded", loc="left")
 
 
 def draw_generic(found: GenericDiagnosis, path: Path) -> None:

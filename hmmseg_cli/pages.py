@@ -19,7 +19,17 @@ from estimation.plot.estimates import draw_estimates
 from estimation.plot.predictive import draw_check
 from hmmseg.hand.signals import Signals
 from hmmseg.io.trial import Trial
-from hmmseg.numbers import SHOWN, between, estimate, interval, percent, plain, property_shown_as, shown_as
+from hmmseg.numbers import (
+    SHOWN,
+    between,
+    estimate,
+    fixed,
+    interval,
+    percent,
+    plain,
+    property_shown_as,
+    shown_as,
+)
 from hmmseg.plot.signals import draw_signals
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
@@ -134,7 +144,7 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
                     inner = interval(entry["interval_68"][0], entry["interval_68"][1], shown, sds=2.0)
                     outer = interval(entry["interval_95"][0], entry["interval_95"][1], shown, sds=3.9)
                     if value is not None:
-                        deviation = f"{100 * (entry['mean'] / value[0] - 1):+.2f} %"
+                        deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
                         if body.get("actual", {}).get(obj, {}).get(prop, {}).get("disagrees"):
                             deviation += ", disagrees"
             apart = (
@@ -185,9 +195,9 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         "diagnose.html.j2",
         headline=finding.headline(body, setting.rig),
         lines=finding.sentences(body),
-        to_do=finding.to_do(body) if body["verdict"] != "none" else [],
+        to_do=_to_do(body, setting) if body["verdict"] != "none" else [],
         remains=finding.remains(body),
-        parameters=_parameters(effect) if effect and body["causes"] else [],
+        parameters=_parameters(effect, body["causes"]) if effect and body["causes"] else [],
         subtasks=setting.subtasks,
         heat=_heat(cells, setting.subtasks) if cells else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
@@ -202,6 +212,10 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         warnings=setting.warnings,
         files=setting.files,
     )
+
+
+def _to_do(body: Body, setting: Setting) -> list[str]:
+    return [*finding.to_do(body), *filter(None, [finding.settles(body, setting.measured is not None)])]
 
 
 def _heat(cells: Mapping[tuple[str, str], Sequence], subtasks: Sequence[str]) -> list[dict[str, Any]]:
@@ -240,36 +254,35 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
     )
 
 
-def _parameters(effect: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _parameters(effect: Mapping[str, Any], causes: Sequence[str]) -> list[tuple[str, ...]]:
+    """Parameter, the model's value where it is known, what was found, interval."""
     rows = []
     for name, p in effect["parameters"].items():
+        cause = next((c for c in causes if name.startswith(f"{c}.")), causes[0])
         last = name.rpartition(".")[2]
         shown = SHOWN[last] if last in SHOWN else shown_as(p["unit"], share=last in SHARES)
         low, high = p["interval_90"]
         ends = "" if None in (low, high) else interval(low, high, shown)
-        rows.append((name.replace("_", " "), estimate(p["mean"], p["sd"] or 0.0, shown), ends))
+        words, nominal = last.replace("_", " "), p.get("nominal")
+        if nominal is not None:
+            words = plain_name(cause) + (f", {words}" if not cause.endswith(f".{last}") else "")
+        model = "" if nominal is None else estimate(nominal, 0.0, shown)
+        rows.append((words, model, estimate(p["mean"], p["sd"] or 0.0, shown), ends))
     return rows
 
 
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
-    """Every effect that was looked at: whether it acts, what it explains, its evidence and signature."""
+    """Every effect that was looked at: how probably it acts, what it explains and where it would show."""
     attribution = body.get("attribution") or {}
-    names = dict.fromkeys([*attribution, *body["effects"]])
     rows = []
-    for name in names:
-        entry, own = body["effects"].get(name), attribution.get(name)
-        acts = own["probability"] if own else body["probabilities"].get(name)
-        share = ""
+    for name, chance in sorted(finding.chances(body).items(), key=lambda row: -row[1])[:MOST]:
+        own, share = attribution.get(name), ""
         if own and own.get("share") is not None and own["probability"] >= 0.01:
             ends = between(*(own.get("interval_90") or (None, None)))
             share = percent(own["share"]) + (f" ({ends})" if ends else "")
-        evidence = "" if entry is None or entry["log_evidence"] is None else f"{entry['log_evidence']:.0f}"
         shows = "; ".join(setting.shows[n] for n in name.split("+") if n in setting.shows)
-        rows.append(
-            (acts or 0.0, (f"{plain_name(name)} ({name})", percent(acts or 0.0), share, evidence, shows))
-        )
-    rows.sort(key=lambda row: -row[0])
-    return [row for _, row in rows][:MOST]
+        rows.append((plain_name(name), percent(chance), share, shows, name))
+    return rows
 
 
 def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tuple[str, ...]]:
@@ -290,7 +303,10 @@ def _detection(body: Body) -> str:
     text = f"A healthy recording of this rig and task differs from the model as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
-    return f"{text}; the healthy twins simulated cannot show less than {plain(fineness, 1)}."
+    fewer = (
+        f"the healthy twins simulated for it are so few that they alone show no less than {percent(fineness)}"
+    )
+    return f"{text}. Counted, not calculated: {fewer}."
 
 
 def _far(body: Body) -> str:
