@@ -183,13 +183,10 @@ def diagnose_robot(
         write_patch(found, document, own.mjcf, lambda name: out.stage(own.patch / name))  # type: ignore[operator]
         import json
 
-        left = json.loads(out.stage(own.patch / "ranges.json").read_text(encoding="utf-8"))
-        out.print(f"ranges of what was found are in {own.patch / 'ranges.json'}"
-                  + (f", the corrected model in {own.patch / own.mjcf.name}" if own.mjcf else ""))  # fmt: skip
-        for line in left.get("not_in_xml", ()):
-            out.warn(
-                f"--patch: an MJCF has no place for {line}; correct it in the driver or the logs by ranges.json"
-            )
+        ranges, model = own.patch / "ranges.json", "" if own.mjcf is None else f" and {own.mjcf.name}"
+        out.print(f"what was found is in {ranges}{model}")
+        for line in json.loads(out.stage(ranges).read_text(encoding="utf-8")).get("not_in_xml", ()):
+            out.warn(f"--patch: an MJCF has no place for {line}; correct the driver by ranges.json")
     out.finish(document)
     kept.forget()
 

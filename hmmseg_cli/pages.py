@@ -303,10 +303,8 @@ def _detection(body: Body) -> str:
     text = f"A healthy recording of this rig and task differs from the model as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
-    fewer = (
-        f"the healthy twins simulated for it are so few that they alone show no less than {percent(fineness)}"
-    )
-    return f"{text}. Counted, not calculated: {fewer}."
+    fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"
+    return f"{text}; {fewer}, and what is below follows from the sensors' noise."
 
 
 def _far(body: Body) -> str:
