@@ -51,7 +51,9 @@ def results() -> str | None:
     rms = [", ".join(percent(c["properties"][k]["rms"], 2) for k in PROPERTIES) for c in single]
     rows.append(["weight, width, height from a single trial", *rms])
     theirs = ", ".join(f"{key} {PAPER[key]}" for key in PROPERTIES)
-    note = f"Coverages with their standard error over cases. The paper's own errors, of one recording: {theirs}."
+    note = (
+        f"Coverages with their standard error over cases. The paper's own errors, of one recording: {theirs}."
+    )
     speed = load("benchmark_commands")
     if speed is not None:
         seconds = speed["commands"]["identify"]["warm"]
