@@ -39,11 +39,11 @@ def inspect(
         for each in found:
             _show(out, each)
         if write is not None:
-            out.stage(write).write_text(_extended(write, found), encoding="utf-8")
+            out.stage(write).write_text(extended(write, found), encoding="utf-8")
         out.finish({"files": [_document(each) for each in found]})
 
 
-def _extended(rig_file: Path, found: list[Any]) -> str:
+def extended(rig_file: Path, found: list[Any]) -> str:
     """The rig's text with the mapping added; InputError where there is one, or none to add."""
     proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
     if not proposed:
