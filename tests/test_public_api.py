@@ -122,10 +122,12 @@ CELLS = (
 
 
 def test_a_notebook_shows_every_result_once_and_every_plot():
-    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
+    from nbclient import NotebookClient
+
     cells = [nbformat.v4.new_code_cell(source) for source in CELLS]
-    nbclient.NotebookClient(nbformat.v4.new_notebook(cells=cells), timeout=300).execute()
+    NotebookClient(nbformat.v4.new_notebook(cells=cells), timeout=300).execute()
     shown = [[o for o in cell.outputs if o.get("name") != "stderr"] for cell in cells]
     several, one, printed, plot = shown
     assert len(several) == len(one) == len(printed) == 1
