@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
+.PHONY: oldest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -45,6 +45,14 @@ golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ agai
 
 wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
 	$(BIN)/python .ci/check_wheel.py
+
+OLDEST := build/oldest
+oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares, in an environment of its own
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
+	$(BIN)/uv pip install --quiet --python $(OLDEST) --resolution lowest-direct '.[mujoco]'
+	$(OLDEST)/bin/hmmseg doctor
+	$(OLDEST)/bin/hmmseg demo --figures build/oldest_demo
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
 	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs
@@ -121,6 +129,10 @@ wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and o
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
 	$(BIN)/python -m experiments.readme_figures
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
+
+ablation: $(INSTALLED)  ## what each special case of segmentation and estimate buys; fills docs/tables/special_cases.csv
+	$(BIN)/python -m experiments.ablation
+	$(BIN)/python -m experiments.write_tables
 
 results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings

@@ -6,47 +6,529 @@ channel c:
     mean = A . unknowns + J . deviations + unit (common_c + own) + noise,
 
 A holds gravity factors (force), ones (distance) and coefficients of heights (rise), J finite
-differences through the hand. `unit` is the quantity that the channel's equation is built on: the
-carried force, the pads' give along the grip, what their shear deflection differs by between pickup
-and place. What the equation leaves out is stated as a share of it: one that all grips have in common,
-one that differs from grip to grip. Beside the means stand slopes over the pads' give within a grip
-(`estimation.compliance`), which show these shares themselves (unit 1), whatever the block.
+differences through the hand: each deviation of the rig's [systematic] table reads a trial again by a hand
+that deviates by a small step, with the same sample weights. `unit` is the quantity that the channel's
+equation is built on: the carried force, the pads' give along the grip, what their shear deflection differs
+by between pickup and place. What the equation leaves out is stated as a share of it: one that all grips have
+in common, one that differs from grip to grip. Slopes over the pads' give within a grip (`estimation.pads`)
+show these shares themselves (unit 1), whatever the block.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from math import gcd, lcm
 
 import numpy as np
 
-from estimation.compliance import SLOPE_SD
-from estimation.moments import (
-    SLOPES,
-    free_means,
-    level_rises,
-    observe,
-    observe_slopes,
-    pad_doubt,
-    sampling_variance,
-    slope_variances,
-    unexpected_bias,
-    units,
-)
-from estimation.nuisance import Nuisance, PadDoubt, nuisances
 from estimation.observations import (
     CHANNELS,
+    MIN_FREE,
     Noise,
     WeighedTrial,
+    channel_values,
     free_forces,
     gravity_factor,
 )
-from estimation.unknowns import FORCE, PROPERTIES, RISE, Unknown, coefficients_of, determined
-from hmmseg.contact.decompose import height_equations
-from hmmseg.hand.signals import Signals
-from hmmseg.io.rig import FORCE_CHANNELS
+from estimation.pads import (
+    SLOPE_SD,
+    UNSTATED,
+    middle_share,
+    misstated,
+    possible_share,
+    shared_error,
+    shear_give,
+    squeeze_give,
+    unit_pads,
+)
+from hmmseg.contact.decompose import FREE, PROPERTIES, height_equations
+from hmmseg.hand.signals import Signals, task_space
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.io.trial import Trial
+from hmmseg.levels import SURE
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.emissions import thin
+
+Terms = dict[str, int]
+
+
+def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
+    """Independent integer combinations of the unknowns in `order` that span `rows`, single ones first.
+
+    Each is {unknown: coefficient} with coprime coefficients, the first of them positive.
+    """
+    given = [
+        _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
+    ]
+    echelon = [_whole(row, order) for row in _echelon([_fractions(row) for row in given], order)]
+    single = [row for row in echelon if len(row) == 1]
+    known = {name for row in single for name in row}
+    rest = [{k: v for k, v in row.items() if k not in known} for row in given]
+    left = [_whole(_fractions(row), order) for row in rest if row] + [r for r in echelon if len(r) > 1]
+    chosen = list(single)
+    for row in sorted(left, key=_complexity):
+        if len(_echelon([_fractions(r) for r in [*chosen, row]], order)) > len(chosen):
+            chosen.append(row)
+    return sorted(single, key=lambda row: order.index(next(iter(row)))) + chosen[len(single) :]
+
+
+def _complexity(row: Terms) -> tuple[int, bool, int]:
+    return len(row), any(v < 0 for v in row.values()), sum(abs(v) for v in row.values())
+
+
+def _fractions(row: Mapping[str, int]) -> dict[str, Fraction]:
+    return {k: Fraction(v) for k, v in row.items()}
+
+
+def _echelon(rows: list[dict[str, Fraction]], order: Sequence[str]) -> list[dict[str, Fraction]]:
+    """Rows of the reduced row echelon form, pivots in `order`."""
+    pivots: dict[str, dict[str, Fraction]] = {}
+    for row in rows:
+        for name, pivot in pivots.items():
+            if name in row:
+                row = _minus(row, row[name], pivot)
+        if not row:
+            continue
+        lead = next(name for name in order if name in row)
+        row = {k: v / row[lead] for k, v in row.items()}
+        pivots = {k: _minus(p, p[lead], row) if lead in p else p for k, p in pivots.items()}
+        pivots[lead] = row
+    return list(pivots.values())
+
+
+def _minus(a: dict[str, Fraction], factor: Fraction, b: dict[str, Fraction]) -> dict[str, Fraction]:
+    out = {k: a.get(k, Fraction(0)) - factor * b.get(k, Fraction(0)) for k in a | b}
+    return {k: v for k, v in out.items() if v}
+
+
+def _whole(row: Mapping[str, Fraction], order: Sequence[str]) -> Terms:
+    """The same direction with coprime whole coefficients, the first positive."""
+    terms = {name: row[name] for name in order if name in row}
+    common = lcm(*(v.denominator for v in terms.values()))
+    whole = {k: int(v * common) for k, v in terms.items()}
+    share = gcd(*whole.values())
+    sign = 1 if next(iter(whole.values())) > 0 else -1
+    return {k: sign * v // share for k, v in whole.items()}
+
+
+FORCE, DISTANCE, RISE = range(len(CHANNELS))
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What the recording determines: a property, or a combination of one property of several objects."""
+
+    prop: str
+    terms: Terms
+
+    @property
+    def single(self) -> bool:
+        """Whether it is a property of one object."""
+        return len(self.terms) == 1
+
+    @property
+    def properties(self) -> tuple[str, ...]:
+        """`object.property` of all that enter."""
+        return tuple(f"{obj}.{self.prop}" for obj in self.terms)
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """(object, property); objects of a combination joined as in `b + c`."""
+        text = ""
+        for obj, c in self.terms.items():
+            sign = " - " if c < 0 else " + "
+            text += (sign if text else "") + (obj if abs(c) == 1 else f"{abs(c)} {obj}")
+        return text, self.prop
+
+
+def determined(
+    task: BlockTask, objects: Sequence[str], rises: dict[int, Terms], there: np.ndarray
+) -> tuple[Unknown, ...]:
+    """What the moves recorded in `there` (num_moves, 3) determine, objects in the task's order."""
+    names = list(task.objects)
+    held = {
+        c: {obj for obj, seen in zip(objects, there[:, c], strict=True) if seen} for c in (FORCE, DISTANCE)
+    }
+    out = []
+    recorded = [rises[m] for m, seen in enumerate(there[:, RISE]) if seen]
+    heights = simplest_combinations(recorded, names)
+    for name in names:
+        out += [Unknown("weight", {name: 1})] * (name in held[FORCE])
+        out += [Unknown("width", {name: 1})] * (name in held[DISTANCE])
+        out += [Unknown("height", {name: 1})] * ({name: 1} in heights)
+    return (*out, *(Unknown("height", terms) for terms in heights if len(terms) > 1))
+
+
+def coefficients_of(
+    unknowns: Sequence[Unknown], objects: Sequence[str], rises: dict[int, Terms]
+) -> np.ndarray:
+    """Coefficients (num_moves, 3, Q) of the unknowns in each observation of a move."""
+    out = np.zeros((len(objects), len(CHANNELS), len(unknowns)))
+    heights = [i for i, u in enumerate(unknowns) if u.prop == "height"]
+    names = list(dict.fromkeys(name for i in heights for name in unknowns[i].terms))
+    basis = np.array([[unknowns[i].terms.get(name, 0) for name in names] for i in heights], float)
+    for m, obj in enumerate(objects):
+        for i, u in enumerate(unknowns):
+            if u.single and obj in u.terms and u.prop != "height":
+                out[m, PROPERTIES.index(u.prop), i] = 1.0
+        if heights and rises[m] and set(rises[m]) <= set(names):
+            rise = np.array([rises[m].get(name, 0) for name in names], float)
+            solved, *_ = np.linalg.lstsq(basis.T, rise, rcond=None)
+            if np.abs(solved @ basis - rise).max() < 1e-9:
+                out[m, RISE, heights] = np.where(np.abs(solved) > 1e-9, solved, 0.0)
+    return out
+
+
+# prior: a pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off
+# by as much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
+MOST_BENT = 0.5
+UNLIKE = 0.3  # prior: by which share of what both pads have alike one may differ: foams of one make do
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """One deviation: its name, prior standard deviation, and how a trial is read under it.
+
+    `read(trial, rig, size)` gives the task-space signals as a hand that truly deviates by `size`
+    from the nominal rig means them; `step` is a small deviation for finite differences.
+    """
+
+    name: str
+    sd: float
+    step: float
+    read: Callable[[Trial, Rig, float], Signals]
+
+
+def _with_channel(name: str, change: Callable[[np.ndarray, float], np.ndarray]):
+    def read(trial: Trial, rig: Rig, size: float) -> Signals:
+        channels = trial.channels | {name: change(trial.channels[name], size)}
+        return task_space(replace(trial, channels=channels), rig)
+
+    return read
+
+
+def _longer_link(finger: int, link: int):
+    def read(trial: Trial, rig: Rig, size: float) -> Signals:
+        fingers, nominal = dict(rig.fingers or {}), rig.finger(finger)
+        links = list(nominal.links)
+        links[link] *= 1 + size
+        fingers[str(finger)] = nominal.model_copy(update={"links": tuple(links)})
+        return task_space(trial, rig.model_copy(update={"fingers": fingers}))
+
+    return read
+
+
+@dataclass(frozen=True)
+class PadDoubt:
+    """What recordings show of the pads and the rig does not admit: how much softer they are, as shares.
+
+    `normal`, `shear`: along the grip and in shear the compliance seems 1 + share times the nominal; `odds`
+    are the probabilities that the rig is so wrong; where it is `doubted`, the extra prior sd is as large as
+    the share. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
+    how much pads may give, by what the recordings show, whose stiffness the rig leaves unstated; 0 where it
+    states one. `usual_normal`, `usual_shear`: forces of one finger as they usually are in a grip, and where a
+    block is put down [N]. `seen`: those shares and their sds whatever the odds, infinite where nothing tells.
+    """
+
+    normal: float = 0.0
+    shear: float = 0.0
+    normal_give: float = 0.0
+    shear_give: float = 0.0
+    usual_normal: float = 1.0
+    usual_shear: float = 1.0
+    odds: tuple[float, float] = (0.0, 0.0)
+    doubted: bool = False
+    apart: tuple[float, float] = (0.0, 0.0)
+    seen: tuple[tuple[float, float], tuple[float, float]] = ((0.0, np.inf), (0.0, np.inf))
+
+    def extra_sd(self, kind: str) -> float:
+        """Prior standard deviation of the share, "normal" or "shear", beyond what the rig admits."""
+        return abs(getattr(self, kind)) if self.doubted else 0.0
+
+    def slope_sd(self) -> np.ndarray:
+        """Standard deviations (3,) by channel of what slopes are off by alike and each of its own.
+
+        A share of what truly gives, and beside it what noise of forces or places may make of all of them.
+        """
+        usual = SLOPE_SD * np.array([1.0, self.normal_give or 1.0, self.shear_give or 1.0])
+        return np.hypot(usual, [0.0, *self.apart])
+
+
+def _softer_pads(fingers: tuple[int, ...], axis: str):
+    def read(trial: Trial, rig: Rig, size: float) -> Signals:
+        """Pads whose compliance is 1 + size of the nominal: their faces lie elsewhere under a force."""
+        signals, moved = task_space(trial, rig), {}
+        for finger in fingers:
+            name = f"{axis}{finger}"
+            give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
+            moved[name] = getattr(signals, name) - give * size
+        return replace(signals, **moved)
+
+    return read
+
+
+def _bent_pads(axis: str, usual: float):
+    def read(trial: Trial, rig: Rig, size: float) -> Signals:
+        """Pads that give as force^(1 + size), as the nominal at the force `usual`; to first order."""
+        signals, moved = task_space(trial, rig), {}
+        for finger in (1, 2):
+            name = f"{axis}{finger}"
+            force = getattr(signals, f"f{name}")
+            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * usual) / usual)
+            moved[name] = getattr(signals, name) - _compliance(rig, finger, axis) * bend * size
+        return replace(signals, **moved)
+
+    return read
+
+
+def _compliance(rig: Rig, finger: int, axis: str) -> float:
+    """Of one pad [m/N]: along the grip (x) or in shear (y)."""
+    return getattr(unit_pads(rig), ("normal" if axis == "x" else "shear") + str(finger))
+
+
+def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
+    """Fingers that touch a block when they are `size` further apart than their distance says."""
+    signals = task_space(trial, rig)
+    return replace(signals, x1=signals.x1 - size / 2, x2=signals.x2 + size / 2)
+
+
+def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0.0) -> tuple[Nuisance, ...]:
+    """The deviations that the rig admits, and those that recordings show beside.
+
+    `biased` (4,): extra prior sd of each force bias [N]; `doubt`: of the pads' compliances; `touch_sd`
+    [m]: how well the distance is known at which the fingers touch a block.
+    """
+    s, out = rig.systematic, []
+    for i, name in enumerate(FORCE_CHANNELS):
+        sd = float(np.hypot(s.force_bias[i], biased[i]))
+        if sd > 0:
+            out.append(Nuisance(f"force_bias.{name}", sd, 1e-3,
+                                _with_channel(name, lambda f, b: f - b)))  # fmt: skip
+        if s.force_gain[i] > 0:
+            out.append(Nuisance(f"force_gain.{name}", s.force_gain[i], 1e-3,
+                                _with_channel(name, lambda f, g: f / (1 + g))))  # fmt: skip
+    if rig.jointed:
+        for i, name in enumerate(JOINTS):
+            if s.joint_offset[i] > 0:
+                out.append(Nuisance(f"joint_offset.{name}", s.joint_offset[i], 1e-5,
+                                    _with_channel(name, lambda q, d: q - d)))  # fmt: skip
+        for i, (finger, link) in enumerate([(1, 0), (1, 1), (2, 0), (2, 1)]):
+            if s.link_length[i] > 0:
+                out.append(Nuisance(f"link_length.{finger}{link + 1}", s.link_length[i], 1e-5,
+                                    _longer_link(finger, link)))  # fmt: skip
+    # What slopes show is compliance and exponent together, so either may be off by as much as both; the bend
+    # is that of what gives.
+    stated = min(max(doubt.extra_sd("normal"), *s.pad_stiffness) / np.log(2), MOST_BENT)
+    bends = {"normal": MOST_BENT * doubt.normal_give or stated, "shear": MOST_BENT * doubt.shear_give}
+    # Pads of one hand are of one make: of what their stiffness is stated to be in doubt by, most is common.
+    common = min(s.pad_stiffness) * np.sqrt(1 - UNLIKE**2)
+    for axis, kind in (("x", "normal"), ("y", "shear")):
+        found, give = doubt.extra_sd(kind), getattr(doubt, f"{kind}_give")
+        admitted = 0.0 if give else common
+        both = max(found, UNSTATED if give else 0.0)
+        both = float(np.hypot(np.hypot(both, bends[kind]) if both else 0.0, admitted))
+        if both:
+            out.append(Nuisance(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis)))
+        for finger in (1, 2):
+            own = 0.0 if give else s.pad_stiffness[finger - 1]
+            sd = float(np.sqrt(own**2 - admitted**2 + (UNLIKE * max(found, give)) ** 2))
+            if sd > 0:
+                out.append(Nuisance(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis)))
+        if bends[kind] and any(n.name.startswith(f"pad_{kind}") for n in out):
+            usual = max(getattr(doubt, f"usual_{kind}"), 1e-3)
+            out.append(Nuisance(f"pad_{kind}_exponent", bends[kind], 1e-3, _bent_pads(axis, usual)))
+    if touch_sd > 0:
+        out.append(Nuisance("touch", touch_sd, 1e-5, _wider))
+    return tuple(out)
+
+
+ZERO_SHARE = 0.05  # limit: of the largest force: a zero that moves by less matters less than other errors
+
+# Slopes that show the pads, by their names in `Weights.slopes`: the channel they are of, whose samples.
+SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
+
+
+def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+    """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
+    values = channel_values(signals, rig)
+    out = []
+    for move in moves:
+        weights, counts = weighed.weights.grips[move], weighed.weights.counts[move]
+        means = {k: _mean(w, values[k], counts[k]) for k, w in weights.items()}
+        out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
+    return np.moveaxis(np.array(out), 2, 0)
+
+
+def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
+    """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where none."""
+    values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
+    for i, move in enumerate(moves):
+        for k, (name, (_, reading)) in enumerate(SLOPES.items()):
+            found = weighed.weights.slopes.get(move, {}).get(name)
+            if found is not None:
+                out[i, k] = found.weights @ np.nan_to_num(values[reading])
+    return out
+
+
+def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Variances (num_moves, len(SLOPES)) of slopes, infinite of none, and what they may be off by alike."""
+    found = [[weighed.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
+    variance = [[np.inf if s is None else s.variance for s in row] for row in found]
+    return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in found])
+
+
+def pad_doubt(
+    slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
+) -> PadDoubt:
+    """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, and usual forces.
+
+    `variance`, `alike`: as in `slope_variances`, of all trials. A share that several kinds of slope find is
+    that of the surest of them.
+    """
+    admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
+    found, possible, shared = {}, {DISTANCE: 0.0, RISE: 0.0}, {}
+    surest = {DISTANCE: (0.0, np.inf), RISE: (0.0, np.inf)}
+    for channel, stiffness in (
+        (DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness),
+    ):  # fmt: skip
+        stated = bool(np.isfinite(stiffness))
+        kinds = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
+        seen = np.isfinite(slopes[..., kinds])
+        mine = [values[..., kinds][seen] for values in (slopes, variance, alike)]
+        shared[channel] = shared_error(mine[2], mine[1])
+        found[channel] = (0.0, 0.0)
+        for k in kinds:
+            of_kind = np.isfinite(slopes[..., k])
+            one = [values[..., k][of_kind] for values in (slopes, variance, alike)]
+            apart = shared_error(one[2], one[1])
+            if one[0].size:
+                middle, error = middle_share(one[0], one[1], 0.0)
+                surest[channel] = min(surest[channel], (middle, float(np.hypot(error, apart))), key=sd_of)
+            said = misstated(one[0], one[1], stated, admitted if stated else 0.0, apart)
+            found[channel] = max(found[channel], said, key=lambda share_and_odds: share_and_odds[1])
+        if not stated:
+            possible[channel] = possible_share(mine[0], mine[1])
+    normal, shear = (
+        float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, weighed), strict=True)
+    )
+    # A width reads too small by the share of the give that the rig leaves out, a height too large.
+    return PadDoubt(
+        -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], normal, shear,
+        (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
+        seen=((-surest[DISTANCE][0], surest[DISTANCE][1]), surest[RISE]),
+    )  # fmt: skip
+
+
+def sd_of(found: tuple[float, float]) -> float:
+    """The second of a value and its standard deviation."""
+    return found[1]
+
+
+def _usual(weighed: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:
+    """Mean forces of one finger (num_moves,) along the grip, and in shear where the block is put down [N]."""
+    s, grips = weighed.signals, weighed.weights.grips.values()
+    along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
+    return np.array([np.mean(w["distance"] @ along) for w in grips]), np.array(
+        [abs(np.mean(w["place"] @ up)) for w in grips]
+    )
+
+
+def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    return np.where(counts > 0, weights @ np.nan_to_num(values), np.nan)
+
+
+def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
+    """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
+    out = []
+    with np.errstate(divide="ignore", invalid="ignore"):  # of a channel without readings
+        for move in moves:
+            part = {k: noise.variance[k] / n for k, n in weighed.weights.counts[move].items()}
+            out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
+    return np.moveaxis(np.array(out), 2, 0)
+
+
+def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
+    """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
+
+    Of a rise at least the give under the weight, and what it changed by in landing: what a pad does on
+    its way from one to the other need not cancel where contact forces balance.
+    """
+    force = np.abs(raw[..., FORCE]).mean(axis=1)
+    force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
+    grip, lever, landed = [], [], []
+    for a in weighed:
+        squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
+        grips = a.weights.grips.values()
+        grip.append([np.mean(w["distance"] @ squeeze) for w in grips])
+        place = [np.mean(w["place"] @ shear) for w in grips]
+        lever.append([p - np.mean(w["pickup"] @ shear) for p, w in zip(place, grips, strict=True)])
+        landed.append([abs(p - np.mean(w["force"] @ shear)) for p, w in zip(place, grips, strict=True)])
+    hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
+    rise = np.array(lever)
+    least = np.maximum(hanging, np.array(landed))
+    rise = np.where(rise < 0, -1.0, 1.0) * np.maximum(np.abs(rise), least)
+    return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
+
+
+def free_means(
+    weighed: Sequence[WeighedTrial], noise: Noise, free_steps: Sequence[int], rig: Rig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N].
+
+    A zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
+    the rig's own bias allow, is no better known in a grip than these stretches differ.
+    """
+    mean = np.stack([free_forces(a.signals, a) for a in weighed])
+    count = np.array([max(a.weights.free_count, 1.0) for a in weighed])
+    of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
+    variance = of_sample[None, :] / count[:, None]
+    moved = np.stack([_moved_zero(a, free_steps, of_sample, rig) for a in weighed])
+    return mean, variance + moved**2, moved.max(axis=0)
+
+
+def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
+    """How far (4,) [N] a free stretch's forces are from the mean of all, at most; 0 if by noise."""
+    out = np.zeros(len(FORCE_CHANNELS))
+    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.weights.free > 0) for k in free_steps]
+    for i, name in enumerate(FORCE_CHANNELS):
+        force = getattr(a.signals, name)
+        pieces = [force[span & np.isfinite(force)] for span in spans]
+        pieces = [piece for piece in pieces if piece.size >= MIN_FREE]
+        if len(pieces) < 2:
+            continue
+        middles = np.array([np.median(piece) for piece in pieces])
+        errors = np.sqrt(np.array([variance[i] / piece.size for piece in pieces]))
+        allowed = SURE * np.hypot(errors.max() + errors, rig.systematic.force_bias[i])
+        off = np.abs(middles - middles.mean())
+        if (off > allowed).any() and off.max() > ZERO_SHARE * float(np.nanmax(np.abs(force))):
+            out[i] = off.max()
+    return out
+
+
+def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
+    """Mean recorded rise [m] of the moves that should have none, where they were recorded."""
+    out = {}
+    for move, rise in rises.items():
+        recorded = raw[:, :, move, RISE]
+        recorded = recorded[np.isfinite(recorded)]
+        if not rise and recorded.size:
+            out[move] = float(recorded.mean())
+    return out
+
+
+def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
+    """Extra prior sd (4,) of force biases that free motion shows and the rig does not admit [N].
+
+    Forces in free motion should vanish; where their pooled mean is beyond 4 standard errors of
+    what noise and the rig's own [systematic] allow, the bias gets a prior as wide as itself.
+    """
+    precision = 1.0 / variance
+    pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
+    allowed = np.hypot(1.0 / np.sqrt(precision.sum(axis=0)), np.asarray(rig.systematic.force_bias))
+    return np.where(np.abs(pooled) > 4 * allowed, np.abs(pooled), 0.0)
 
 
 @dataclass(frozen=True)
@@ -61,7 +543,8 @@ class Design:
     `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
     free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
     that free motion shows and the rig does not admit, `doubt`: the like of the pads; `level_rises`: by
-    move between equal heights, the mean rise that was recorded [m].
+    move between equal heights, the mean rise that was recorded [m]; `moved` (4,): by how much the zeros
+    of forces move within a trial [N].
     """
 
     unknowns: tuple[Unknown, ...]
@@ -83,6 +566,7 @@ class Design:
     unexpected: tuple[Nuisance, ...] = ()
     doubt: PadDoubt = field(default_factory=PadDoubt)
     level_rises: dict[int, float] = field(default_factory=dict)
+    moved: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
@@ -119,8 +603,9 @@ def build(
     columns = coefficients_of(unknowns, objects, rises)  # M, 3, Q
     coefficients = np.repeat(np.repeat(columns[None, None], raw.shape[1], axis=1), len(trials), axis=0)
     coefficients[:, :, :, FORCE] *= np.swapaxes(factor, 1, 2)[..., None]
-    free_mean, free_variance = free_means(weighed, noise)
-    surprise = unexpected_bias(free_mean, free_variance, rig)
+    free_steps = [step.index for step in aligned.subtasks if step.state == FREE]
+    free_mean, free_variance, moved = free_means(weighed, noise, free_steps, rig)
+    surprise = np.maximum(unexpected_bias(free_mean, free_variance, rig), moved)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
     slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that tell no unknown
@@ -157,7 +642,7 @@ def build(
         slope=np.repeat([False, True], [where[0].size, steep[0].size]),
         free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
         scale_count=np.array(counts), slope_sd=doubt.slope_sd(),
-        unexpected=tuple(d for d in deviations if d.name in surprising),
+        unexpected=tuple(d for d in deviations if d.name in surprising), moved=moved,
         doubt=doubt, level_rises=level_rises(raw, rises),
     )  # fmt: skip
 

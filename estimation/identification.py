@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from estimation.actual import Actual
-from estimation.channel_noise import Noise
-from estimation.design import Design
-from estimation.doubtful_pads import designs, sample_either
-from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.observations import WeighedTrial, aligned_weights
-from estimation.predictive import PredictiveCheck, check
-from estimation.remarks import dense, misfits, soft_pads, unnamed, unrepeated, unstated_pads
-from estimation.rolling import without_roll
-from estimation.sampler import Draws
-from estimation.sliding import with_slides
-from estimation.summary import summary
-from estimation.tables import properties_table
-from estimation.unknowns import Unknown
+from estimation.checks import (
+    PredictiveCheck,
+    check,
+    dense,
+    force_scale,
+    misfits,
+    soft_pads,
+    uneven,
+    unnamed,
+    unrepeated,
+    unstated_pads,
+)
+from estimation.design import Design, Unknown
+from estimation.friction import FrictionPosterior, friction_posteriors
+from estimation.observations import Noise, WeighedTrial, aligned_weights, with_slides, without_roll
+from estimation.report import Actual, inference_data, properties_table, summary
+from estimation.sampler import Draws, designs, sample_either
 from hmmseg.contact.decompose import (
     ABOVE_GROUND,
     FREE,
@@ -32,12 +35,14 @@ from hmmseg.contact.decompose import (
     height_equations,
 )
 from hmmseg.errors import nearest
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
+
+LISTED = 3  # look: faults in a reason
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,19 +136,19 @@ class Identification(Tabled):
 
     def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None):
         """Every property with its 68 and 95 % interval, against measured values where given; the axes."""
-        from estimation.plot.estimates import draw_estimates
+        from estimation.plots import draw_estimates
 
         return draw_estimates(self.to_json()["properties"], actual, None if path is None else Path(path))
 
     def plot_posterior(self, actual: Actual | None = None, path: str | Path | None = None):
         """Corner plot of the joint posterior; its axes (num_properties, num_properties)."""
-        from estimation.plot.corner import draw_corner
+        from estimation.plots import draw_corner
 
         return draw_corner(self.draws, self.names, None if path is None else Path(path), actual)
 
     def plot_check(self, trial: int = 0, path: str | Path | None = None):
         """One trial's recorded samples in the band that the posterior predicts; the axes."""
-        from estimation.plot.predictive import draw_check
+        from estimation.plots import draw_check
 
         return draw_check(self, trial, None if path is None else Path(path))
 
@@ -154,14 +159,12 @@ class Identification(Tabled):
         return pd.DataFrame(self.draws, columns=[".".join(name) for name in self.names])
 
     def to_arviz(self):
-        """ArviZ InferenceData of the properties' posterior, dimensions (chain, draw)."""
-        import arviz
-
+        """The properties' posterior as ArviZ has it, dimensions (chain, draw)."""
         if self.sampled is None:
             raise ValueError("no property was determined, so there is no posterior")
         chain = self.sampled.chain
         names = [f"{obj}.{prop}" for obj, prop in (*self.names, *(u.name for u in self.combinations))]
-        return arviz.from_dict(posterior={name: chain[..., i] for i, name in enumerate(names)})
+        return inference_data({name: chain[..., i] for i, name in enumerate(names)})
 
 
 @double_precision
@@ -182,38 +185,75 @@ def identify_aligned(
         friction = {obj: FrictionPosterior(None, reason=hidden["friction"], ground=f.ground)
                     for obj, f in friction.items()}  # fmt: skip
     warnings, notes = misfits(aligned), []
-    sampled, predictive = None, None
+    sampled, predictive, scale = None, None, None
     reasons = _reasons(aligned, design, friction)
+    kept: list[int] = []
     if design.unknowns:
         found, sampled = sample_either(design, other, seed, progress)
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings
             notes += [*unrepeated(design), *unstated_pads(design)]
+            reasons |= untrusted(aligned, weighed, design, sampled)
+            kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
+            scale = None if aligned.late else force_scale(design.doubt, weighed, rig)
         if sampled.method != "emcee":
             warnings.append("the chain did not converge: intervals are of the weighted Laplace approximation")
         if not sampled.converged:
-            why = f"the sampler has not converged: ESS {sampled.ess:.0f}, R-hat {sampled.rhat:.3f}"
+            why = f"the sampler has not converged: {sampled.shortfall}"
             warnings.append(why)
             reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
-    kept = design.unknowns if sampled is not None and sampled.converged else ()
-    single = [u.single for u in kept]
+    unknowns = tuple(design.unknowns[i] for i in kept)
+    if sampled is not None:
+        sampled = replace(sampled, chain=sampled.chain[..., kept])
+        if scale is not None:
+            heavy = [i for i, u in enumerate(unknowns) if u.prop == "weight"]
+            sampled = replace(sampled, chain=scale.corrected(sampled.chain, heavy, rng))
+            warnings += [scale.remark()] * bool(heavy)
     draws = np.zeros((0, 0)) if sampled is None or not kept else sampled.flat
-    num = sum(single)  # singles come first
+    num = sum(u.single for u in unknowns)  # singles come first
     warnings += [
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
     ]
+    warnings += [
+        f"the zero of {name} moves by {size:.2g} N between stretches of free motion; intervals allow for it"
+        for name, size in zip(FORCE_CHANNELS, design.moved, strict=True) if size > 0
+    ]  # fmt: skip
+    warnings += list(dict.fromkeys(reason for reason in reasons.values() if reason.startswith("fx1 and")))
     warnings += soft_pads(design, rig)
     warnings += unnamed(aligned.task, design)
-    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(kept) if u.single}
+    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(unknowns) if u.single}
     warnings += dense(aligned.task, rig, means)
+    friction = {
+        k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
+    }
     return Identification(
-        aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in kept[:num]),
-        draws[:, :num], tuple(kept[num:]), draws[:, num:], sampled if kept else None,
-        {k: f for k, f in friction.items() if f.lower_bound is not None}, reasons, predictive,
-        tuple(warnings), tuple(notes),
+        aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
+        draws[:, :num], unknowns[num:], draws[:, num:], sampled if kept else None, friction, reasons,
+        predictive, tuple(warnings), tuple(notes),
     )  # fmt: skip
+
+
+def untrusted(
+    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design, sampled: Draws
+) -> dict[str, str]:
+    """Why properties that could be worked out are none: by `object.property`."""
+    out = {}
+    for i in sampled.impossible:
+        size = float(sampled.flat[:, i].mean())
+        name = ".".join(design.unknowns[i].name)
+        unit = UNITS[design.unknowns[i].prop]
+        text = f"{name} comes out at {size:.3g} {unit}, as no block has it: positions or rig.toml are off"
+        out |= dict.fromkeys(design.unknowns[i].properties, text)
+    objects = list(aligned.task.objects)
+    unlike = uneven(weighed)
+    if unlike is not None:
+        out |= {f"{obj}.{prop}": unlike for obj in objects for prop in ("weight", "width", "friction")}
+    blamed = {fault.line for t in aligned.trials for fault in t.trial.faults if fault.blames}
+    for line in blamed:
+        out |= {f"{obj}.{prop}": line for obj in objects for prop in ("width", "height")}
+    return out
 
 
 def source_subtasks(steps: tuple[Subtask, ...], task: BlockTask, obj: str, prop: str) -> list[str]:
@@ -252,4 +292,9 @@ def _not_recorded(aligned: AlignedTrials, obj: str, prop: str) -> str:
     needed = source_subtasks(aligned.subtasks, aligned.task, obj, prop)
     if not needed:
         return f"no subtask of this task lifts {obj}"
-    return f"the recording does not show {' and '.join(needed)} as the task has it"
+    missing = f"the recording does not show {' and '.join(needed)} as the task has it"
+    faults = [
+        f"{t.trial.file}: {fault.line}" for t in aligned.trials for fault in t.trial.faults if fault.spans
+    ]
+    more = f" and {len(faults) - LISTED} more" if len(faults) > LISTED else ""
+    return missing + (f" ({'; '.join(faults[:LISTED])}{more})" if faults else "")

@@ -9,29 +9,140 @@ Three observations a grip (the span from pickup to place of one move):
 
 Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2
 pooled over grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal
-1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask.
+1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask. A hand that
+rolls is read as if it were level, and blocks that slide in the grip lose what slid.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
-from estimation.channel_noise import Noise, channel_sds, learned
-from estimation.compliance import Slope
-from estimation.pad_slopes import slope_of_landing, slopes_within
+from estimation.pads import SLOPE_SD, UNSTATED, Slope, middle_share, slope_of_landing, slopes_within
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
+from hmmseg.hand.roll import with_roll
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.trial import ROLL
 from hmmseg.levels import TAIL
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.emissions import acceleration, thin
+from hmmseg.segmentation.posteriors import tilts
 from hmmseg.tables import Brief
+
+FARTHEST_LAG = 11  # numerics: samples; autocorrelations beyond are noise
+MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
+LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior
+# prior: samples that a stated noise is worth: it is off by a factor of two once in twenty
+STATED = 4.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of one effective sample and the number it was learned from.
+
+    Of each kind of mean of a grip ("force", "distance", "pickup", "place"), and of each force in
+    free motion by its name.
+    """
+
+    variance: dict[str, float]
+    count: dict[str, float]
+
+
+def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str, float]:
+    """Noise that the rig states of one sample behind each mean [N, m], the median; NaN where it states none.
+
+    Of a sensor in the wrist, whose fingers are made up, nothing is stated.
+    """
+    pads, out = pads_of(aligned.rig), dict[str, float]()
+    if any(one.trial.inertia is not None for one in aligned.trials):
+        return out
+    root2 = np.sqrt(2.0)
+    for s in signals:
+        rise = np.hypot(s.sd_y, s.sd_force * pads.shear1) / root2
+        sds = {
+            "force": np.full(1, root2 * s.sd_force),
+            "distance": root2 * np.hypot(s.sd_x, s.sd_force * pads.normal1),
+            "pickup": rise,
+            "place": rise,
+        }
+        for key, sd in sds.items():
+            known = sd[np.isfinite(sd)]
+            out[key] = max(out.get(key, 0.0), float(np.median(known)) if known.size else np.nan)
+    return out
+
+
+def learned(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
+    """Noise of each channel from residuals and their weights, pooled over grips.
+
+    `stated`: standard deviations of one sample, where they are known.
+    """
+    variance, count = {}, {}
+    for key, pairs in pooled.items():
+        pairs = [(r[np.isfinite(r)], w[np.isfinite(r)]) for r, w in pairs]
+        pairs = [(r, w) for r, w in pairs if r.size > 1]
+        if not pairs:
+            known = np.isfinite(stated.get(key, np.nan))
+            variance[key], count[key] = (stated[key] ** 2, STATED) if known else (scales[key] ** 2, 1.0)
+            continue
+        psi = np.concatenate([w * r for r, w in pairs])
+        z2 = np.concatenate([(r / scales[key]) ** 2 for r, _ in pairs])
+        slope = np.mean((TAIL + 1) * (TAIL - z2) / (TAIL + z2) ** 2)
+        # One location a grip was fitted: correct for the lost degrees of freedom.
+        lost = psi.size / max(psi.size - len(pairs), 1)
+        stretch = autocorrelation_time([w * r for r, w in pairs])
+        found = float(np.mean(psi**2) / slope**2 * lost * stretch)
+        variance[key] = max(found, LEAST**2)
+        count[key] = float(max(psi.size - len(pairs), 1) / stretch)
+        if variance[key] < stated.get(key, 0.0) ** 2:
+            total = STATED + count[key]
+            variance[key] = (STATED * stated[key] ** 2 + count[key] * variance[key]) / total
+            count[key] = total
+    return Noise(variance, count)
+
+
+def autocorrelation_time(series: list[np.ndarray]) -> float:
+    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
+
+    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of
+    lags (0, 1), (2, 3), ... up to the first pair that is not positive. Below 1 where successive
+    residuals cancel, as differentiated noise does. Series about their own mean are biased by
+    -1 / length, which is put back.
+    """
+    bias = len(series) / max(sum(r.size for r in series), 1)
+    power = sum(float(r @ r) for r in series)
+    size = sum(r.size for r in series)
+
+    def rho(lag: int) -> float:
+        if lag == 0:
+            return 1.0
+        pairs = sum(max(r.size - lag, 0) for r in series)
+        if pairs < 8 or power <= 0:
+            return 0.0
+        products = sum(float(r[lag:] @ r[: r.size - lag]) for r in series if r.size > lag)
+        return products / power * size / pairs + bias
+
+    total, lags = -1.0, 1
+    for lag in range(0, FARTHEST_LAG, 2):
+        pair = rho(lag) + rho(lag + 1)
+        # A pair counts only where it stands out of its own sampling noise.
+        if lag > 0 and pair <= 2 / np.sqrt(size):
+            break
+        total += 2 * pair
+        lags = lag + 1
+    # Estimated from few samples, the excess over white noise is mostly noise itself: its variance is
+    # about 4 / size a lag, and it is shrunk by that (positive-part James and Stein 1961).
+    excess = total - 1
+    if excess != 0 and size:
+        total = 1 + excess * max(0.0, 1 - 4 * lags / size / excess**2)
+    return max(total, MIN_STRETCH)
+
 
 CHANNELS = ("force", "distance", "rise")
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
@@ -227,3 +338,79 @@ def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: st
     if not residuals:
         return 1.0
     return max(robust_sd(np.concatenate(residuals)), 1e-9)
+
+
+# Of velocities only means are read, which a roll leaves alone.
+TURNED = ("x1", "y1", "x2", "y2", "fx1", "fy1", "fx2", "fy2")
+
+
+def without_roll(aligned: AlignedTrials) -> AlignedTrials:
+    """The same with what each carry shows of a roll taken out of trials and signals.
+
+    Trials whose roll was recorded are level as they were read.
+    """
+    return replace(aligned, trials=tuple(_levelled(trial, aligned) for trial in aligned.trials))
+
+
+def _levelled(trial: TrialAlignment, aligned: AlignedTrials) -> TrialAlignment:
+    s = trial.signals
+    if ROLL in trial.trial.channels or trial.trial.inertia is not None:
+        return trial  # a wrist's fingers are made up level
+    medians = [b.quantile(0.5) for b in trial.boundaries]
+    edges = np.maximum.accumulate([float(s.t[0]), *medians, float(s.t[-1])])
+    ends = list(pairwise(edges))
+    roll = np.zeros(s.t.size)
+    for inside, tilt, _ in tilts(s, pads_of(aligned.rig), ends, aligned.subtasks):
+        roll[inside] = np.nan_to_num(tilt)
+    if not roll.any():
+        return trial
+    level = with_roll(trial.trial, roll)
+    changed = {name: level.channels[name] for name in TURNED}
+    return replace(trial, trial=level, signals=replace(s, **changed))
+
+
+SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide
+WITNESSES = ("rise", "landing")
+
+
+def with_slides(weighed: Sequence[WeighedTrial], noise: Noise, rig: Rig) -> list[WeighedTrial]:
+    """The trials with places counting for less where their blocks slid; others as they are.
+
+    A landing in which a block slid is no witness of the pads any more.
+    """
+    readings = [np.nan_to_num(channel_values(a.signals, rig)["place"]) for a in weighed]
+    slopes = [
+        (float(found.weights @ reading), found.variance)
+        for a, reading in zip(weighed, readings, strict=True)
+        for of_move in a.weights.slopes.values()
+        for name, found in of_move.items()
+        if name in WITNESSES
+    ]
+    if not slopes:
+        return list(weighed)
+    stated = np.isfinite(rig.fingertip.shear_stiffness)
+    believed = max(rig.systematic.pad_stiffness) if stated else UNSTATED
+    shares, variances = np.array([(0.0, believed**2), *slopes]).T
+    common, _ = middle_share(shares, variances, SLOPE_SD)
+    return [
+        _doubted(a, reading, common, noise.variance["place"])
+        for a, reading in zip(weighed, readings, strict=True)
+    ]
+
+
+def _doubted(a: WeighedTrial, reading: np.ndarray, common: float, variance: float) -> WeighedTrial:
+    counts, slopes = dict(a.weights.counts), dict(a.weights.slopes)
+    for move, of_move in a.weights.slopes.items():
+        found = of_move.get("landing")
+        slid = 0.0 if found is None else _slid(found, float(found.weights @ reading), common)
+        if slid:
+            usual = counts[move]["place"]
+            counts[move] = counts[move] | {"place": usual / (1 + usual * slid**2 / variance)}
+            slopes[move] = {name: s for name, s in of_move.items() if name != "landing"}
+    return replace(a, weights=replace(a.weights, counts=counts, slopes=slopes))
+
+
+def _slid(found: Slope, share: float, common: float) -> float:
+    """How far [m] a landing went beyond what its pads gave; 0 where it need not have."""
+    doubt = float(np.sqrt(found.variance + (SLOPE_SD * max(abs(common), 1.0)) ** 2))
+    return (share - common) * found.change if abs(share - common) > SEEN * doubt else 0.0

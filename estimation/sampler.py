@@ -5,24 +5,95 @@ task. Most proposals are independent draws (`estimation.proposal`), the rest dif
 (ter Braak 2006), which frees walkers that it would hold in a tail. The chain is checked against the
 same proposal's importance-weighted draws, which owe nothing to the chain.
 experiments/benchmarks/moves.py compares them with emcee's stretch move.
+
+Draws where it is open whether the rig's pads are as it says: from both possibilities, by their odds.
+
+Slopes within a grip may contradict `[fingertip]` without proving it wrong (`compliance.misstated`). One
+design then believes the rig, another doubts it by as much as the slopes say; widths are drawn from the
+latter with the probability that the pads' give along the grip is wrong, heights with that of their shear.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import gammaln
 
 from estimation import priors
-from estimation.mode import Mode, find_mode
-from estimation.posterior import Posterior
-from estimation.proposal import Proposal, proposal
+from estimation.design import DISTANCE, RISE, Design, PadDoubt, build
+from estimation.observations import Noise, WeighedTrial
+from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode, posterior
+from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Brief
 
 if TYPE_CHECKING:
     import emcee
+
+
+TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
+WIDEN = 1.1  # numerics: of the Laplace covariance, likewise
+# numerics: share of proposals whose scatter is a t about its prior's median, heavier than any posterior
+FROM_PRIOR = 0.1
+STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its prior median)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Multivariate t of the noise scales: `mean` (3,), `chol` (3, 3); densities (3, G) of the scatters.
+
+    `cells` are probabilities of the grid's intervals, of width STEP from REACH[0] on.
+    """
+
+    mean: np.ndarray
+    chol: np.ndarray
+    cells: np.ndarray
+
+    def draw(self, num: int, random: np.random.RandomState) -> np.ndarray:
+        """Proposals (num, 6)."""
+        chi2 = random.chisquare(TAIL, size=(num, 1)) / TAIL
+        noise = self.mean + random.normal(size=(num, NUM_CHANNELS)) / np.sqrt(chi2) @ self.chol.T
+        cumulative = np.cumsum(self.cells, axis=1)
+        chosen = [np.searchsorted(row / row[-1], random.uniform(size=num)) for row in cumulative]
+        scatter = REACH[0] + STEP * (np.stack(chosen, axis=1) + random.uniform(size=(num, NUM_CHANNELS)))
+        prior = priors.SCATTER_LOG_SD * random.standard_t(TAIL, size=scatter.shape)
+        from_prior = random.uniform(size=scatter.shape) < FROM_PRIOR
+        return np.concatenate([noise, np.where(from_prior, prior, scatter)], axis=1)
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """Log density (num,) of proposing x (num, 6)."""
+        z = np.linalg.solve(self.chol, (x[:, :NUM_CHANNELS] - self.mean).T)
+        out = _log_student((z**2).sum(axis=0), TAIL, NUM_CHANNELS) - np.log(np.diag(self.chol)).sum()
+        scatter = x[:, NUM_CHANNELS:]
+        cell = np.floor((scatter - REACH[0]) / STEP).astype(int)
+        inside = (cell >= 0) & (cell < self.cells.shape[1])
+        drawn = self.cells[np.arange(NUM_CHANNELS), np.where(inside, cell, 0)] / STEP
+        z2 = (scatter / priors.SCATTER_LOG_SD) ** 2
+        prior = np.exp(_log_student(z2, TAIL, 1)) / priors.SCATTER_LOG_SD
+        return out + np.log((1 - FROM_PRIOR) * np.where(inside, drawn, 0.0) + FROM_PRIOR * prior).sum(axis=1)
+
+
+def proposal(post: Posterior, mode: Mode) -> Proposal:
+    """The proposal about a mode."""
+    middle = np.arange(REACH[0] + STEP / 2, REACH[1], STEP)
+    cells = []
+    for c in range(NUM_CHANNELS):
+        along = np.repeat(mode.scales[None], middle.size, axis=0)
+        along[:, NUM_CHANNELS + c] = middle
+        log_prob = post.log_prob(along)
+        cells.append(np.exp(log_prob - log_prob.max()))
+    noise = WIDEN * mode.covariance[:NUM_CHANNELS, :NUM_CHANNELS]
+    found = np.stack([row / row.sum() for row in cells])
+    return Proposal(mode.scales[:NUM_CHANNELS], np.linalg.cholesky(noise), found)
+
+
+def _log_student(z2: np.ndarray, tail: float, dim: int) -> np.ndarray:
+    """Log density of a t of unit scale in `dim` dimensions, from squared distances."""
+    constant = gammaln((tail + dim) / 2) - gammaln(tail / 2) - dim / 2 * np.log(tail * np.pi)
+    return constant - (tail + dim) / 2 * np.log1p(z2 / tail)
+
 
 INDEPENDENT = 0.9  # numerics: share of independence proposals
 WALKERS = 64  # numerics: of emcee
@@ -48,7 +119,7 @@ class Draws(Brief):
     `apart`: largest distance of the chain's mean scales from those of importance-weighted draws, in
     posterior sds; None where these are too few. `method`: "emcee", or "laplace" for those draws, which
     stand in where the chain did not converge. `prior_ess`: share of draws left effective by the
-    unknowns' priors.
+    unknowns' priors. `impossible`: unknowns whose every draw has a sign that no such property has.
     """
 
     scales: np.ndarray
@@ -62,6 +133,7 @@ class Draws(Brief):
     method: str
     prior_ess: float
     apart: float | None
+    impossible: tuple[int, ...] = ()
 
     @property
     def flat(self) -> np.ndarray:
@@ -69,10 +141,25 @@ class Draws(Brief):
         return self.chain.reshape(-1, self.chain.shape[-1])
 
     @property
+    def shortfall(self) -> str:
+        """The first criterion of convergence that fails, with its number; empty where none does."""
+        if self.ess < MIN_ESS:
+            return f"effective sample size of {self.ess:.0f}; {MIN_ESS:.0f} are needed"
+        if self.rhat > MAX_RHAT:
+            return f"R-hat of {self.rhat:.3f}; at most {MAX_RHAT:g} is allowed"
+        if self.apart is not None and self.apart > MAX_APART:
+            return (
+                f"means {self.apart:.2f} sd from those of independent draws; at most {MAX_APART:g} is allowed"
+            )
+        if self.prior_ess < MIN_EFFICIENCY:
+            shared = f"recording and priors have {self.prior_ess:.2%} of the draws in common"
+            return f"{shared}; at least {MIN_EFFICIENCY:.0%} are needed"
+        return ""
+
+    @property
     def converged(self) -> bool:
-        """Whether ESS and R-hat reach what this module asks for, priors taken in."""
-        agreed = self.apart is None or self.apart <= MAX_APART
-        return agreed and self.ess >= MIN_ESS and self.rhat <= MAX_RHAT and self.prior_ess >= MIN_EFFICIENCY
+        """Whether all criteria are met, priors taken in."""
+        return not self.shortfall
 
 
 def independence_move(independent: Proposal) -> emcee.moves.MHMove:
@@ -125,12 +212,12 @@ def sample(
             ess, rhat, method, apart = float(1 / (weight**2).sum()), 1.0, "laplace", None
     thin = max(chain.shape[0] * chain.shape[1] // KEPT, 1)
     scales = chain[:, thin - 1 :: thin]
-    rest, prior_ess = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
+    rest, prior_ess, impossible = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
     num, deviations = len(post.design.unknowns), len(post.design.nuisances)
     rest = rest.reshape(*scales.shape[:2], -1)
     return Draws(
         scales, rest[..., :num], rest[..., num : num + deviations], rest[..., num + deviations :],
-        ess, rhat, acceptance, steps, method, prior_ess, apart,
+        ess, rhat, acceptance, steps, method, prior_ess, apart, impossible,
     )  # fmt: skip
 
 
@@ -153,12 +240,13 @@ def _apart(chain: np.ndarray, drawn: np.ndarray, weight: np.ndarray) -> float:
 
 def draw_unknowns(
     post: Posterior, theta: np.ndarray, random: np.random.RandomState
-) -> tuple[np.ndarray, float]:
+) -> tuple[np.ndarray, float, tuple[int, ...]]:
     """Draws (W, Q + N + 6) of unknowns, deviations and common shares, one for each row of scales.
 
     They come from the conditional Gaussian, whose prior of the unknowns is flat, and are resampled
     by the unknowns' own prior (systematically, so order is kept). Also the share of draws that this
-    leaves effective: next to 1 where the recording decides.
+    leaves effective (next to 1 where the recording decides), and the unknowns of whose draws the prior allows
+    none: these stay as the recording has them.
     """
     parts = []
     for k in range(0, len(theta), BATCH):
@@ -167,14 +255,18 @@ def draw_unknowns(
         parts.append(mean + np.linalg.solve(np.swapaxes(chol, 1, 2), z[..., None])[..., 0])
     out = np.concatenate(parts)
     out[:, : post.reference.size] += post.reference
-    log_weight = np.zeros(len(out))
+    log_weight, impossible = np.zeros(len(out)), []
     for i, u in enumerate(post.design.unknowns):
-        log_weight += priors.log_prior(u.prop, np.array(list(u.terms.values())), out[:, i])
+        of_prior = priors.log_prior(u.prop, np.array(list(u.terms.values())), out[:, i])
+        if np.isfinite(of_prior).any():
+            log_weight += of_prior
+        else:
+            impossible.append(i)
     if not np.isfinite(log_weight).any():
-        return out, 0.0
+        return out, 0.0, tuple(impossible)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return out[_resampled(weight, random)], float(1 / (weight**2).sum() / len(weight))
+    return out[_resampled(weight, random)], float(1 / (weight**2).sum() / len(weight)), tuple(impossible)
 
 
 def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:
@@ -210,3 +302,50 @@ def split_rhat(chain: np.ndarray) -> float:
     within = parts.var(axis=1, ddof=1).mean(axis=0)
     between = parts.mean(axis=1).var(axis=0, ddof=1)
     return float(np.sqrt(np.max(1 + between / within)))
+
+
+CERTAIN = 0.99  # chosen: probability from which it is said, and taken for true, that the rig's pads are wrong
+
+
+def designs(
+    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise
+) -> tuple[Design, Design | None]:
+    """The likelier design, and the other one where it is open whether the rig's pads are right."""
+    found = build(aligned, weighed, noise)
+    if not found.unknowns or not any(0 < odds < CERTAIN for odds in found.doubt.odds):
+        return found, None
+    return found, build(aligned, weighed, noise, not found.doubt.doubted)
+
+
+def sample_either(
+    likelier: Design, other: Design | None, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> tuple[Posterior, Draws]:
+    """The likelier design's posterior and draws of its unknowns, mixed with the other's by their odds.
+
+    Scales, shares and deviations stay those of the likelier; the other is left out if it does not converge.
+    """
+    first = posterior(likelier)
+    found = sample(first, seed, progress)
+    if other is None or not found.converged:
+        return first, found
+    second = sample(posterior(other), seed)
+    return first, found if not second.converged else mixed(
+        found, second, [u.prop for u in likelier.unknowns], likelier.doubt, seed
+    )
+
+
+def mixed(likelier: Draws, other: Draws, props: Sequence[str], doubt: PadDoubt, seed: int) -> Draws:
+    """Draws of the likelier, those of each channel replaced by the other's with its probability.
+
+    `props`: of the unknowns; `doubt`: the likelier's.
+    """
+    rng, chain = np.random.default_rng([seed, 17]), likelier.chain.copy()
+    flat = chain.reshape(-1, chain.shape[-1])
+    instead = other.flat[rng.integers(len(other.flat), size=len(flat))]
+    for channel, odds in zip((DISTANCE, RISE), doubt.odds, strict=True):
+        wrong = 1.0 if odds >= CERTAIN else odds
+        swapped = rng.uniform(size=len(flat)) < (1 - wrong if doubt.doubted else wrong)
+        mine = np.array([priors.CHANNEL[prop] == channel for prop in props])
+        taken = swapped[:, None] & mine
+        flat[taken] = instead[taken]
+    return replace(likelier, chain=flat.reshape(chain.shape))

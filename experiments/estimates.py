@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from estimation.doubtful_pads import designs, sample_either
-from estimation.mode import find_mode
+from estimation.design import PROPERTIES
 from estimation.observations import aligned_weights
-from estimation.posterior import posterior
-from estimation.unknowns import PROPERTIES
+from estimation.posterior import find_mode, posterior
+from estimation.sampler import designs, sample_either
 from experiments.recordings import Case
 from experiments.scoring import boundaries_covered, boundary_residuals
 from hmmseg.segmentation.align import align

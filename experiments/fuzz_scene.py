@@ -53,7 +53,7 @@ class Scene:
 
     def read(self, name: str, path: Path) -> None:
         """Read a damaged file as its kind is read."""
-        from estimation.actual import read_actual
+        from estimation.report import read_actual
         from hmmseg.contact.decompose import decompose
         from hmmseg.io.inspect import inspect
         from hmmseg.io.rig import read_rig

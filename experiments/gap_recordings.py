@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from estimation.actual import read_actual
+from estimation.report import read_actual
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
 from hmmseg.segmentation.align import align

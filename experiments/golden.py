@@ -60,7 +60,7 @@ def identified(name: str) -> Json:
 
 def diagnosed(name: str) -> Json:
     """What `diagnose` finds on one folder of recordings/, its properties measured apart."""
-    from estimation.actual import read_actual
+    from estimation.report import read_actual
     from experiments.recordings import read_case
     from hmmseg.segmentation.align import align
     from simgap.gap.diagnose import diagnose

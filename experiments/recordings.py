@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from estimation.actual import read_actual
+from estimation.report import read_actual
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig, read_rig

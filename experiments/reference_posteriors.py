@@ -19,11 +19,8 @@ from typing import Any
 import emcee
 import numpy as np
 
-from estimation.density import log_density
-from estimation.mode import find_mode
-from estimation.posterior import Posterior, posterior
-from estimation.proposal import proposal
-from estimation.sampler import BURN_IN, WALKERS, draw_unknowns, effective_sample_size, sample
+from estimation.posterior import Posterior, find_mode, log_density, posterior
+from estimation.sampler import BURN_IN, WALKERS, draw_unknowns, effective_sample_size, proposal, sample
 from experiments.saving import save
 from experiments.sbc import design_of, drawn
 from hmmseg.jaxconfig import double_precision

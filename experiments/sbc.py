@@ -22,11 +22,9 @@ import numpy as np
 from scipy import stats
 
 from estimation import priors
-from estimation.design import Design
-from estimation.nuisance import Nuisance
+from estimation.design import PROPERTIES, Design, Nuisance, Unknown
 from estimation.posterior import posterior
 from estimation.sampler import sample
-from estimation.unknowns import PROPERTIES, Unknown
 from experiments.saving import save
 
 HERE = Path(__file__).parent

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from experiments.blind_check.tables import goals
 from experiments.blind_check.tables import table as check_table
 from experiments.table_text import load, markdown, percent
 
@@ -105,5 +106,11 @@ def fresh() -> dict[str, Any] | None:
 
 def blind() -> str | None:
     """docs/gap_results.md: the figures of the blind check."""
+    found = fresh()
+    return None if found is None else goals(found)
+
+
+def blind_by_circumstance() -> str | None:
+    """docs/tables/blind.csv: the same by circumstance, size and effect."""
     found = fresh()
     return None if found is None else check_table(found)

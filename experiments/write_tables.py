@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments import (
+    ablation,
     gap_arm,
     gap_drawn,
     patch_heldout,
@@ -102,6 +103,8 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
     ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
+    ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),
+    ("docs/tables/special_cases.csv", "", ablation.table, "ablation"),
     ("README.md", "alignment", table_speed.alignment, "bench"),
     ("docs/hmm.md", "hiro_network", hiro_network, "real"),
     ("docs/benchmarks.md", "alignment", table_speed.alignment, "bench"),

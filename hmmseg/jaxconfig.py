@@ -15,14 +15,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from hmmseg.cache import cache_folder, keep, kept
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def cache_folder() -> Path:
-    """The user's cache folder of this project, which may be yet to be made."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "hmmseg"
+class _Programs:
+    """Compiled programs in a folder, as JAX's compilation cache wants it. JAX's own would run what a garbled
+    file holds, and never replaces one that it cannot read."""
+
+    def __init__(self, folder: str) -> None:
+        self._path = Path(folder)
+
+    def get(self, key: str) -> bytes | None:
+        return kept(self._path / key)
+
+    def put(self, key: str, value: bytes) -> None:
+        keep(self._path / key, value)
 
 
 def configure(steady: bool = False) -> None:
@@ -37,8 +47,6 @@ def configure(steady: bool = False) -> None:
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_persistent_cache_min_entry_size_bytes": 0,
     }
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        settings["jax_compilation_cache_dir"] = str(cache_folder() / "jax")
     if steady:
         settings["jax_cpu_enable_async_dispatch"] = False
     for name, value in settings.items():  # what JAX reads when it is imported
@@ -46,6 +54,33 @@ def configure(steady: bool = False) -> None:
     if "jax" in sys.modules:
         for name, value in settings.items():
             sys.modules["jax"].config.update(name, value)
+    _configured.append(True)
+
+
+_configured: list[bool] = []
+
+
+def keep_programs() -> None:
+    """Have JAX keep compiled programs in our cache folder where `configure` has been called, once JAX is
+    imported; where its user has a folder for them, they go there."""
+    if _configured:
+        _keep_programs()
+
+
+@functools.cache
+def _keep_programs() -> None:
+    import jax
+
+    folder = cache_folder()
+    if folder is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return
+    try:
+        from jax._src import compilation_cache
+
+        compilation_cache.get_file_cache = lambda path: (_Programs(path), path)
+    except (ImportError, AttributeError):  # another JAX than those that this was tried with
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder / "programs"))
 
 
 def double_precision(function: Callable[P, R]) -> Callable[P, R]:
@@ -55,6 +90,7 @@ def double_precision(function: Callable[P, R]) -> Callable[P, R]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         import jax
 
+        keep_programs()
         if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
             return function(*args, **kwargs)
         with jax.enable_x64(True):

@@ -11,7 +11,7 @@ import logging
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -96,25 +96,57 @@ def segment_each(paths: Sequence[Path], task: Path, rig: Path) -> list[Segmented
 
 def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
-    advance: Callable[[int], None],
+    advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
     """What `segment_each` finds, in the order of the paths; `advance` is told how many more are done.
 
-    InputError where a recording or the cluster is at fault; what has not begun then is not begun.
+    A recording whose worker is lost is segmented again by itself; if that worker is lost too it is left out,
+    and `tell` is told. InputError where a recording or the cluster is at fault; what has not begun then is
+    not begun.
     """
-    given = [paths[i : i + CHUNK] for i in range(0, len(paths), CHUNK)]
+    left = [paths[i : i + CHUNK] for i in range(0, len(paths), CHUNK)]
     lab = task.absolute(), rig.absolute()
-    with _executor(workers, scheduler) as executor:
-        futures = [executor.submit(segment_each, [p.absolute() for p in part], *lab) for part in given]
-        try:
-            for part, future in zip(given, futures, strict=True):
-                found = future.result()
-                advance(len(part))
-                for path, each in zip(part, found, strict=True):
-                    yield replace(each, segmentation=replace(each.segmentation, file=str(path)))
-        finally:
-            for future in futures:
-                future.cancel()
+    while left:
+        with _executor(workers, scheduler) as executor:
+            futures = [executor.submit(segment_each, [p.absolute() for p in part], *lab) for part in left]
+            try:
+                while left:
+                    found: Sequence[Segmented | None] | None = _unless_lost(futures[-len(left)])
+                    part, lost = left.pop(0), found is None
+                    if found is None:
+                        tell(f"{part[0]}: its worker, or that of a recording near it, was lost; once more")
+                        found = [_alone(path, lab, tell) for path in part]
+                    advance(len(part))
+                    for path, each in zip(part, found, strict=True):
+                        if each is not None:
+                            yield replace(each, segmentation=replace(each.segmentation, file=str(path)))
+                    if lost:  # all of a pool is lost with one of its processes; a cluster may be gone
+                        scheduler = None
+                        break
+            finally:
+                for future in futures:
+                    future.cancel()
+
+
+def _alone(path: Path, lab: tuple[Path, Path], tell: Callable[[str], None]) -> Segmented | None:
+    """A recording segmented in a process of its own; None, which `tell` is told, where that is lost too."""
+    with _executor(1, None) as executor:
+        found = _unless_lost(executor.submit(segment_each, [path.absolute()], *lab))
+    if found is None:
+        tell(f"{path}: the process that segmented it was killed, twice; it is left out")
+    return None if found is None else found[0]
+
+
+def _unless_lost(future: Future) -> list[Segmented] | None:
+    """What a worker found; None where it was killed, or its cluster is gone."""
+    try:
+        return future.result()
+    except (BrokenExecutor, CancelledError):
+        return None
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] == "distributed":  # KilledWorker, CommClosedError, ...
+            return None
+        raise
 
 
 @contextmanager

@@ -8,6 +8,7 @@ together by `Output.finish`; a command that fails has written nothing.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json as jsonlib
 import math
@@ -15,16 +16,20 @@ import os
 import shutil
 import sys
 import tempfile
+import time
 import tomllib
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.segment import Segment
 from typer.core import TyperCommand, TyperGroup
 
 import hmmseg
+from hmmseg.cache import CacheWarning
 from hmmseg.errors import InputError
 from hmmseg.io.formats import KINDS, kind_of, parts_of, split_part
 
@@ -52,6 +57,8 @@ QuietOption = Annotated[bool, typer.Option(
     "--quiet", help="Print nothing but errors; warnings stand in the JSON.")]  # fmt: skip
 
 STANDARD_OUTPUT = "-"
+SCRATCH = "hmmseg-"  # how folders for temporary files begin
+YOUNG = 60.0  # numerics: s; a run that begins locks its folder long before
 INPUT_SUFFIXES = (*KINDS, ".toml")
 
 
@@ -121,8 +128,18 @@ class Output:
         self._side = _console(sys.stderr, quiet)
 
     def __enter__(self) -> Output:
-        self._folder = Path(self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="hmmseg-")))
+        self._folder = self._cleanup.enter_context(scratch())
         self._stdout = sys.stdout
+        self._cleanup.enter_context(warnings.catch_warnings())
+        usual = warnings.showwarning
+
+        def show(message: Any, category: Any, *where: Any) -> None:
+            if issubclass(category, CacheWarning):
+                self.warn(str(message))
+            else:
+                usual(message, category, *where)
+
+        warnings.showwarning = show
         if self.json == STANDARD_OUTPUT:  # a stray print must not spoil the document
             self._cleanup.enter_context(contextlib.redirect_stdout(sys.stderr))
         return self
@@ -136,12 +153,25 @@ class Output:
         `whole`: lines are not wrapped, as somebody copies them.
         """
         for renderable in renderables:
-            self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
+            with self._console.unless_lost():
+                self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
 
     def warn(self, text: str) -> None:
         """Keep a warning for the JSON document and show it on standard error."""
         self.warnings.append(text)
-        self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
+        with self._side.unless_lost():
+            self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
+
+    def write(self, text: str) -> None:
+        """Write to standard output as it is."""
+        with self._console.unless_lost():
+            self._stdout.write(text)
+            self._stdout.flush()
+
+    @property
+    def lost(self) -> str:
+        """Why nobody can be written to any more; empty where all is well."""
+        return self._console.lost
 
     @contextlib.contextmanager
     def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
@@ -165,7 +195,8 @@ class Output:
     def stage(self, destination: Path) -> Path:
         """Path to write to now; `finish` puts the file at its destination."""
         if destination not in self._staged:
-            self._staged[destination] = self._folder / f"{len(self._staged)}-{destination.name}"
+            kind = destination.suffix if len(destination.suffix) < 10 else ""  # names may be as long as any
+            self._staged[destination] = self._folder / f"{len(self._staged)}{kind}"
         return self._staged[destination]
 
     def finish(self, document: dict[str, Any]) -> None:
@@ -179,11 +210,15 @@ class Output:
         }
         text = strict_json({**envelope, **document})
         if self.json not in (None, STANDARD_OUTPUT):
-            self.stage(Path(self.json)).write_text(text, encoding="utf-8")
+            self.stage(Path(self.json)).write_bytes(text.encode("utf-8", "backslashreplace"))
         _publish(self._staged)
         if self.json == STANDARD_OUTPUT:
-            self._stdout.write(text)
-            self._stdout.flush()
+            self.write(text)
+        if self.lost:
+            kept = ", ".join(str(path) for path in self._staged)
+            raise InputError("standard output", f"cannot be written to ({self.lost})",
+                             "somebody who reads" + (f"; written all the same: {kept}" if kept else "")
+                             )  # fmt: skip
 
 
 def strict_json(document: Any) -> str:
@@ -228,7 +263,7 @@ def distinct_trials(paths: Sequence[Path]) -> list[Path]:
 def _digest(path: Path) -> str:
     if path.is_dir():
         return str(path.resolve())
-    with path.open("rb") as file:
+    with named(str(path)), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -293,11 +328,21 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
     return found
 
 
+@contextlib.contextmanager
+def named(where: str) -> Iterator[None]:
+    """Within it what the system refuses (a name too long, a disk that is gone) is an InputError."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise InputError(where, str(getattr(error, "strerror", None) or error), "a file or folder") from None
+
+
 def check_folder(option: str, folder: Path) -> None:
     """InputError unless files can be written into the folder, which may be yet to be made."""
     existing = folder.absolute()
-    while not existing.exists():
-        existing = existing.parent
+    with named(f"{option} {folder}"):
+        while not existing.exists():
+            existing = existing.parent
     if not existing.is_dir():
         raise InputError(f"{option} {folder}", f"{existing} is not a folder", "a folder")
     if not os.access(existing, os.W_OK | os.X_OK):
@@ -307,6 +352,8 @@ def check_folder(option: str, folder: Path) -> None:
 def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: Sequence[str] = ()) -> None:
     """InputError unless this file can be written; `suffixes` are its kinds, `refused` what it may not be."""
     where = f"{option} {path}"
+    with named(where), contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        path.lstat()
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(where, "unknown kind of file", " or ".join(suffixes))
     if path.suffix.lower() in refused:  # `--json TRIAL.csv`, its own operand forgotten
@@ -322,6 +369,7 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
 def _publish(staged: dict[Path, Path]) -> None:
     """Copy beside each destination first, then rename: nobody sees half a file, nor a copy after Ctrl-C."""
     beside: dict[Path, Path] = {}
+    destination = Path()
     try:
         for destination, source in staged.items():
             if destination.exists() and not destination.is_file():  # a pipe or device: no renaming onto it
@@ -329,30 +377,130 @@ def _publish(staged: dict[Path, Path]) -> None:
                 continue
             target = destination.resolve()
             target.parent.mkdir(parents=True, exist_ok=True)
-            beside[target] = target.with_name(f".{target.name}.{os.getpid()}")
+            beside[target] = target.with_name(f".hmmseg-{os.getpid()}-{len(beside)}")
             shutil.copyfile(source, beside[target])
         _put(beside)
     except OSError as error:
-        raise InputError(str(error.filename), f"cannot be written ({error.strerror})") from error
+        raise InputError(str(destination), f"cannot be written ({error.strerror})") from error
     finally:
         for temporary in beside.values():
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def _put(beside: dict[Path, Path]) -> None:
-    """Rename all; interrupted in between, the rest first: results are whole or not there."""
+    """Rename all. Interrupted in between, the rest first; refused, all is as it was before."""
     interrupted: KeyboardInterrupt | None = None
-    for target, temporary in beside.items():
-        try:
-            os.replace(temporary, target)
-        except KeyboardInterrupt as interrupt:
-            interrupted = interrupt
-            if temporary.exists():
+    before = {target: temporary.with_suffix(".old") for target, temporary in beside.items()}
+    try:
+        for target, old in before.items():
+            if len(beside) > 1 and target.exists():
+                shutil.copyfile(target, old)
+        for target, temporary in beside.items():
+            try:
                 os.replace(temporary, target)
+            except KeyboardInterrupt as interrupt:
+                interrupted = interrupt
+                if temporary.exists():
+                    os.replace(temporary, target)
+    except OSError:
+        for target, temporary in beside.items():
+            if before[target].exists():
+                os.replace(before[target], target)
+            elif not temporary.exists():
+                target.unlink(missing_ok=True)
+        raise
+    finally:
+        for old in before.values():
+            with contextlib.suppress(OSError):
+                old.unlink(missing_ok=True)
     if interrupted is not None:
         raise interrupted
 
 
-def _console(file: Any, quiet: bool) -> Console:
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder for this run alone. What a run that was killed left behind is taken away by the next one."""
+    try:
+        _sweep(Path(tempfile.gettempdir()))
+        folder = tempfile.TemporaryDirectory(prefix=SCRATCH, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise InputError("the folder for temporary files", f"cannot be used ({error.strerror})",
+                         "TMPDIR to name one that can be written to") from None  # fmt: skip
+    with folder as name:
+        path = Path(name)
+        with (path / "lock").open("w") as lock:
+            _locked(lock)
+            yield path
+
+
+def _sweep(where: Path) -> None:
+    """Take away folders of ours whose run is over: their lock is free. Young ones may not have theirs yet."""
+    for folder in where.glob(f"{SCRATCH}*"):
+        with contextlib.suppress(OSError):
+            if folder.is_symlink() or time.time() - folder.stat().st_mtime < YOUNG:
+                continue
+            lock = folder / "lock"
+            if lock.exists():
+                with lock.open("r+") as file:
+                    if not _locked(file):
+                        continue
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _locked(file: Any) -> bool:
+    """Whether the file is locked by us now; the lock is gone with its process. Without locks: never."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
+    except (ImportError, OSError):
+        return False
+
+
+class _Screen(Console):
+    """A console that shows no control characters of what it is given, and that may lose its reader."""
+
+    lost: str = ""  # why nothing can be written any more
+
+    def on_broken_pipe(self) -> None:  # rich's own ends the process
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control:
+                yield segment
+            else:
+                yield Segment(visible(segment.text), segment.style)
+
+    @contextlib.contextmanager
+    def unless_lost(self) -> Iterator[None]:
+        """Within it a reader that has gone, or a disk that is full, is noted, and nothing more is written."""
+        try:
+            yield
+        except OSError as error:
+            self.lost = self.lost or error.strerror or "it is closed"
+            self.quiet = True
+            discard(self.file)
+
+
+def discard(stream: Any) -> None:
+    """Let what is still in a stream's buffer go nowhere: it would be complained of when the process ends."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+CONTROL = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
+
+
+def visible(text: str) -> str:
+    """The text with control characters, escapes among them, as \\x1b: names of files may hold any."""
+    return text.translate(CONTROL)
+
+
+def _console(file: Any, quiet: bool) -> _Screen:
     width = None if file.isatty() or "COLUMNS" in os.environ else 120  # rich would fold a pipe at 80
-    return Console(file=file, quiet=quiet, width=width)
+    return _Screen(file=file, quiet=quiet, width=width)

@@ -60,8 +60,8 @@ AgainstOption = Annotated[list[Path] | None, typer.Option(
     "--against", metavar="SIM...", rich_help_panel=GIVEN,
     help="Simulated trials to compare with; a plain ordered task needs them.")]  # fmt: skip
 ModelFile = Annotated[Path | None, typer.Option(
-    "--model", metavar="M.npz", rich_help_panel=GIVEN,
-    help="Emissions of a plain ordered task, from hmmseg fit.")]  # fmt: skip
+    "--model", metavar="M", rich_help_panel=GIVEN,
+    help="Emissions (.npz) of a plain ordered task, by hmmseg fit; or as --mjcf.")]  # fmt: skip
 EffectOption = Annotated[list[str] | None, typer.Option(
     "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
 )]  # fmt: skip
@@ -110,6 +110,8 @@ def diagnose(
     """
     with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
+        if model is not None and mjcf is None and model.suffix.lower() != ".npz":
+            model, mjcf = None, model  # a robot's, not the emissions of a task
         own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
@@ -180,7 +182,7 @@ def run(
     healthy: Sequence[Path] = (),
 ) -> Diagnosis:
     """Diagnose, and put table, figures and page where `out` has them go."""
-    from estimation.actual import read_actual
+    from estimation.report import read_actual
     from hmmseg.segmentation.align import align
     from simgap.gap.diagnose import STAGES
     from simgap.gap.diagnose import diagnose as find

@@ -33,7 +33,7 @@ MjcfOption = Annotated[
         "--mjcf",
         metavar="XML",
         rich_help_panel="A robot against your own model of it",
-        help="Your own model, for MuJoCo; it needs --map.",
+        help="Your own model, as MuJoCo reads it; it needs --map.",
     ),
 ]
 MapOption = Annotated[
@@ -104,7 +104,11 @@ class OwnSimulator:
 
 
 def diagnose_robot(
-    out: Output, paths: Sequence[Path], own: OwnSimulator, task: Path | None, effect: Sequence[str]
+    out: Output,
+    paths: Sequence[Path],
+    own: OwnSimulator,
+    task: Path | None,
+    effect: Sequence[str],
 ) -> None:
     """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
     from simgap.progress import heard
@@ -132,9 +136,9 @@ def diagnose_robot(
         recordings = [loaded.read(path) for path in paths]
         at_risk, length = loaded.simulator, loaded.map.length
         inputs = [loaded.digest, *(name.encode() for name in own.candidates)]
-        more = loaded.effects(recordings)
         for warning in loaded.warnings:
             out.warn(warning)
+        more = loaded.effects(recordings)
     for recording in recordings:
         for warning in recording.warnings:
             out.warn(warning)
@@ -144,7 +148,10 @@ def diagnose_robot(
         from simgap.robots.task_phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
-    inputs += [*(path.read_bytes() for path in paths), b"" if task is None else task.read_bytes()]
+    inputs += [
+        *(path.read_bytes() for path in paths),
+        b"" if task is None else task.read_bytes(),
+    ]
     kept = kept_for([*inputs, repr((sorted(effect), out.seed)).encode()])
     if kept.begun:
         out.print("going on where an earlier run of this was interrupted")
@@ -174,13 +181,21 @@ def diagnose_robot(
                 out.warn("interrupted; the same command goes on from here")
             raise
     document = body(found)
-    out.print(sentence(document), *tables(document, found))
+    if own.mjcf is not None:
+        from simgap.simulators.mjcf.engine import warned
+
+        for line in warned():
+            out.warn(line)
+    left = document["remainder"]["rms_over_noise"]
+    out.print(sentence(document), f"What is left is {left:.3g} times the noise.", *tables(document, found))
     if out.figures is not None or out.report is not None:
         _draw(out, found, document)
     if own.patch is not None:
         from simgap.robots.patch import write_patch
 
-        write_patch(found, document, own.mjcf, lambda name: out.stage(own.patch / name))  # type: ignore[operator]
+        folder = own.patch
+        given = found.composed, found.linear.point, document, document["causes"], own.mjcf
+        write_patch(*given, lambda name: out.stage(folder / name))
         import json
 
         ranges, model = own.patch / "ranges.json", "" if own.mjcf is None else f" and {own.mjcf.name}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from estimation.tables import properties_table
+from estimation.report import properties_table
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli.console import (
@@ -61,7 +61,7 @@ def run(
     description = read_task(task)
     if not isinstance(description, BlockTask):
         raise InputError(str(task), "a plain ordered task has no blocks to identify", "objects and moves")
-    from estimation.actual import read_actual
+    from estimation.report import read_actual
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
 
@@ -75,7 +75,7 @@ def run(
         found = _bayes(out, recordings, description, hand)
         body, segmentations = found.to_json(), found.segmentations
     if measured is not None:
-        from estimation.actual import compare, disagreements
+        from estimation.report import compare, disagreements
 
         body["actual"] = compare(body["properties"], measured, hand.tolerance.property or 0.0)
         for line in disagreements(body["properties"], body["actual"]):
@@ -132,9 +132,7 @@ def _draw(
     body: dict[str, Any], found: Any, actual: Any,
 ) -> None:  # fmt: skip
     """Signals with subtasks a trial, estimates, and of a Bayesian result corner and predictive check."""
-    from estimation.plot.corner import draw_corner
-    from estimation.plot.estimates import draw_estimates
-    from estimation.plot.predictive import draw_check
+    from estimation.plots import draw_check, draw_corner, draw_estimates
     from hmmseg.plot.signals import draw_signals
 
     for i, (s, trial, segmentation) in enumerate(zip(signals, trials, segmentations, strict=True)):

@@ -34,7 +34,7 @@ class Live:
         self._kept: deque[tuple[float, float, float]] = deque(maxlen=WIDTH)
         self._notes: deque[str] = deque(maxlen=3)
         self._console = Console(stderr=True)
-        self._live = RichLive(console=self._console, auto_refresh=False, transient=False)
+        self._live = RichLive(console=self._console, auto_refresh=False, redirect_stdout=False)
         self._live.start()
         self._last: Answer | None = None
 

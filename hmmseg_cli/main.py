@@ -1,12 +1,14 @@
 """The `hmmseg` command and its exit codes.
 
 0: done, whatever was found. 2: the input is at fault; one line on standard error says where.
-Any other exception is a bug and shows its traceback.
+Any other exception is a bug and shows its traceback; what the machine refuses (memory, a disk) is not.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -17,9 +19,11 @@ import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
 from hmmseg_cli import (
+    calibrate,
     decompose,
     demo,
     diagnose,
+    doctor,
     effects,
     fit,
     identify,
@@ -30,7 +34,7 @@ from hmmseg_cli import (
     simulate,
     watch,
 )
-from hmmseg_cli.console import Grouped, Hmmseg
+from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
 from hmmseg_cli.interrupts import heard
 from hmmseg_cli.memory import keep_freed_memory
 
@@ -51,6 +55,7 @@ COMMANDS = {
         new.new: "hmmseg new my_hand --from trial_01.csv",
         inspect.inspect: "hmmseg inspect trial_01.csv",
         decompose.decompose: "hmmseg decompose task.toml",
+        doctor.doctor: "hmmseg doctor",
     },
     "When and what": {
         segment.segment: "hmmseg segment trial_*.csv --figures figures/",
@@ -59,6 +64,7 @@ COMMANDS = {
         fit.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
     },
     "Why simulation and recording differ": {
+        calibrate.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
         diagnose.diagnose: diagnose.EXAMPLES,
         effects.effects: "hmmseg effects",
     },
@@ -97,24 +103,49 @@ def main(args: Sequence[str] | None = None) -> int:
     gc.set_threshold(COLLECTED, *gc.get_threshold()[1:])
     keep_freed_memory()
     configure()
+    _open_streams()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
     command = typer.main.get_command(app)
     try:
         with heard():
-            return command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
+            code = command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
+            sys.stdout.flush()
+            return code
     except InputError as error:
         return _at_fault(str(error))
+    except MemoryError:
+        return _at_fault("hmmseg: there is not enough memory for this; expected shorter or fewer recordings")
+    except OSError as error:  # a disk that is full, a folder that is gone: the machine, not a bug
+        return _at_fault(f"{error.filename or 'standard output'}: {error.strerror or error}")
     except UsageError as error:
         context = getattr(error, "ctx", None)
         path = context.command_path if context else "hmmseg"
-        return _at_fault(f"{path}: {error.format_message()} (see {path} --help)")  # type: ignore[attr-defined]
+        said = error.format_message().partition("Traceback (most recent call last)")[0]  # type: ignore[attr-defined]
+        return _at_fault(f"{path}: {said.strip() or 'a value that cannot be read'} (see {path} --help)")
     except typer.Abort:
         return 130
 
 
 def _at_fault(line: str) -> int:
-    print(" ".join(line.split()), file=sys.stderr)
+    with contextlib.suppress(OSError, ValueError):
+        print(visible(" ".join(line.split())), file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        discard(sys.stdout)
     return 2
+
+
+def _open_streams() -> None:
+    """Streams that were closed refuse what is written to them; names that are no UTF-8 can be printed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, encoding="utf-8"))  # noqa: SIM115 - to read from alone
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: SIM115
 
 
 if __name__ == "__main__":

@@ -12,11 +12,9 @@ from typing import Any
 import jinja2
 
 import hmmseg
-from estimation.actual import Actual
 from estimation.identification import Identification
-from estimation.plot.corner import draw_corner
-from estimation.plot.estimates import draw_estimates
-from estimation.plot.predictive import draw_check
+from estimation.plots import draw_check, draw_corner, draw_estimates
+from estimation.report import Actual
 from hmmseg.hand.signals import Signals
 from hmmseg.io.trial import Trial
 from hmmseg.numbers import (

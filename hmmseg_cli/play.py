@@ -50,6 +50,7 @@ def play(
         chosen = blocks if effects is not None and effects != {} else properties
         effects = (effects or {}) | {name: effect_values(name) for name in effect or []}
         session = _session(chosen, task, rig, seed)
+        session.check_folder(output)
         out.print("preparing the blocks ...")
         if effects:
             session.beside(session.world_with(effects))

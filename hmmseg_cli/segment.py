@@ -134,12 +134,15 @@ def _segment_apart(
     """Each recording by itself, in other processes."""
     found = []
     with out.progress("segmenting", len(paths)) as advance:
-        for each in segment_apart(paths, task, rig, workers, scheduler, advance):
+        for each in segment_apart(paths, task, rig, workers, scheduler, advance, out.warn):
             for warning in each.warnings:
                 out.warn(warning)
             for note in each.notes:
                 out.print(note)
             found.append(each.segmentation)
+    if not found:
+        raise InputError(str(paths[0]), "the process that segmented it was killed, as of all others",
+                         "enough memory, or fewer --workers")  # fmt: skip
     return found
 
 

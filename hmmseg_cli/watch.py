@@ -51,7 +51,7 @@ def watch(
             from hmmseg_cli.live import Live
 
             show = Live(watcher, lines=not sys.stdout.isatty())
-        write = sys.stdout.write if show is None or show.lines else None
+        write = out.write if show is None or show.lines else None
         try:
             _follow(watcher, rows, write, show, skip_bad_rows, out)
         finally:
@@ -67,15 +67,13 @@ def watch(
         line = final.line(envelope)
         if write is not None:
             write(line + "\n")
-            sys.stdout.flush()
-        if destination is not None:
+        if destination is not None or out.lost:
             import json as jsonlib
 
             out.finish(jsonlib.loads(line))
 
 
 def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out: Output) -> None:
-    flush = sys.stdout.flush
     gc.collect()
     gc.freeze()
     gc.disable()  # nothing here makes cycles, and a collection would hold up a row
@@ -95,7 +93,8 @@ def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out
         answer = watcher.update(*row)
         if write is not None:
             write(answer.line() + "\n")
-            flush()
+            if out.lost and out.json is None:  # nobody reads, and there is nothing else to write
+                return
         if show is not None:
             show.update(answer)
 

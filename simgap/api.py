@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from estimation.actual import parse_actual, read_actual
 from estimation.identification import Identification
+from estimation.report import parse_actual, read_actual
 from hmmseg.api import Source, align, block_task
 from hmmseg.io.rig import Rig
 from hmmseg.segmentation.align import AlignedTrials

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import priors
-from estimation.design import Design
-from estimation.nuisance import Nuisance
-from estimation.unknowns import Unknown
+from estimation.design import Design, Nuisance, Unknown
 
 OBJECTS = ("left", "right")
 PROPS = ("weight", "width", "height")

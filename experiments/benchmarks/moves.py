@@ -18,16 +18,15 @@ import emcee
 import numpy as np
 
 from estimation.design import build
-from estimation.mode import Mode, find_mode
 from estimation.observations import aligned_weights
-from estimation.posterior import Posterior, posterior
-from estimation.proposal import proposal
+from estimation.posterior import Mode, Posterior, find_mode, posterior
 from estimation.sampler import (
     BURN_IN,
     INDEPENDENT,
     WALKERS,
     effective_sample_size,
     independence_move,
+    proposal,
     split_rhat,
 )
 from experiments.recordings import Case

@@ -41,7 +41,7 @@ def scales_optimistix(folder: Path) -> Solve:
     post.log_prob(np.zeros((1, 6)))  # its tables are part of the problem
 
     def climb() -> np.ndarray:
-        from estimation.mode import find_mode
+        from estimation.posterior import find_mode
 
         return find_mode(post).scales
 
@@ -60,7 +60,7 @@ def scales_scipy(folder: Path) -> Solve:
     def climb() -> np.ndarray:
         from scipy.optimize import minimize
 
-        from estimation.mode import start_of
+        from estimation.posterior import start_of
 
         found = minimize(lambda x: -float(post.log_prob(x[None])[0]), start_of(post), jac=gradient,
                          method="BFGS", options={"gtol": 1e-4}).x  # fmt: skip

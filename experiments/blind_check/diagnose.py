@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from estimation.actual import Actual, read_actual
+from estimation.report import Actual, read_actual
 from experiments.blind_check.sealing import code_digest
 from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig

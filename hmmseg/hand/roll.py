@@ -14,7 +14,7 @@ import numpy as np
 
 from hmmseg.contact.equations import rolled_offset, turned
 from hmmseg.errors import InputError
-from hmmseg.hand.pose import smooth
+from hmmseg.hand.tool import smooth
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.robust import bridged
 

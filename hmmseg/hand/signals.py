@@ -2,18 +2,50 @@
 
 Fingers are x1, y1, ... (left) and x2, y2, ... (right); the object sees their means and
 differences. Positions are the undeformed contact faces, forces what a fingertip exerts.
+
+Velocities that a drive makes of its own positions, and so come late.
+
+A drive without a tachometer gives v[k] = (x[k] - x[k-m]) / (t[k] - t[k-m]): the velocity of m / 2 samples
+ago, with the positions' own noise. At 20 Hz that is 25 ms, more than a contact change may be wrong by.
+
+Where a hand was while some of its coordinates are missing: interpolated, coordinate by coordinate.
+
+A height takes four link angles. Where two readings in five are missing, all four are there in one sample of
+eight, though each of them is known well enough from its neighbours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.hand.kinematics import forward, jacobian
+from hmmseg.io.plausibility import position_pairs
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import ROLL, Trial
+from hmmseg.robust import bridged
 from hmmseg.tables import Brief
+
+
+def group_size(rate: float, max_rate: float) -> int:
+    """How many samples at `rate` [Hz] become one at no more than `max_rate`."""
+    return int(np.ceil(rate / max_rate - 1e-6))
+
+
+def grouped(values: np.ndarray, group: int, width: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Means (M, ...) over each `group` of samples of values (N, ...), and how many values each is of.
+
+    Of a group only the first `width` samples count, all by default; what is left over at the end is left out,
+    and a mean of nothing is NaN.
+    """
+    width = group if width is None else width
+    starts = np.arange(0, len(values) - width + 1, group)
+    block = values[starts[:, None] + np.arange(width)]
+    there = np.isfinite(block)
+    count = there.sum(axis=1)
+    mean = np.where(there, block, 0.0).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count > 0, mean, np.nan), count
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,3 +184,85 @@ def central_differences(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, 
         neighbours = np.pad(t[there], 1, mode="edge")
         window[there] = neighbours[2:] - neighbours[:-2]
     return out, window
+
+
+SPAN = 0.01  # chosen: s; fingers change their speed over some hundredths of a second
+LONGEST = 4  # chosen: samples that such a difference spans at most
+# numerics: what rounding leaves, against what a velocity of its own differs by from any difference
+ALIKE = 0.1
+
+
+def timely(signals: Signals, trial: Trial, rig: Rig) -> Signals:
+    """The signals with central differences for velocities that are late differences of positions, or none."""
+    dead = any(not np.isfinite(trial.channels[rate]).any() for _, rate in position_pairs(trial))
+    return differenced(signals) if dead or come_late(trial, rig) else signals
+
+
+def come_late(trial: Trial, rig: Rig) -> bool:
+    """Whether a trial's velocities are late differences of its positions."""
+    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
+    rates = [f"d{n}" if rig.jointed else f"v{n}" for n in names]
+    pairs = [(trial.channels[n], trial.channels[r]) for n, r in zip(names, rates, strict=True)
+             if r in trial.channels]  # fmt: skip
+    return bool(pairs) and all(late_differences(trial.t, *pair) for pair in pairs)
+
+
+def differenced(signals: Signals) -> Signals:
+    """The signals with central differences of positions for velocities."""
+    made = {}
+    for axis in "xy":
+        for i in (1, 2):
+            made[f"v{axis}{i}"], window = central_differences(signals.t, getattr(signals, f"{axis}{i}"))
+        made[f"sd_v{axis}"] = np.sqrt(2.0) * getattr(signals, f"sd_{axis}") / window
+    return replace(signals, derived=True, **made)
+
+
+def late_differences(t: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> bool:
+    """Whether velocity (num_timesteps,) repeats the backward differences of position over some samples."""
+    central = _residual(velocity[1:-1], (position[2:] - position[:-2]) / (t[2:] - t[:-2]))
+    backward = [
+        _residual(velocity[m:], (position[m:] - position[:-m]) / (t[m:] - t[:-m]))
+        for m in range(1, min(LONGEST + 1, t.size - 1))
+    ]
+    return bool(backward) and bool(min(backward) < ALIKE * central)
+
+
+def one_sided(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rates (2, num_timesteps) of change just before and just after each sample, from that side alone.
+
+    A difference across a touch is of neither side. Each is the slope at the end of a parabola through
+    three readings SPAN apart, or a sample's interval. Also their noise over that of a reading [1/s].
+    """
+    there = np.isfinite(values)
+    h = max(SPAN, float(np.median(np.diff(t))))
+    noise = float(np.sqrt(1.5**2 + 2**2 + 0.5**2) / h)
+    if there.sum() < 2:
+        return np.full((2, t.size), np.nan), noise
+
+    def read(at: np.ndarray) -> np.ndarray:
+        return np.interp(at, t[there], values[there])
+
+    before = (1.5 * values - 2 * read(t - h) + 0.5 * read(t - 2 * h)) / h
+    after = (-1.5 * values + 2 * read(t + h) - 0.5 * read(t + 2 * h)) / h
+    return np.stack([before, after]), noise
+
+
+def _residual(velocity: np.ndarray, difference: np.ndarray) -> float:
+    """Mean absolute residual [m/s or rad/s], infinite of none."""
+    apart = np.abs(velocity - difference)
+    apart = apart[np.isfinite(apart)]
+    return float(apart.mean()) if apart.size else np.inf
+
+
+def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
+    """The signals with heights wherever coordinates can be interpolated over time.
+
+    Only for what a fraction of a hand's way decides: an interpolated height has an error of its own.
+    """
+    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("y1", "y2")
+    known = {name: np.isfinite(trial.channels[name]) for name in names}
+    if all(k.all() for k in known.values()) or not all(k.any() for k in known.values()):
+        return signals
+    filled = {name: bridged(trial.channels[name], trial.t) for name in names}
+    whole = task_space(replace(trial, channels=trial.channels | filled), rig)
+    return replace(signals, y1=whole.y1, y2=whole.y2, sd_y=whole.sd_y)

@@ -26,6 +26,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from hmmseg.jaxconfig import keep_programs
+
+keep_programs()
+
 NEVER = -jnp.inf  # physics: the logarithm of no weight
 BLOCK = 256  # numerics: rows that are searched together for where a path entered its state
 

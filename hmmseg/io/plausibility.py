@@ -144,7 +144,8 @@ def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
     """Positions in mm or cm (no hand travels so far), or far too small."""
     travels = {
         name: float(np.nanmax(values) - np.nanmin(values))
-        for name, values in trial.channels.items() if name in ("x1", "y1", "x2", "y2")
+        for name, values in trial.channels.items()
+        if name in ("x1", "y1", "x2", "y2") and np.isfinite(values).any()
     }  # fmt: skip
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
@@ -169,7 +170,8 @@ def length_unit(travel: float) -> tuple[str, str]:
 
 def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
     """Joint angles in degrees: no link winds twice around."""
-    joints = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
+    named = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
+    joints = [name for name in named if np.isfinite(trial.channels[name]).any()]
     widest = {name: float(np.nanmax(np.abs(trial.channels[name]))) for name in joints}
     wound = {name: value for name, value in widest.items() if value > WINDING}
     if not wound:
@@ -177,7 +179,7 @@ def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
     name, value = max(wound.items(), key=lambda item: item[1])
     unit = "deg" if value < 3600 else "mrad"
     changes = all_changed(joints, rig, unit=unit)
-    as_they = [f"d{each}" for each in joints if abs(_slope(trial, each, f"d{each}") - 1) < SAME]
+    as_they = [f"d{each}" for each in joints if abs(scale_to_velocity(trial, each, f"d{each}") - 1) < SAME]
     changes |= all_changed(as_they, rig, unit=f"{unit}/s")
     problem = f"reaches {value:.4g} rad, {value / 2 / np.pi:.0f} turns of a link: it looks like {unit}"
     return [Finding(name, problem, changes)]
@@ -187,8 +189,8 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
     """Velocities that are the positions' derivatives times a factor of units, or with the other sign."""
     factors = {"q": ((180 / np.pi, "deg/s"), (1e3, "mrad/s")), "x": ((1e3, "mm/s"), (1e2, "cm/s"))}
     found: dict[str, tuple[float, dict[str, object]]] = {}
-    for position, velocity in _pairs(trial):
-        slope = _slope(trial, position, velocity)
+    for position, velocity in position_pairs(trial):
+        slope = scale_to_velocity(trial, position, velocity)
         for factor, unit in factors["q" if position[0] == "q" else "x"]:
             if abs(slope / factor - 1) < SAME:
                 found[velocity] = slope, {"unit": unit}
@@ -214,13 +216,14 @@ def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
     return [Finding(names[0], problem, all_changed(names, rig, unit=unit), certain=False)]
 
 
-def _pairs(trial: Trial) -> list[tuple[str, str]]:
+def position_pairs(trial: Trial) -> list[tuple[str, str]]:
+    """Names of each position with its velocity, where both are recorded."""
     named = [(f"q{i}{j}", f"dq{i}{j}") for i in "12" for j in "12"]
     named += [(f"{axis}{i}", f"v{axis}{i}") for i in "12" for axis in "xy"]
     return [pair for pair in named if all(name in trial.channels for name in pair)]
 
 
-def _slope(trial: Trial, position: str, velocity: str) -> float:
+def scale_to_velocity(trial: Trial, position: str, velocity: str) -> float:
     """What integrated velocity is to displacement over windows in which the hand moves; nan if unclear.
 
     Windows make noise small beside displacement, as a difference of neighbours does not.

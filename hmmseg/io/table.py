@@ -10,6 +10,7 @@ import numpy as np
 from hmmseg.errors import InputError
 
 MAX_ROWS = 200_000_000  # numerics: more is a damaged or hostile file: 13 columns of it would be 20 GB
+MAX_COLUMNS = 20_000  # limit: no robot says so many; the arrays of each take kilobytes
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from hmmseg.io.schema import read_toml
 
 GROUND = "ground"
 RESERVED = (GROUND, "finger1", "finger2")
+MAX_MOVES = 2000  # limit: with repeats; what is computed grows with their square
 MAX_REPEAT = 1000  # limit: rounds; more is a slip of the pen
 
 
@@ -109,6 +110,8 @@ def _parse_sequence(table: dict[str, Any], where: str) -> SequenceTask:
     sequence = _names(table, "sequence", where)
     if not sequence:
         raise InputError(f"{where}: key sequence", "is empty", "at least one name")
+    if len(sequence) > MAX_MOVES:
+        raise InputError(f"{where}: key sequence", f"{len(sequence)} states", f"{MAX_MOVES} at most")
     for i, (a, b) in enumerate(itertools.pairwise(sequence)):
         if a == b:
             raise InputError(
@@ -143,6 +146,9 @@ def _parse_blocks(table: dict[str, Any], where: str) -> BlockTask:
                                 or not 1 <= repeat <= MAX_REPEAT):  # fmt: skip
         raise InputError(f"{where}: key repeat", f"found {repeat!r}",
                          f'a whole number from 1 to {MAX_REPEAT} or "unknown"')  # fmt: skip
+    if len(moves) * (1 if repeat == "unknown" else repeat) > MAX_MOVES:
+        raise InputError(f"{where}: key moves", f"{len(moves)} moves, repeat {repeat}",
+                         f'{MAX_MOVES} moves in all at most, or repeat = "unknown"')  # fmt: skip
     task = BlockTask(initial, tuple(_parse_move(i, m, where) for i, m in enumerate(moves, 1)), repeat)
     _check_moves(task, where)
     return task

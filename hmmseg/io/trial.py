@@ -55,6 +55,7 @@ class Trial(Tabled):
     timing: np.ndarray | None = None
     inertia: np.ndarray | None = None
     free: np.ndarray | None = None
+    faults: tuple[Any, ...] = ()
 
     @staticmethod
     def read(source: Any, rig: Any = None, task: Any = None) -> Trial:
@@ -124,8 +125,10 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
         return replace(trial, warnings=(*trial.warnings, *warnings))
     from hmmseg.hand.plausibility import check  # which read trials themselves
     from hmmseg.hand.roll import levelled
+    from hmmseg.hand.sensing import sensed
     from hmmseg.hand.wrist import from_halves, halved, two_fingers
 
+    trial = sensed(trial, rig)
     warnings = check(trial, rig)
     trial = levelled(trial)
     if rig.gripper is not None:

@@ -1,6 +1,6 @@
 """Grips of a parallel gripper while it closes: what its opening has shown so far, and what it leaves open.
 
-Off line a closing is read from both of its ends (`hmmseg.hand.opening`). While it happens, a touch shows only
+Off line a closing is read from both of its ends (`hmmseg.hand.wrist`). While it happens, a touch shows only
 once the gripper stands, some tens of milliseconds after it; until then nobody knows whether samples since
 it slowed down were of a grip. Those are held back.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hmmseg.hand.opening import LEAST_CLOSING, SLOWED, STEP, Grip, grip_of
+from hmmseg.hand.wrist import LEAST_CLOSING, SLOWED, STEP, Grip, grip_of
 from hmmseg.robust import NORMAL
 
 STAND = 0.1  # chosen: s of next to no motion: the gripper stands

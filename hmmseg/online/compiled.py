@@ -9,22 +9,47 @@ from __future__ import annotations
 import hashlib
 import inspect
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hmmseg.jaxconfig import cache_folder
+from hmmseg.cache import cache_folder
 
-if "numba" not in sys.modules and "NUMBA_CACHE_DIR" not in os.environ:
+FOLDER = cache_folder()
+if FOLDER is not None and "numba" not in sys.modules and "NUMBA_CACHE_DIR" not in os.environ:
     # Numba notices a change of a function's own file alone: a folder for each state of these files.
     digest = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py"))))
-    os.environ["NUMBA_CACHE_DIR"] = str(cache_folder() / "numba" / digest.hexdigest()[:16])
+    os.environ["NUMBA_CACHE_DIR"] = str(FOLDER / "numba" / digest.hexdigest()[:16])
 
-import numba
+import numba  # noqa: E402
 
 
 def compiled(function: Callable) -> Any:
     """`function` compiled at its first call, without the interpreter's lock."""
     function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
-    return numba.njit(function, cache=bool(numba.config.CACHE_DIR), nogil=True, error_model="numpy")  # type: ignore[attr-defined]
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    try:
+        made = numba.njit(function, cache=bool(numba.config.CACHE_DIR), **options)  # type: ignore[attr-defined]
+    except (RuntimeError, OSError):  # no folder that could be written to
+        return numba.njit(function, **options)
+    cache = getattr(made, "_cache", None)
+    for name in ("load_overload", "save_overload"):
+        if hasattr(cache, name):
+            setattr(cache, name, _or_nothing(getattr(cache, name)))
+    return made
+
+
+def _or_nothing(of_cache: Callable) -> Callable:
+    """What a cache does, or nothing where its files are not as they were written or cannot be."""
+
+    def tried(*args: Any) -> Any:
+        try:
+            return of_cache(*args)
+        except Exception:
+            if FOLDER is not None:  # numba would find them again at every start
+                shutil.rmtree(FOLDER / "numba", ignore_errors=True)
+            return None
+
+    return tried

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hmmseg.hand.carried import TOGETHER
+from hmmseg.hand.wrist import TOGETHER
 from hmmseg.levels import MOVED, SURE
 from hmmseg.robust import robust_sd
 

@@ -15,12 +15,8 @@ from collections import deque
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.carried import TOGETHER, give_of, grip_force_of
-from hmmseg.hand.gripper_signs import lifts_pull
-from hmmseg.hand.opening import Grip
-from hmmseg.hand.pose import WINDOW, Pose, pose_of
-from hmmseg.hand.tool import FreeMotion, Tool, applied_force, free_motion, tool_of
-from hmmseg.hand.wrist import as_fingers
+from hmmseg.hand.tool import WINDOW, FreeMotion, Pose, Tool, applied_force, free_motion, pose_of, tool_of
+from hmmseg.hand.wrist import TOGETHER, Grip, as_fingers, give_of, grip_force_of, lifts_pull
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
 from hmmseg.online.closing import Closings

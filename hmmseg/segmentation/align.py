@@ -16,9 +16,7 @@ import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
 from hmmseg.contact.equations import block_width
-from hmmseg.hand.bridging import with_heights
-from hmmseg.hand.rates import timely
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -85,6 +83,7 @@ class Pool:
     changes: list[list[Change | None]] = field(default_factory=list)
     disagreement: dict[tuple[Kind, int], Disagreement] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    late: bool = False
 
 
 def pooled(
@@ -106,7 +105,7 @@ def pooled(
         return readings, fitted, sense(fine, paths, steps, fitted.parameters, rig, again)
 
     readings, fitted, sensing = once(recordings, again=False)
-    remarks = sensing.remarks(rig)
+    remarks, late = sensing.remarks(rig), sensing.late
     if sensing.late:
         readings, fitted, again = once([read_again(s, sensing) for s in recordings], again=True)
         remarks = replace(again, late=True, filter=sensing.filter, delay=sensing.delay).remarks(rig)
@@ -116,7 +115,7 @@ def pooled(
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)
     ]
     disagreement = disagreements([c for own in changes for c in own if c is not None])
-    return Pool(readings, fitted, sensing, changes, disagreement, remarks)
+    return Pool(readings, fitted, sensing, changes, disagreement, remarks, late)
 
 
 def unfitted(recordings: Sequence[Signals], parameters: Parameters, rig: Rig, taps: Sequence[Spans]) -> Pool:
@@ -138,7 +137,7 @@ class Piece:
     """One round of one recording (of a task done once: all of it), aligned.
 
     `first`, `last` [s] are its ends; `failed` counts subtasks from its own first. `remarks`: what was done
-    beside the task.
+    in addition to the task.
     """
 
     boundaries: tuple[BoundaryPosterior, ...]
@@ -346,7 +345,7 @@ class AlignedTrials(Tabled):
     """All trials of one task; those that fit it are aligned together by one fit.
 
     `fit` pools the trials, or the rounds of a repeated task, that fit, in order; without any it has no
-    posteriors.
+    posteriors. `late`: forces come later than positions by their sensor's doing.
     """
 
     task: BlockTask
@@ -354,6 +353,7 @@ class AlignedTrials(Tabled):
     subtasks: tuple[Subtask, ...]
     fit: Fit
     trials: tuple[TrialAlignment, ...]
+    late: bool = False
 
     @property
     def segmentations(self) -> list[Segmentation]:
@@ -415,7 +415,7 @@ def align(
         trial_alignments.append(
             TrialAlignment(trial, s, thinned, features(thinned, rig), boundaries, segmentation, present)
         )
-    return AlignedTrials(done, rig, steps, pool.fit, tuple(trial_alignments))
+    return AlignedTrials(done, rig, steps, pool.fit, tuple(trial_alignments), pool.late)
 
 
 def segment(trials: Sequence[Trial], task: BlockTask, rig: Rig) -> list[Segmentation]:

@@ -265,10 +265,10 @@ def _discrepancy(changes: Sequence[Change]) -> float:
     for change in changes:
         for c, interval in zip(change.contacts, change.intervals, strict=True):
             n = interval + change.making
-            beside = slice(n, n + 2) if change.making else slice(max(n - 1, 0), n + 1)
-            sure = np.flatnonzero(c.pressed[beside] > SURE * c.sd_pressed)
+            near = slice(n, n + 2) if change.making else slice(max(n - 1, 0), n + 1)
+            sure = np.flatnonzero(c.pressed[near] > SURE * c.sd_pressed)
             if sure.size:
-                i = beside.start + (sure[0] if change.making else sure[-1])
+                i = near.start + (sure[0] if change.making else sure[-1])
                 apart = c.place[i] - (0.0 if c.hidden else c.pressed[i])
                 if np.isfinite(apart):
                     found.append((float(apart), c.sd_place))

@@ -74,7 +74,8 @@ def settled(
     every = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
     every[:, -1] = table
     every[:, :-1] = _settling_table(table, index, free)[:, None]
-    for i, c in enumerate(columns):  # a block is let go by fingers that open; a path that leaves may lose it
+    # A block is released by fingers that open; a path that leaves may lose it.
+    for i, c in enumerate(columns):
         if c is not None and i > 0 and free.states[c][0] == FREE:
             every[:, 0, i] += free.opened[: len(table)]
     model = _settling(log_initial, log_transition, stages, settle)
@@ -134,7 +135,7 @@ def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) 
 
     Fingers and block ring for a while after any contact change. What the forces of a ringing sample
     do says which block is held, but not how: every hold of it scores as the likeliest of them. Fingers that
-    have just let go ring in the air.
+    have just released a block ring in the air.
     """
     out = table.copy()
     blocks = np.array([-1 if block is None else block for _, block in free.states])

@@ -28,8 +28,7 @@ from scipy.special import gammaln
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
-from hmmseg.hand.grouping import group_size, grouped
-from hmmseg.hand.signals import Signals
+from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.robust import white_sd

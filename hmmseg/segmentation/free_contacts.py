@@ -167,7 +167,7 @@ def astride(
     None where nothing was. `press` (num_timesteps, 2): what each finger presses inwards with [N] at t [s],
     `sd_force` its noise; `apart` (num_timesteps,): width [m] of what is between them, if anything. The block
     is `width` [m] wide and is touched at `touch` [s]. Fingers that press no more for longer than an impact
-    have let go meanwhile: what they did before belongs to no closing.
+    have released it meanwhile: what they did before belongs to no closing.
     """
     pressed = press > SURE * sd_force
     n = int(np.searchsorted(t, touch))
@@ -192,7 +192,7 @@ def _lasting(found: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
 CLOSED = (
-    1e-3  # prior: share of blocks let go where they stand by fingers that slide off them, without opening
+    1e-3  # prior: share of blocks released where they stand by fingers that slide off them, without opening
 )
 RINGING = 0.1  # prior: share of samples that ring while a contact settles
 ROUNDS = 8  # numerics: of an iteration that settles sooner
@@ -213,7 +213,7 @@ class FreeContacts:
     Samples are `interval` s apart; `ringing` (num_timesteps,): log-likelihoods of free motion just after a
     contact. A state is (contact state, number of its block in `blocks`; None in
     free motion); `path` (num_timesteps,) is the most probable sequence of states. `opened` (num_timesteps,):
-    log-likelihoods of how far apart the fingers are, if they just let go of a block that stays where it is.
+    log-likelihoods of how far apart the fingers are, if they just released a block that stays where it is.
     `taps` [s] are touches of a block before its grip: to the path they are free motion, in the table they say
     nothing.
     """
@@ -328,7 +328,7 @@ def _unweighed(states: States, path: np.ndarray, blocks: tuple[Block, ...]) -> t
 def _opened(
     f: Features, states: tuple[tuple[str, int | None], ...], path: np.ndarray, bias: np.ndarray
 ) -> np.ndarray:
-    """Log-likelihoods (num_timesteps,) of the fingers' distance, if they let go of what stays between them.
+    """Log-likelihoods (num_timesteps,) of the fingers' distance, if they release what stays between them.
 
     Pads that come off a block have been relaxed first: fingers are as far apart as it is wide. Where they are
     no farther apart than while they held it, it has left them. Half of what pads give by the rig is enough,

@@ -68,7 +68,7 @@ SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recordin
 
 @dataclass(frozen=True)
 class Squeeze:
-    """One grip on a block at rest with the free motion beside it, arrays (N,).
+    """One grip on a block at rest with the free motion before and after it, arrays (N,).
 
     Times t [s], the fingers' distance [m] and its rate [m/s], the summed grip `load` [N], NaN where one
     finger presses alone, and their noise.
@@ -204,12 +204,12 @@ RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force 
 SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after all
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
 BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
-REACH = 0.4  # numerics: s; free motion beside a hold that is looked at: the longest delay, and a touch
+REACH = 0.4  # numerics: s; free motion before and after a hold that is used: the longest delay, and a touch
 FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays below what counts as one
 LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
 LATE = 0.01  # chosen: s; a longer delay is the sensor's
 DECISIVE = 15.0  # chosen: nats for a longer delay against none; its prior probability is about exp(-5)
-LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be asked
+LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 SLIDING = 0.9  # chosen: quantile of the steepest ratios of forces of all contacts that is friction's
@@ -221,7 +221,7 @@ ENOUGH = 24  # chosen: stretches that tell a delay
 class Compliance:
     """Compliance [m/N], its standard deviation, and the share by which one contact may differ from it.
 
-    `toe` is what contacts give beside it when they are hardly pressed.
+    `toe` is what contacts give in addition when they are hardly pressed.
     """
 
     value: float
@@ -342,7 +342,7 @@ def sense(
                 ratios += steepest(s, start, end, parameters)
                 rings += ringing(s, start, end, parameters)
                 if not again:
-                    squeezes.append(squeeze(s, *_beside(t, path, steps, step.index), parameters))
+                    squeezes.append(squeeze(s, *_with_free_motion(t, path, steps, step.index), parameters))
     rung = np.quantile(rings, LOUD, axis=0) if rings else np.zeros(3)
     squeezes = [q and replace(q, sd_load=float(np.hypot(q.sd_load, rung[2]))) for q in squeezes]
     nominal = pads_of(rig)
@@ -381,12 +381,14 @@ def _prior(compliance: float, stated: float) -> tuple[float, float]:
     return compliance, (stated or STIFFNESS_SD) * compliance if compliance > 0 else SOFT
 
 
-def _beside(t: np.ndarray, path: np.ndarray, steps: Sequence[Subtask], index: int) -> tuple[float, float]:
-    """Ends [s] of a hold with the free motion beside it: a touch may be earlier than its forces."""
+def _with_free_motion(
+    t: np.ndarray, path: np.ndarray, steps: Sequence[Subtask], index: int
+) -> tuple[float, float]:
+    """Ends [s] of a hold with the adjacent free motion: a touch may be earlier than its forces."""
     ends = []
-    for beside, end, way in ((index - 1, 0, -1), (index + 1, -1, 1)):
+    for adjacent, end, way in ((index - 1, 0, -1), (index + 1, -1, 1)):
         near = float(t[np.flatnonzero(path == index)[end]])
-        free = t[path == beside] if 0 <= beside < len(steps) and steps[beside].state == FREE else t[:0]
+        free = t[path == adjacent] if 0 <= adjacent < len(steps) and steps[adjacent].state == FREE else t[:0]
         far = near + way * REACH
         ends.append(float(np.clip(far, free[0], free[-1])) if free.size else near)
     return ends[0], ends[1]

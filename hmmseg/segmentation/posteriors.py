@@ -13,9 +13,8 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import Pads, block_offset, block_y, corner_drop, hanging
-from hmmseg.hand.rates import one_sided
 from hmmseg.hand.roll import slow_roll
-from hmmseg.hand.signals import Signals, central_differences
+from hmmseg.hand.signals import Signals, central_differences, one_sided
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
@@ -331,7 +330,7 @@ def nearest_touch(touches: Touches, found: BoundaryPosterior) -> BoundaryPosteri
 def _held_side(
     t: np.ndarray, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
 ) -> tuple[float, float]:
-    """Stretch [s] nearest to interval n of the subtask that rests on the ground beside it."""
+    """Stretch [s] nearest to interval n of the subtask that rests on the ground, before or after it."""
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
     if after:

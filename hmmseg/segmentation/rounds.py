@@ -16,9 +16,7 @@ from typing import Protocol, overload, runtime_checkable
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
-from hmmseg.hand.grouping import group_size
-from hmmseg.hand.rates import come_late, differenced
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import Signals, come_late, differenced, group_size, task_space
 from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -60,7 +58,7 @@ class InMemory:
 
 
 class OnDisk:
-    """Signals read anew whenever they are asked for.
+    """Signals read anew at each access.
 
     Whether velocities come late is judged by its beginning: a drive does not change its habits.
     """
@@ -102,7 +100,7 @@ class OnDisk:
 
 
 class Parts(Sequence[Signals]):
-    """Parts of recordings, read whenever one is asked for."""
+    """Parts of recordings, read at each access."""
 
     def __init__(self, parts: Sequence[tuple[Recorded, slice]]) -> None:
         self.parts = list(parts)

@@ -100,7 +100,7 @@ def label_states(
 def agreement(labels: StateLabels, steps: tuple[Subtask, ...]) -> np.ndarray:
     """Whether each sample shows each subtask's state, bool (num_timesteps, num_subtasks).
 
-    Sliding counts as hold on ground, except beside a slide, from which it must be told apart.
+    Sliding counts as hold on ground, except next to a slide, from which it must be distinguished.
     """
     slid = {step.move for step in steps if step.state == SLIDING}
     columns = []

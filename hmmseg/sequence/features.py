@@ -16,6 +16,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
 
 CELLS_PER_TRIAL = 1500  # numerics: resolves a boundary to under 0.1 % of a trial's duration
+FEWEST = 20  # numerics: changes of a channel; of fewer nothing is said of its rate
 SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's duration
 
 
@@ -42,6 +43,19 @@ class SequenceFeatures:
     values: np.ndarray
 
 
+def without_old(values: np.ndarray) -> np.ndarray:
+    """A channel (num_timesteps,) whose repeated readings are missing (NaN), where it is read at a lower rate.
+
+    So it is where no two neighbours both change: what comes between two readings is the last one again.
+    """
+    changes = np.flatnonzero(np.diff(values) != 0) + 1
+    if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
+        return values
+    begun = np.concatenate([[0], changes])
+    since = np.arange(values.size) - begun[np.searchsorted(begun, np.arange(values.size), side="right") - 1]
+    return np.where(since % period == 0, values, np.nan)
+
+
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
     """Edges (num_cells + 1,) and mean of each channel (num_cells, num_channels), NaN in empty cells.
 
@@ -50,25 +64,17 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     for name in channels:
         if name not in trial.channels:
             raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")
-    start = float(trial.t[0])
+    start = float(trial.t[0] - 0.5 / trial.rate)  # a change lies anywhere between two samples
     num_cells = max(int(np.ceil((trial.t[-1] - start) / step * (1 - 1e-9))), 1)
     cell = np.minimum(((trial.t - start) / step).astype(int), num_cells - 1)
     means = np.full((num_cells, len(channels)), np.nan)
     for j, name in enumerate(channels):
-        x = trial.channels[name]
+        x = without_old(trial.channels[name])
         finite = np.isfinite(x)
         count = np.bincount(cell[finite], minlength=num_cells)
         total = np.bincount(cell[finite], x[finite], minlength=num_cells)
         means[count > 0, j] = total[count > 0] / count[count > 0]
     return start + step * np.arange(num_cells + 1), means
-
-
-def _moving_average(x: np.ndarray, window: int) -> np.ndarray:
-    """Centred average over `window` cells along axis 0, shorter at the ends."""
-    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, 0)])
-    index = np.arange(len(x))
-    low, high = np.maximum(index - window // 2, 0), np.minimum(index + window // 2 + 1, len(x))
-    return (total[high] - total[low]) / (high - low)[:, None]
 
 
 def filled(x: np.ndarray) -> np.ndarray:
@@ -82,10 +88,30 @@ def filled(x: np.ndarray) -> np.ndarray:
     return out
 
 
+def local_slopes(x: np.ndarray, step: float, window: int) -> np.ndarray:
+    """Slope (num_cells, num_channels) of the straightest line through `window` cells that end at, lie around
+    or begin at each cell.
+
+    Around an abrupt change no line is straight, and the slope does not know of it beforehand: a centred
+    difference would begin half a window too early (edge-preserving filters: Kuwahara et al., 1976).
+    """
+    num_cells = len(x)
+    window = min(window, num_cells)
+    if window < 2:
+        return np.zeros_like(x)
+    lines = np.lib.stride_tricks.sliding_window_view(x, window, axis=0)
+    since = np.arange(window) - (window - 1) / 2
+    centred = lines - lines.mean(-1, keepdims=True)
+    slopes = centred @ since / (since**2).sum()
+    left = ((centred - slopes[..., None] * since) ** 2).sum(-1)
+    cell = np.arange(num_cells)
+    at = np.clip([cell - window + 1, cell - window // 2, cell], 0, num_cells - window)
+    chosen = np.take_along_axis(at[..., None], left[at].argmin(0)[None], 0)[0]
+    return np.take_along_axis(slopes, chosen, 0) / step
+
+
 def _raw(means: np.ndarray, step: float, window: int) -> np.ndarray:
-    slopes = np.zeros_like(means)
-    if len(means) > 1:
-        slopes = np.gradient(_moving_average(filled(means), window), step, axis=0)
+    slopes = local_slopes(filled(means), step, window)
     return np.hstack([means, np.where(np.isfinite(means), slopes, np.nan)])
 
 

@@ -12,7 +12,7 @@ from hmmseg.errors import InputError
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
 from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder, SmallGap
-from simgap.attribution.heldout import how_far
+from simgap.attribution.heldout import Heldout
 from simgap.attribution.invariance import (
     POSITIVE,
     Invariance,
@@ -20,8 +20,8 @@ from simgap.attribution.invariance import (
     residual_left,
     scatter_between,
 )
-from simgap.attribution.noise import channel_of, noise_of, small_gap, stated
-from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
+from simgap.attribution.noise import noise_of, small_gap, stated
+from simgap.attribution.posterior import Forms, Model, channel_of, coordinates, fitted, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought, weights
 from simgap.attribution.shares import Shares, shares
@@ -36,7 +36,7 @@ def attribute(
     twins: Iterable[float] | Callable[[float], Iterable[float]] | None = None,
     forced: tuple[str, ...] = (),
     seed: int = 0,
-    nested: bool = True,
+    heldout: bool = True,
     models: list[Model] | None = None,
     absorbed: np.ndarray | None = None,
 ) -> Attribution:
@@ -44,8 +44,9 @@ def attribute(
 
     `twins`: the `statistic` of healthy twins, taken one by one, or what gives them for the gap's own; without
     them stated noise is the null. `absorbed`: by how much the first nuisances may be off without it
-    mattering. `forced` names effects that act for certain, and no others. `nested`: whether how far the gap
-    shrinks is asked. `models`: the sets that `sought` finds, where they are known already.
+    mattering. `forced` names effects that act for certain, and no others. `heldout`: whether causes must
+    shrink the gap of trials that took no part, where there are several. `models`: the sets that `sought`
+    finds, where they are known already.
     """
     rng = np.random.default_rng(seed)
     f = forms(gap)
@@ -63,7 +64,10 @@ def attribute(
     for m, weight in zip(models, w, strict=True):
         likely[parts[m.effects]] = likely.get(parts[m.effects], 0.0) + float(weight)
     ranked = sorted((p for p in likely if p), key=lambda p: -likely[p])
-    examined = {part: _examined(f, part, by_group, rng) for part in ranked[:EXAMINED]}
+    ranked, others = ranked[:EXAMINED], None
+    if heldout and (found.p_value < ALARM or forced):
+        others = Heldout.of(gap, noise**2, (j for part in ranked for j in part))
+    examined = {part: _examined(f, part, by_group, rng, others) for part in ranked}
     sets = [_explanation(f, parts[m.effects], float(x), examined) for m, x in zip(models, w, strict=True)]
     small = None
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
@@ -81,7 +85,7 @@ def attribute(
     rest = significant(gap.rows, f.spectrum.band, left, sd)
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, model, by_group, rng)
-    far = how_far(gap, noise**2) if nested and causes else None
+    far = others.how_far(causes) if others is not None and causes else None
     chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
                     found.p_value)  # fmt: skip
     somewhere = verdict.verdict != "none" or small is not None
@@ -176,8 +180,13 @@ class _Examined:
 
 
 def _examined(
-    f: Forms, effects: tuple[int, ...], by_group: np.ndarray, rng: np.random.Generator
+    f: Forms,
+    effects: tuple[int, ...],
+    by_group: np.ndarray,
+    rng: np.random.Generator,
+    others: Heldout | None = None,
 ) -> _Examined:
+    """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     same = {j: invariance(f, model, j, f.gap.rows.trial) for j in effects}
@@ -194,11 +203,26 @@ def _examined(
             and _there(f, model, j)
         )
     )
+    if others is not None:
+        causes = _predicting(others, causes)
     shifting = [same[j] for j in causes if j not in scattering]
     left = explained.inside if shifting else 0.0
     factors = [i.log_bayes_factor for i in shifting]
-    sure = known(left, 1 - explained.remainder, factors) if causes else 0.0
+    far = others.how_far(causes) if others is not None and causes else None
+    share = 1 - explained.remainder if far is None else far.fraction
+    sure = known(left, share, factors) if causes else 0.0
     return _Examined(effects, model, explained, same, causes, sure)
+
+
+def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
+    """Those causes without which trials that took no part are predicted worse, taken out one by one."""
+    while causes:
+        gains = {j: others.gain(causes, [i for i in causes if i != j]) for j in causes}
+        least = min(gains, key=lambda j: gains[j])
+        if gains[least] > POSITIVE:
+            break
+        causes = tuple(j for j in causes if j != least)
+    return causes
 
 
 def _matters(f: Forms, model: Model, effect: int) -> bool:

@@ -1,51 +1,101 @@
-"""How far the gap shrinks, nested: every trial is judged by a search that never saw it."""
+"""How far causes shrink the gap of trials that took no part: predicted by what the other trials say.
+
+Causes are chosen on all trials; how large they are is then found without the trial that is predicted. The
+squares of that trial are those of its predictive density, in which the covariance of the noise is widened by
+what the other trials leave open:
+
+    S = min over x of  sum_g energy_g(x) / noise_g + (x - mean)' covariance^-1 (x - mean)
+
+with mean and covariance of x (nuisances and parameters) given the other trials. Where the model holds, S has
+the expectation n, the number of rows. A nuisance of one trial is free again in the trial that is predicted:
+the others say nothing of it. Both squares, with causes and without, are taken in the same way.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import t as student
 
-from simgap.attribution.posterior import Forms, fitted, forms, squares_left
+from simgap.attribution.posterior import Forms, channel_of, fitted, forms, quadratic_forms
 from simgap.attribution.problem import Gap
-from simgap.attribution.search import sought
+from simgap.bounded import least
 
 
 @dataclass(frozen=True)
 class HowFar:
     """Mean squares of trials that took no part, `before` and `after`, the noise's own `noise_floor`, fixed
-    beforehand; `fraction` of the gap that is gone, its 90 % interval by trial."""
+    beforehand; `fraction` of the gap that is gone, its 90 % interval by trial; `score` [nats]: gain of the
+    log predictive density."""
 
     before: float
     after: float
     noise_floor: float
     fraction: float
     interval_90: tuple[float, float]
+    score: float
 
 
-def how_far(gap: Gap, noise: np.ndarray) -> HowFar | None:
-    """The nested shrinkage; `noise` (channels,): variance of each channel's noise. None with one trial."""
-    trials = np.unique(gap.rows.trial)
-    if trials.size < 2:
-        return None
-    before, after, floor = (np.zeros(trials.size) for _ in range(3))
-    for k, trial in enumerate(trials):
-        inside = gap.rows.trial == trial
-        train, test = forms(gap.taken(~inside)), forms(gap.taken(inside))
-        best = next((m for m in sought(train, 1) if any(gap.candidates[j].named for j in m.effects)), None)
-        kept = () if best is None else tuple(j for j in best.effects if gap.candidates[j].named)
-        model, empty = fitted(train, kept), fitted(train, ())
-        weight = 1 / noise[_channels(test, gap, inside)]
-        after[k] = _square(test, kept, weight, model.x)
-        before[k] = _square(test, (), weight, _plain(train, gap, ~inside, noise))
-        before[k] = min(before[k], _square(test, (), weight, empty.x))
-        floor[k] = test.count.sum()
-    gone, there = before - after, before - floor
-    if float(there.sum()) <= 0:
-        return None
-    n = float(floor.sum())
-    return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *fraction_gone(gone, there))
+@dataclass(frozen=True)
+class Heldout:
+    """Every trial predicted by the others; `noise` (channels,): variance of each channel's noise.
+
+    `among`: the gap's candidates that sets are made of; `folds`: the others and the trial, of these alone;
+    `computed`: squares (K,) and log determinants (K,) of sets so far.
+    """
+
+    noise: np.ndarray
+    among: tuple[int, ...]
+    folds: tuple[tuple[Forms, Forms], ...]
+    computed: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, gap: Gap, noise: np.ndarray, among: Iterable[int]) -> Heldout | None:
+        """None with one trial: nothing predicts it."""
+        trials = np.unique(gap.rows.trial)
+        if trials.size < 2:
+            return None
+        among = tuple(sorted(set(among)))
+        gap, inside = gap.only(among), [gap.rows.trial == trial for trial in trials]
+        return cls(noise, among, tuple((forms(gap.taken(~one)), forms(gap.taken(one))) for one in inside))
+
+    def how_far(self, effects: Sequence[int]) -> HowFar | None:
+        """How far a set of effects shrinks the gap; None where these trials have no excess of squares."""
+        (before, _), (after, _) = self._squares(()), self._squares(effects)
+        floor = np.array([test.count.sum() for _, test in self.folds])
+        if float((before - floor).sum()) <= 0:
+            return None
+        n, gone = float(floor.sum()), fraction_gone(before - after, before - floor)
+        return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *gone, self.gain(effects, ()))
+
+    def gain(self, effects: Sequence[int], without: Sequence[int]) -> float:
+        """Log predictive density of all trials by a set of effects over that by another [nats]."""
+        (more, wide), (less, plain) = self._squares(effects), self._squares(without)
+        return 0.5 * float((less + plain - more - wide).sum())
+
+    def _squares(self, effects: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        key = tuple(sorted(self.among.index(j) for j in effects))
+        if key not in self.computed:
+            each = np.array([self._predicted(train, test, key) for train, test in self.folds])
+            self.computed[key] = each[:, 0], each[:, 1]
+        return self.computed[key]
+
+    def _predicted(self, train: Forms, test: Forms, effects: tuple[int, ...]) -> tuple[float, float]:
+        """Squares of a trial, and log determinant of its noise over the stated one; `effects` of `among`."""
+        model, taken = fitted(train, effects), quadratic_forms(test, effects)
+        weight = np.exp(-taken.shift) / self.noise[channel_of(test)]
+        loose = ~model.at_bound  # what is at a bound stays there
+        precision = np.zeros_like(model.covariance)
+        precision[np.ix_(loose, loose)] = np.linalg.inv(model.covariance[np.ix_(loose, loose)])
+        low, high = (np.where(loose, edge, model.x) for edge in (taken.low, taken.high))
+        matrix, pull = taken.weighed(weight)
+        x, _ = least(matrix + precision, pull + precision @ model.x, low, high)
+        squares, off = weight * taken.energy(x), x - model.x
+        more = test.count * test.freed[list(effects)].sum(0)  # of the squares, so much is what they free
+        left = np.maximum(squares - more, np.minimum(squares, test.count))
+        return float(left.sum() + off @ precision @ off), float(test.count @ taken.shift)
 
 
 def fraction_gone(gone: np.ndarray, there: np.ndarray) -> tuple[float, tuple[float, float]]:
@@ -56,23 +106,3 @@ def fraction_gone(gone: np.ndarray, there: np.ndarray) -> tuple[float, tuple[flo
     sd = float(np.sqrt((k - 1) / k * ((others - others.mean()) ** 2).sum()))
     wide = float(student.ppf(0.95, k - 1)) * sd
     return fraction, (fraction - wide, min(fraction + wide, 1.0))
-
-
-def _square(f: Forms, effects: tuple[int, ...], weight: np.ndarray, x: np.ndarray) -> float:
-    """Squares of the rows that a set leaves at x."""
-    return float(squares_left(f, effects, weight, x)[:-1].sum())
-
-
-def _channels(f: Forms, gap: Gap, inside: np.ndarray) -> np.ndarray:
-    """The channel (G,) of each group of the rows inside."""
-    out = np.zeros(f.count.size, int)
-    out[f.spectrum.group] = gap.rows.channel[inside]
-    return out
-
-
-def _plain(f: Forms, gap: Gap, inside: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Nuisances (K,) that least squares find, without any effect."""
-    weight = 1 / noise[_channels(f, gap, inside)]
-    z = f.spectrum.num_nuisances
-    bend = np.tensordot(weight, f.product[:, 1 : 1 + z, 1 : 1 + z], 1) + np.eye(z)
-    return np.linalg.solve(bend, weight @ f.product[:, 0, 1 : 1 + z])

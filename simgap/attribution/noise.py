@@ -6,25 +6,20 @@ import numpy as np
 
 from simgap.attribution.findings import SmallGap
 from simgap.attribution.invariance import residual_left
-from simgap.attribution.posterior import Forms, Model, fitted
+from simgap.attribution.posterior import Forms, Model, channel_of, fitted
 from simgap.attribution.problem import Rows
 
 STATED = (0.6, 1.7)  # prior: bounds of a channel's noise over the stated one, in standard deviations
 
 
-def channel_of(f: Forms) -> np.ndarray:
-    """The channel (G,) of each group."""
-    out = np.zeros(f.count.size, int)
-    out[f.spectrum.group] = f.gap.rows.channel
-    return out
-
-
 def noise_of(f: Forms, model: Model) -> np.ndarray:
     """Noise (channels,) over the stated one, sd: the median of the groups that a set leaves, by their counts.
 
-    Groups where the model is off by itself are few: a median does not see them.
+    Groups where the model is off by itself are few: a median does not see them. Each is measured by the
+    median of as many squares of noise, which is less than their mean (Wilson & Hilferty, PNAS 17, 1931).
     """
-    channel, ratio = channel_of(f), model.energy / np.maximum(f.count, 1)
+    count = np.maximum(f.count, 1)
+    channel, ratio = channel_of(f), model.energy / (count * (1 - 2 / (9 * count)) ** 3)
     out = np.ones(len(f.gap.rows.channels))
     for c in np.unique(channel):
         mine = np.flatnonzero((channel == c) & (f.count >= 8))

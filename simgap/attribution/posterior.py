@@ -129,6 +129,13 @@ def forms(gap: Gap, background: Background | None = None) -> Forms:
     return Forms(gap, s, background or Background.usual(), product, count)
 
 
+def channel_of(f: Forms) -> np.ndarray:
+    """The channel (G,) of each group."""
+    out = np.zeros(f.count.size, int)
+    out[f.spectrum.group] = f.gap.rows.channel
+    return out
+
+
 def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
     """The set's mode and evidence, the better one of two starts: all groups count alike, and as they would
     with every effect as it was linearised."""

@@ -128,7 +128,12 @@ class Gap:
 
     def only(self, effects: Sequence[int]) -> Gap:
         """The gap with some of its candidates alone, in this order."""
-        return replace(self, candidates=tuple(self.candidates[j] for j in effects))
+        carried = self.carried
+        if carried is not None:
+            own = self.own_columns
+            kept = [np.arange(1 + self.nuisance.shape[1]), *(own[j] for j in effects)]
+            carried = carried[:, :, np.concatenate(kept)]
+        return replace(self, candidates=tuple(self.candidates[j] for j in effects), carried=carried)
 
     @property
     def raw_columns(self) -> Float[np.ndarray, "n m"]:

@@ -1,7 +1,6 @@
-"""The candidate effects: every module of this package that defines EFFECT is one, found by itself.
+"""The candidate effects: every `Effect` that a module of this package defines is one, found by itself.
 
-A module that defines DECOY instead is an effect outside the contract: where it explains a recording best
-the verdict is "unknown".
+Those of `unnamed` are outside the contract: where one explains a recording best the verdict is "unknown".
 """
 
 from __future__ import annotations
@@ -15,23 +14,21 @@ from simgap.effects.base import Effect
 
 
 @cache
-def _defined(kind: str) -> dict[str, Effect]:
-    found = {}
-    for info in pkgutil.iter_modules(__path__):
-        effect = getattr(importlib.import_module(f"{__name__}.{info.name}"), kind, None)
-        if effect is not None:
-            found[effect.name] = effect
-    return dict(sorted(found.items()))
+def _defined(decoy: bool) -> dict[str, Effect]:
+    modules = [m for m in pkgutil.iter_modules(__path__) if (m.name == "unnamed") == decoy]
+    found = [vars(importlib.import_module(f"{__name__}.{m.name}")).values() for m in modules]
+    effects = {e.name: e for each in found for e in each if isinstance(e, Effect)}
+    return dict(sorted(effects.items()))
 
 
 def catalogue() -> dict[str, Effect]:
     """All effects by name, in alphabetical order."""
-    return _defined("EFFECT")
+    return _defined(decoy=False)
 
 
 def decoys() -> dict[str, Effect]:
     """Effects that are fitted to be told from the catalogue's, and never named."""
-    return _defined("DECOY")
+    return _defined(decoy=True)
 
 
 def fitted() -> dict[str, Effect]:

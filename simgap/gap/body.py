@@ -36,7 +36,7 @@ def body(
                 f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()
             },
             "log_evidence": _evidence(verdict, verdict.causes),
-            "heldout_score": None,
+            "heldout_score": None if verdict.how_far is None else verdict.how_far.score,
             "property_shift": _shifts(found, causes),
         }
     elif verdict.causes and causes is not None:
@@ -127,7 +127,7 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
     """Properties with rig.toml at its word and with the causes, of those that were identified or measured.
 
     Both are of one model, pads included, so that either can be simulated; what `identify` says is of a rig
-    that may be wrong by what it doubts (`estimation.doubtful_pads`), and stands between them.
+    that may be wrong by what it doubts (`estimation.sampler`), and stands between them.
     """
     if causes is None:
         return {}

@@ -77,7 +77,7 @@ class Diagnosis(Tabled):
     def to_arviz(self):
         """ArviZ InferenceData: draws of the described effects' parameters, `effect.parameter`, given that it
         acts. Each effect is drawn by itself."""
-        import arviz
+        from estimation.report import inference_data
 
         every = {
             f"{name}.{key}": values[None]
@@ -87,7 +87,7 @@ class Diagnosis(Tabled):
                 self.search, self.attribution.effects[name], name, self.seed
             ).items()
         }
-        return arviz.from_dict(posterior=every)
+        return inference_data(every)
 
     def plot_where(self, path: str | Path | None = None):
         """Share of the gap by channel and subtask; the axes. Saved where a path is given."""
@@ -117,7 +117,7 @@ def diagnose(
 ) -> Diagnosis:
     """Diagnose aligned recordings of one block task against the nominal model.
 
-    `actual` as `estimation.actual.read_actual` gives it; `forced` names effects to be taken instead of
+    `actual` as `estimation.report.read_actual` gives it; `forced` names effects to be taken instead of
     choosing; `excluded` effects are not thought of. The null are `healthy` recordings of the same task and
     rig if there are any, else simulated `twins`, else the model itself. `identified`: what `identify` made
     of the same trials, where that is known already. InputError where no trial fits its task, or no effect has

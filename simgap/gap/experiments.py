@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from estimation.actual import Actual
+from estimation.report import Actual
 from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.effects import catalogue, forms_of, name_of

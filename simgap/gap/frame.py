@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmmseg.contact.decompose import Subtask, height_equations
-from hmmseg.hand.grouping import group_size
+from hmmseg.hand.signals import group_size
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.align import AlignedTrials

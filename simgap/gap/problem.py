@@ -94,7 +94,7 @@ class Problem:
 def problem(
     frame: Frame, actual: dict | None = None, identified: Mapping[tuple[str, str], float] | None = None
 ) -> Problem:
-    """The problem of a frame; `actual` as `estimation.actual` reads it narrows the prior.
+    """The problem of a frame; `actual` as `estimation.report` reads it narrows the prior.
 
     The prior is identification's (log-normal, `estimation.priors`), linearised about what was `identified`
     (block, property) [N, m], else about its median: in here properties are departures from those.

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask
-from hmmseg.hand.grouping import group_size, grouped
 from hmmseg.hand.kinematics import forward, joint_velocity, tip_velocity
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import Signals, group_size, grouped, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Finger, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE

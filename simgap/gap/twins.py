@@ -8,8 +8,6 @@ recordings like these (`simgap.attribution.detection.detected`).
 from __future__ import annotations
 
 import hashlib
-import json
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -17,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from hmmseg.cache import cache_folder, keep_value, kept_value
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.jaxconfig import cache_folder
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import forms
@@ -56,9 +54,7 @@ def twin_statistics(
     """
     frame = found.problem.frame
     file = _file(found.trials, frame.task, frame.rig, actual, seed)
-    known: list[float] = []
-    with suppress(OSError, ValueError):
-        known = [float(v) for v in json.loads(file.read_text(encoding="utf-8"))]
+    known: list[float] = kept_value(file) or []
     yield from known
     for start in range(len(known) - len(known) % BATCH, MOST, BATCH):
         tell("simulating healthy twins")
@@ -73,7 +69,7 @@ def twin_statistics(
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
                 known.append(healthy_statistic(twin, actual, found.identified))
-                _keep(file, known)
+                keep_value(file, known)
                 yield known[-1]
 
 
@@ -174,7 +170,7 @@ def _rate(trials: Sequence[Trial]) -> float:
     return float(np.median([trial.rate for trial in trials]))
 
 
-def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None, seed: int) -> Path:
+def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None, seed: int) -> Path | None:
     """Where statistics are kept: by recordings, task, rig, measurements, seed and the code that made them."""
     digest = hashlib.sha256()
     for trial in trials:
@@ -182,13 +178,5 @@ def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | Non
             digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
     more = (repr(task), rig.model_dump_json(), repr(actual), str(seed), source_digest())
     digest.update("\n".join(more).encode())
-    return cache_folder() / "twins" / f"{digest.hexdigest()[:24]}.json"
-
-
-def _keep(file: Path, values: list[float]) -> None:
-    """A cache that cannot be written costs time and nothing else; nobody reads half a file."""
-    with suppress(OSError):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside = file.with_name(f".{file.name}.{os.getpid()}")
-        beside.write_text(json.dumps(values), encoding="utf-8")
-        os.replace(beside, file)
+    folder = cache_folder()
+    return None if folder is None else folder / "twins" / f"{digest.hexdigest()[:24]}.npz"

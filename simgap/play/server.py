@@ -7,7 +7,9 @@ sent. Only loopback is listened to, only the page's own origin may open the sock
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
+import hashlib
 import json
 import time
 from http import HTTPStatus
@@ -31,6 +33,12 @@ BEHIND = 50  # look: ms; a machine that cannot keep up lets the played time run 
 LONGEST_MESSAGE = 4096  # limit: bytes
 
 
+def _digest_of(page: bytes, kind: str) -> str:
+    """The page's one inline script or style, as a content security policy names it."""
+    inside = page.partition(f"<{kind}>".encode())[2].partition(f"</{kind}>".encode())[0]
+    return f"'sha256-{base64.b64encode(hashlib.sha256(inside).digest()).decode()}'"
+
+
 class PlayServer:
     """Serves a session; `output` is the folder that the page's button saves into."""
 
@@ -43,23 +51,34 @@ class PlayServer:
     async def start(self, port: int = 0) -> str:
         """Listen on a port of this machine (0: any that is free); the page's address."""
         page = files("simgap.play").joinpath("page.html").read_bytes()
+        sockets: list[str] = []
+        inline = {kind: _digest_of(page, kind) for kind in ("script", "style")}
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
-            host = request.headers.get("Host", "").rpartition(":")[0]
-            if host not in (HOST, "localhost"):
+            hosts = [host.rpartition(":")[0] for host in request.headers.get_all("Host")]
+            if hosts not in ([HOST], ["localhost"]):
                 return connection.respond(HTTPStatus.FORBIDDEN, "only this machine\n")
             if request.path == "/socket":
-                return None
+                origins = request.headers.get_all("Origin")
+                if len(origins) == 1 and origins[0] in self.origins:
+                    return None
+                return connection.respond(HTTPStatus.FORBIDDEN, "only the page's own origin\n")
             if request.path != "/":
                 return connection.respond(HTTPStatus.NOT_FOUND, "the page is at /\n")
             headers = Headers({"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page)),
-                               "Connection": "close", "X-Content-Type-Options": "nosniff"})  # fmt: skip
+                               "Connection": "close", "X-Content-Type-Options": "nosniff",
+                               "Content-Security-Policy": (
+                                   f"default-src 'none'; script-src {inline['script']}; "
+                                   f"style-src {inline['style']}; connect-src {' '.join(sockets)}; "
+                                   "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+                               )})  # fmt: skip
             return Response(200, "OK", headers, page)
 
         self._server = await serve(self._play, HOST, port, process_request=answer, max_size=LONGEST_MESSAGE,
                                    compression=None)  # fmt: skip
         port = next(iter(self._server.sockets)).getsockname()[1]
         self.origins = (f"http://{HOST}:{port}", f"http://localhost:{port}")
+        sockets += [origin.replace("http", "ws", 1) for origin in self.origins]
         return f"http://{HOST}:{port}/"
 
     async def stop(self) -> None:
@@ -69,10 +88,6 @@ class PlayServer:
             await self._server.wait_closed()
 
     async def _play(self, connection: ServerConnection) -> None:
-        origin = connection.request.headers.get("Origin") if connection.request is not None else None
-        if origin not in self.origins:
-            await connection.close(4003, "another page")
-            return
         if self.busy:
             await connection.close(4001, "somebody plays already")
             return

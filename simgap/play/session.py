@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from hmmseg.cache import write_whole
+from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, parse_task
 from simgap.play.world import STIFFNESS, PlayedWorld
@@ -154,7 +156,8 @@ class Session:
     def save(self, folder: Path) -> list[Path]:
         """The nominal world's recording as the next trial_NN.csv beside rig, task and true properties.
 
-        ValueError where there is less than a second of it.
+        ValueError where there is less than a second of it, InputError where the folder is another session's.
+        No file that is there is replaced.
         """
         rows = np.array(self._rows)
         if len(rows) < 1000:
@@ -163,13 +166,22 @@ class Session:
         t = np.arange(int(len(rows) * CONTROL_PERIOD * rate)) / rate
         fine = np.arange(1, len(rows) + 1) * CONTROL_PERIOD
         at = np.stack([np.interp(t, fine, column) for column in rows.T], axis=1).reshape(t.size, 3, 2, 2)
-        number = 1 + len(list(folder.glob("trial_*.csv")))
+        self.check_folder(folder)
+        number = 1
+        while (folder / f"trial_{number:02d}.csv").exists():
+            number += 1
         rng = np.random.default_rng([self.seed, number])
         trial = record(t, at[:, 0], at[:, 1], at[:, 2], self.rig, rng, f"played {number}")
         texts = scene_files(self.task, self.rig, self.blocks) | {f"trial_{number:02d}.csv": trial_csv(trial)}
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
-            written = folder / f".{name}.part"
-            written.write_text(text, encoding="utf-8")
-            written.replace(folder / name)
+            if not (folder / name).exists():
+                write_whole(folder / name, text.encode())
         return [folder / name for name in texts]
+
+    def check_folder(self, folder: Path) -> None:
+        """InputError where a rig, a task or properties are in the folder that are not this session's."""
+        for name, text in scene_files(self.task, self.rig, self.blocks).items():
+            there = folder / name
+            if there.exists() and (not there.is_file() or there.read_bytes() != text.encode()):
+                raise InputError(str(there), "is there already, and not this session's", "another --output")

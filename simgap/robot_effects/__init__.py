@@ -5,10 +5,16 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import cache
 from types import ModuleType
 
+from hmmseg.errors import InputError, nearest
 from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.simulators.protocol import Parameter, Simulator
+from simgap.simulators.recording import Recording
 
 
 @cache
@@ -26,6 +32,56 @@ def candidates(setting: Setting) -> dict[str, RobotEffect]:
     """Every candidate for this simulator and these recordings, by name."""
     made = [effect for module in families().values() for effect in module.candidates(setting)]
     return {effect.name: effect for effect in made}
+
+
+# prior: what a model states and nobody measured may be off by so many usual sizes of what it has wrong
+WIDE = 30.0
+UNMEASURED = (  # of a model, whatever it states of them
+    "joint:*.damping", "joint:*.frictionloss", "joint:*.armature", "actuator:*.gain", "actuator:*.damping",
+    "geom:*.stiffness", "command.delay",
+)  # fmt: skip
+
+
+def effects_of(
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    more: Iterable[RobotEffect] = (),
+    uncertain: Sequence[str] = (),
+) -> dict[str, RobotEffect]:
+    """Every effect of a simulator along logs, `more` among them, with what the simulator and patterns say of
+    how sure each is.
+
+    Raises:
+        InputError: the simulator's map names none.
+    """
+    known = candidates(Setting(simulator, recordings)) | {e.name: e for e in more}
+    sds, named = getattr(simulator, "sd", {}), getattr(simulator, "uncertain", ())
+    for what, names in (("sd", sds), ("uncertain", named)):
+        for name in names:
+            if not any(fnmatchcase(n, name) for n in known):
+                where = f"{getattr(getattr(simulator, 'map', None), 'file', 'simulator')}: {what}"
+                raise InputError(where, f"nothing is called {name}", nearest(name, list(known)))
+    return doubted(known, (*named, *uncertain), sds)
+
+
+def doubted(
+    effects: Mapping[str, RobotEffect], uncertain: Iterable[str], sds: Mapping[str, float]
+) -> dict[str, RobotEffect]:
+    """The effects, with standard deviations of parameters as somebody states them (`sds`, by effect); those
+    that match patterns of what is `uncertain` are fitted along, widely where nobody states how."""
+    patterns, out = tuple(uncertain), dict(effects)
+    for name, effect in effects.items():
+        if any(fnmatchcase(name, p) for p in patterns) and not effect.fitted:
+            wide = WIDE if effect.model else 1.0
+            effect = replace(effect, fitted=True, parameters=_sized(effect, wide, None))
+        stated = sds.get(name)
+        out[name] = effect if stated is None else replace(effect, parameters=_sized(effect, 1.0, stated))
+    return out
+
+
+def _sized(effect: RobotEffect, factor: float, sd: float | None) -> dict[str, Parameter]:
+    known = effect.parameters.items()
+    return {n: replace(p, sd=factor * p.sd if sd is None else sd) for n, p in known}
 
 
 def words(name: str) -> tuple[str, str] | None:

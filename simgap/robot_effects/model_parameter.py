@@ -7,9 +7,10 @@ from simgap.robot_effects.base import RobotEffect, Setting
 
 
 def candidates(setting: Setting) -> list[RobotEffect]:
-    """One for each effect that the simulator's parameters name; a parameter without one is its own."""
+    """One for each effect that the simulator's parameters name; a parameter without one is its own. The
+    solver's own numbers are fitted along: no robot has a step."""
     groups: dict[str, dict[str, str]] = {}
-    known = setting.simulator.parameters
+    known, numerics = setting.simulator.parameters, getattr(setting.simulator, "numerics", ())
     for name, parameter in known.items():
         effect = parameter.effect or name
         if any(known[n].fitted != parameter.fitted for n in groups.get(effect, {}).values()):
@@ -26,7 +27,7 @@ def candidates(setting: Setting) -> list[RobotEffect]:
             says.get(effect, "the simulator's own parameter"),
             {short: known[name] for short, name in names.items()},
             model=names,
-            fitted=all(known[n].fitted for n in names.values()),
+            fitted=all(known[n].fitted or n in numerics for n in names.values()),
         )
         for effect, names in groups.items()
     ]

@@ -21,7 +21,10 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
     p_value = None if v.verdict == "none" else rest.p_value
     out = entries(v, v.detection, (rest.share, p_value, rows(rest.where)), attribution, rows(v.where))
     out["remainder"]["regimes"] = dict(v.left)
+    out["remainder"]["rms_over_noise"] = v.over_noise
     return out | {
+        "numerics": _fitted(found, numeric=True),
+        "stands_in": {c: [o.name for o in v.stand_ins if o.place == c] for c in v.causes},
         "effects": _effects(found),
         "fitted": _fitted(found),
         "discrepancy": dict(found.discrepancy),
@@ -88,10 +91,13 @@ def _effects(found: RobotDiagnosis) -> dict[str, Any]:
     return out
 
 
-def _fitted(found: RobotDiagnosis) -> dict[str, Any]:
-    """What was fitted along: before (nothing else acts) and with the causes."""
+def _fitted(found: RobotDiagnosis, numeric: bool = False) -> dict[str, Any]:
+    """What was fitted along: before (nothing else acts) and with the causes; the simulation's own numbers
+    apart."""
     out = {}
     for name, before in found.plain.point.items():
+        if found.composed.numeric(name) is not numeric:
+            continue
         for short, value in before.items():
             parameter = found.composed.effects[name].parameters[short]
             out[name if len(before) == 1 else f"{name}.{short}"] = {

@@ -15,8 +15,8 @@ from hmmseg.errors import InputError, nearest
 from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import Forms, fitted, forms
 from simgap.progress import Progress, silent
-from simgap.robot_effects import candidates as candidates_of
-from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robot_effects import effects_of
+from simgap.robot_effects.base import RobotEffect
 from simgap.robots.asked import Asked
 from simgap.robots.borne_out import folds_of
 from simgap.robots.causes import about
@@ -88,7 +88,7 @@ def diagnose(
         counted = f"{len(groups)} in {len({*groups})} groups for {len(recordings)} logs"
         raise InputError("groups", f"are {counted}", "one number a log, of at least two groups")
     noise = noises(simulator, recordings)
-    effects = candidates_of(Setting(simulator, recordings)) | {e.name: e for e in more}
+    effects = effects_of(simulator, recordings, more)
     for name in forced:
         if name not in effects or effects[name].fitted:
             raise InputError(f"--effect {name}", "is no candidate", nearest(name, list(effects)))
@@ -100,7 +100,8 @@ def diagnose(
     # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.
     if not forced and (calm := whole.calm()) is not whole:
-        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn, kept.of("calm"), groups)
+        part = kept.of("calm")
+        found = _diagnosed(whole, calm, forced, seed, phases, tell, warn, part, groups)
         if found.verdict.causes:
             return found
         tell("where bodies move in contact")
@@ -197,12 +198,11 @@ def _concluded(
     explains = explained(composed, linear, sensor, plain, ended.best, whole, twins.plain)
     every = s if whole is composed else _every(whole, linear.point, ended.best, phases)
     null = [_twin_statistic(s, white, rows) for white in twins.residuals]
-    numerics = tuple(j for j, n in enumerate(ended.names) if composed.numeric(n))
     causes = ended.models[0].effects
 
     def concluded(large_alone: Sequence[str] = ()) -> RobotVerdict:
-        alone = (*numerics, *(j for j in causes if ended.names[j] in large_alone))
-        given = (null, np.random.default_rng(seed), explains, every, fold[rows], forced, numerics, alone)
+        alone = tuple(j for j in causes if ended.names[j] in large_alone)
+        given = (null, np.random.default_rng(seed), explains, every, fold[rows], forced, alone)
         return verdict_on(ended.forms, s, causes, *given)
 
     # A small cause that goes with one way to explain the large ones, and not with another, is none: few logs

@@ -48,6 +48,16 @@ class Explained:
         return _left(self.before.sum(1), self.after.sum(1), self.floor.sum(1))
 
     @property
+    def gone(self) -> float:
+        """Share of the gap that all causes explain, in the regime in which it is largest."""
+        return float(np.max(np.where(self.asked, 1.0 - self.left, 0.0), initial=0.0))
+
+    @property
+    def over_noise(self) -> float:
+        """Root mean square of what is left, in units of the noise's."""
+        return float(np.sqrt(self.after.sum() / max(self.floor.sum(), 1e-12)))
+
+    @property
     def where_it_acts(self) -> np.ndarray:
         """Share (J, R) of the gap that is left where each cause acts: of channels by what is lost there
         without it. 1 where it takes nothing, or was not sought."""

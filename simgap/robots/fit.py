@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
+from simgap.bounded import least
 from simgap.progress import say
 from simgap.robots.blocks import NONE, Discrepancy
-from simgap.robots.linear import STEP, Base, Linear, base_at, numeric_at, vary
+from simgap.robots.linear import STEP, Base, Linear, base_at, vary
 from simgap.robots.model import Composed, Point
-from simgap.robots.whiten import Whitener
 
-STEPS = 8  # numerics: evaluations of a least-squares fit
+Whiten = Callable[[np.ndarray], np.ndarray]  # rows (N,) or columns (N, k)
+STEPS = 8  # numerics: of a least-squares fit, at most
 HALVINGS = 5  # numerics: of a step that straight lines took too far
-REACH = 3.0  # numerics: usual sizes: how far a fit's first step may go
+SHORTEN, SHORTER = (
+    0.1,
+    10.0,
+)  # numerics: damping of a step that was too long, and by how much more of the next
+CLOSE = 0.05  # numerics: nats that a step must gain for a fit to go on
 WIDE = 3.0  # numerics: posterior standard deviations: a finite difference
 FINEST = 1e-4  # numerics: usual sizes: the least one
 
@@ -33,35 +36,51 @@ class Fit:
 
 
 def moved_to(
-    composed: Composed, linear: Linear, whiten: Whitener, point: Point, only: Sequence[str] | None = None
+    composed: Composed,
+    linear: Linear,
+    whiten: Whiten,
+    point: Point,
+    only: Sequence[str] | None = None,
+    steps: int = STEPS,
 ) -> Fit:
     """The point of least squares of whitened residuals, from a start; priors as in attribution. `only`: the
     effects that are moved, all by default.
 
-    A start that straight lines took too far, so that it is worse than where they begin, is taken back by
-    halves towards there.
+    Steps are Levenberg's and Marquardt's (J. SIAM 11, 1963), each the minimum within bounds. A start that
+    straight lines took too far, so that it is worse than where they begin, is taken back by halves towards
+    there.
     """
     free = {e: theta for e, theta in point.items() if only is None or e in only}
     held = {e: theta for e, theta in point.items() if e not in free}
     if not any(free.values()):
         return Fit(point, 0.0)
     squares = _Squares(composed, linear, whiten, held, free)
-    begin = squares.reached()
-    first = squares.cost(begin)
+    x = squares.reached()
+    first = cost = squares.cost(x)
     if not np.isfinite(first):
         return Fit(point, 0.0)
-    # The first step that is allowed is as long as the start is far from 0, so 0 is put where that suits.
-    offset = begin - REACH / np.sqrt(begin.size)
-    derivative: Any = lambda y: squares.jacobian(y + offset)  # noqa: E731
-    done = least_squares(
-        lambda y: squares.residual(y + offset), begin - offset, derivative,
-        bounds=(squares.low - offset, squares.high - offset), max_nfev=STEPS, method="trf", ftol=1e-5,
-    )  # fmt: skip
-    x = np.clip(done.x + offset, squares.low, squares.high)
-    return Fit({**point, **squares.at(x)}, first - float(done.cost))
+    damping = 0.0
+    for _ in range(steps):
+        jacobian, left = squares.jacobian(x), squares.residual(x)
+        bend, pull = jacobian.T @ jacobian, -jacobian.T @ left
+        usual = np.diag(np.maximum(np.diag(bend), 1.0))
+        for _ in range(HALVINGS):
+            # About x, so that what is held at a bound stays exactly there.
+            move, _ = least(bend + damping * usual, pull, squares.low - x, squares.high - x)
+            there = squares.cost(x + move)
+            if there < cost:
+                break
+            damping = max(SHORTER * damping, SHORTEN)
+        else:
+            break
+        x, gained, cost = x + move, cost - there, there
+        damping = damping / SHORTER if damping > SHORTEN else 0.0
+        if gained < CLOSE * (1 + CLOSE * cost):
+            break
+    return Fit({**point, **squares.at(x)}, first - cost)
 
 
-def reached(composed: Composed, linear: Linear, whiten: Whitener, point: Point) -> Point:
+def reached(composed: Composed, linear: Linear, whiten: Whiten, point: Point) -> Point:
     """The start that `moved_to` has for a point, as far as straight lines from the linear model's lead."""
     if not any(point.values()):
         return point
@@ -77,7 +96,7 @@ class _Squares:
 
     composed: Composed
     linear: Linear
-    whiten: Whitener
+    whiten: Whiten
     held: Point
     free: Point
     latest: dict[bytes, Base] = field(default_factory=dict)
@@ -105,10 +124,10 @@ class _Squares:
         return dict(out)
 
     def coordinates(self, point: Point) -> np.ndarray:
-        """The coordinates of a point, just within bounds; what it does not name is neutral."""
+        """The coordinates of a point; what it does not name is neutral."""
         neutral = {e: self.composed.effects[e].neutral() for e in self.free}
         value = np.array([{**neutral[e], **point.get(e, {})}[p] for e, p in self.names])
-        return np.clip((value - self.nominal) / self.sd, self.low + 1e-6, self.high - 1e-6)
+        return np.clip((value - self.nominal) / self.sd, self.low, self.high)
 
     def reached(self) -> np.ndarray:
         """Where the free effects are, or half as far from the linear model's point, and half again, while
@@ -144,7 +163,7 @@ class _Squares:
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Derivatives of `residual` by x."""
-        base, columns = numeric_at(self.composed, self.base(x)), []
+        base, columns = self.base(x), []
         for effect in self.free:
             step = self._step(effect)
             moved = vary(self.composed, base, self.linear.starts, effect, step=step, shifted=False)

@@ -1,19 +1,17 @@
 """What a diagnosis has worked out so far, so that one that was interrupted goes on where it was.
 
 Every step is a function of the inputs and of the steps before it, so a step is known by the inputs' hash and
-its name. Files are written beside and renamed: nobody reads half a step.
+its name.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import pickle
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -21,7 +19,7 @@ from typing import TypeVar
 import numpy
 import scipy
 
-from hmmseg.jaxconfig import cache_folder
+from hmmseg.cache import cache_folder, keep_value, kept_value
 from simgap.source_digest import source_digest
 
 T = TypeVar("T")
@@ -39,19 +37,11 @@ class Kept:
         """The result of a step as it was kept, or made now and kept."""
         if self.folder is None:
             return make()
-        path = self.folder / f"{self.part}{step}.pickle"
-        # A file that another version wrote, or that a full disk cut short, is as good as none.
-        with contextlib.suppress(OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
-            return pickle.loads(path.read_bytes())
-        made = make()
-        with contextlib.suppress(OSError):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            beside = path.with_name(f".{path.name}.{os.getpid()}")
-            try:
-                beside.write_bytes(pickle.dumps(made, pickle.HIGHEST_PROTOCOL))
-                beside.replace(path)
-            finally:
-                beside.unlink(missing_ok=True)
+        path = self.folder / f"{self.part}{step}.npz"
+        made = kept_value(path)
+        if made is None:
+            made = make()
+            keep_value(path, made)
         return made
 
     def of(self, part: str) -> Kept:
@@ -61,7 +51,7 @@ class Kept:
     @property
     def begun(self) -> bool:
         """Whether there is anything to go on from."""
-        return self.folder is not None and self.folder.is_dir() and any(self.folder.glob("*.pickle"))
+        return self.folder is not None and self.folder.is_dir() and any(self.folder.glob("*.npz"))
 
     def forget(self) -> None:
         """Take it all away: the diagnosis is done."""
@@ -78,11 +68,14 @@ def kept_for(inputs: Iterable[bytes]) -> Kept:
     digest = hashlib.sha256(versions.encode())
     for one in inputs:
         digest.update(hashlib.sha256(one).digest())
-    every = cache_folder() / "robots"
-    for old in every.glob("*"):
-        if time.time() - old.stat().st_mtime > AGE:
-            shutil.rmtree(old, ignore_errors=True)
-    return Kept(every / digest.hexdigest()[:24])
+    folder = cache_folder()
+    if folder is None:
+        return NOWHERE
+    with suppress(OSError):
+        for old in (folder / "robots").glob("*"):
+            if time.time() - old.stat().st_mtime > AGE:
+                shutil.rmtree(old, ignore_errors=True)
+    return Kept(folder / "robots" / digest.hexdigest()[:24])
 
 
 def modules_beside(file: Path) -> list[bytes]:

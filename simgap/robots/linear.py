@@ -66,15 +66,13 @@ class Linear:
 
 @dataclass(frozen=True)
 class Base:
-    """Rollouts at a point, from which effects are varied: starts, true channels, as read, and their rows;
-    `numeric`: of true channels what the simulator's own numerics make up, where the point has them other."""
+    """Rollouts at a point, from which effects are varied: starts, true channels, as read, and their rows."""
 
     point: Point
     begun: list
     true: list[Channels | None]
     read: list[Channels | None]
     rows: np.ndarray
-    numeric: list[Channels | None] | None = None
 
 
 def base_at(composed: Composed, point: Point) -> Base:
@@ -85,32 +83,6 @@ def base_at(composed: Composed, point: Point) -> Base:
     return Base(point, begun, true, read, composed.rows.averaged(read))
 
 
-def numeric_at(composed: Composed, base: Base) -> Base:
-    """The base with what other numerics make of it.
-
-    A finer step costs as many more rollouts, and what it changes is small: what it changes of the change that
-    an effect makes is smaller by as much again, so it is taken as it is at the point.
-    """
-    plain = composed.plainly(base.point)
-    if plain is base.point:
-        return base
-    bare = composed.rolled(plain, base.begun)
-    return replace(base, numeric=[_sum(a, b, -1.0) for a, b in zip(base.true, bare, strict=True)])
-
-
-def _sum(one: Channels | None, other: Channels | None, sign: float = 1.0) -> Channels | None:
-    """Channel by channel; None where either diverged."""
-    return None if one is None or other is None else {n: v + sign * other[n] for n, v in one.items()}
-
-
-def _rolled(composed: Composed, base: Base, point: Point, begun: list) -> list[Channels | None]:
-    """True channels at another point or from other starts, numerics as they are at the base."""
-    if base.numeric is None:
-        return composed.rolled(point, begun)
-    run = composed.rolled(composed.plainly(point), begun)
-    return [_sum(a, b) for a, b in zip(run, base.numeric, strict=True)]
-
-
 def linearise(
     composed: Composed, point: Point, effects: Sequence[str], starts: Mapping[str, np.ndarray] | None = None
 ) -> Linear:
@@ -119,7 +91,7 @@ def linearise(
 
     InputError where the simulator diverges in every window.
     """
-    base = numeric_at(composed, base_at(composed, point))
+    base = base_at(composed, point)
     if all(channels is None for channels in base.read):
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
     residual = composed.rows.observed - base.rows
@@ -136,14 +108,9 @@ def linearise(
         composed.wobble,
     )
     moved, diverged = {}, []
-    # The solver's own numbers first: a simulator may have their runs still at hand.
-    first = sorted(effects, key=lambda n: not composed.numeric(n))
-    found_by = {}
-    for number, name in enumerate(first):
-        say(f"{number + 1} of {len(first)}, {name}")
-        found_by[name] = vary(composed, base, starts, name)
-    for name in effects:
-        one = found_by[name]
+    for number, name in enumerate(effects):
+        say(f"{number + 1} of {len(effects)}, {name}")
+        one = vary(composed, base, starts, name)
         if one is None:
             diverged.append(name)
         else:
@@ -246,8 +213,12 @@ def _rows_at(
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
     if not effect.reads:
-        exact = composed.plainly({name: dict(values)}) == {}
-        run = composed.rolled(moved, base.begun) if exact else _rolled(composed, base, moved, base.begun)
+        if composed.numeric(name):
+            run, now = list(base.true), {**effect.neutral(), **base.point.get(name, {})}
+            for short, value in values.items():
+                run = composed.stepped(run, name, short, value - now[short])
+        else:
+            run = composed.rolled(moved, base.begun)
         return composed.rows.averaged(composed.read(run, moved))
     out = composed.rows.averaged(composed.read(base.true, moved))
     if effect.undoes:
@@ -275,7 +246,7 @@ def _by_start(composed: Composed, base: Base) -> dict[str, np.ndarray]:
             s if s is None or state not in s else {**s, state: s[state] + h}
             for s, h in zip(base.begun, steps, strict=True)
         ]
-        run = _rolled(composed, base, base.point, begun)
+        run = composed.rolled(base.point, begun)
         there = composed.rows.averaged(composed.read(run, base.point))
         by_row = np.array(steps)[composed.rows.window]
         change = np.where(by_row > 0, (there - base.rows) / np.where(by_row > 0, by_row, 1.0), 0.0)

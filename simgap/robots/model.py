@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,7 +26,8 @@ class Composed:
 
     `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
     move in contact; None where there is none. `motion`: a number for every log's motion, the same in repeats
-    (see `repeats`); none where no logs are.
+    (see `repeats`); none where no logs are. What the simulator's own numbers do (its step, how it holds
+    commands) is small: it is taken in proportion to them, as it is at the point `about`.
     """
 
     simulator: Simulator
@@ -37,6 +38,8 @@ class Composed:
     rows: Rows
     wobble: np.ndarray | None = None
     motion: tuple[int, ...] = ()
+    about: Point = field(default_factory=dict)
+    _slopes: dict = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -109,35 +112,63 @@ class Composed:
                     out[self.effects[name].model[short]] = value
         return out
 
-    def plainly(self, point: Point) -> Point:
-        """The point without what sets the simulator's own numerics; the same where it sets none."""
-        out = {n: v for n, v in point.items() if not self.numeric(n)}
-        return point if len(out) == len(point) else out
-
     def numeric(self, effect: str) -> bool:
         """Whether an effect is of the simulator's own numerics."""
         numerics = getattr(self.simulator, "numerics", ())
         return any(p in numerics for p in self.effects[effect].model.values())
 
+    def moved(self, point: Point) -> Composed:
+        """The same, with what the simulator's own numbers do as it is at this point."""
+        return replace(self, about={n: v for n, v in point.items() if not self.numeric(n)}, _slopes={})
+
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """True channels of every window from these starts; None where a rollout diverged."""
-        jobs = self.jobs(point, starts)
-        leads = [0] * len(jobs)
-        for i, (window, job) in enumerate(zip(self.windows, jobs, strict=True)):
+        plain = {n: v for n, v in point.items() if not self.numeric(n)}
+        out = self._rolled(plain, self.windows, starts)
+        for name, theta in point.items():
+            if name not in plain:
+                for short, value in theta.items():
+                    out = self.stepped(out, name, short, value - self.effects[name].parameters[short].nominal)
+        return out
+
+    def stepped(
+        self, true: Sequence[Channels | None], name: str, short: str, by: float
+    ) -> list[Channels | None]:
+        """True channels with one of the simulator's own numbers changed by so much."""
+        return (
+            [_sum(a, b, by) for a, b in zip(true, self._slope(name, short), strict=True)] if by else [*true]
+        )
+
+    def _slope(self, name: str, short: str) -> list[Channels]:
+        """Derivatives of every window's channels by a number of the simulator's, none where one diverges."""
+        keys = [(w.log, w.begin, w.end, name, short) for w in self.windows]
+        new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
+        if new:
+            known = self.effects[name].parameters[short]
+            step = known.sd if known.nominal + known.sd <= known.high else -known.sd
+            there = {**self.about, name: {**self.effects[name].neutral(), short: known.nominal + step}}
+            both = [self._rolled(p, new, [w.start for w in new]) for p in (self.about, there)]
+            for w, here, moved in zip(new, *both, strict=True):
+                change = {} if here is None or moved is None else _sum(moved, here, -1.0)
+                found = {n: v / step for n, v in (change or {}).items()}
+                self._slopes[w.log, w.begin, w.end, name, short] = found
+        return [self._slopes[key] for key in keys]
+
+    def _rolled(
+        self, point: Point, windows: Sequence[Window], starts: Sequence[Mapping[str, float] | None]
+    ) -> list[Channels | None]:
+        """True channels of windows, all as the simulator gives them."""
+        recordings, parameters = self.commanded(point), self.parameters(point)
+        jobs, leads = [], []
+        for window, start in zip(windows, starts, strict=True):
+            along, lead = recordings[window.log].window(window.begin, window.end), 0
             if window.regime == RESTS:
-                settling, leads[i] = settled(job.recording)
-                jobs[i] = replace(job, recording=settling)
+                along, lead = settled(along)
+            jobs.append(Job(parameters, along, start))
+            leads.append(lead)
         return [
             None if channels is None else {n: v[lead:] for n, v in channels.items()}
             for channels, lead in zip(run_all(self.simulator, jobs), leads, strict=True)
-        ]
-
-    def jobs(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Job]:
-        """One run for each window."""
-        recordings, parameters = self.commanded(point), self.parameters(point)
-        return [
-            Job(parameters, recordings[w.log].window(w.begin, w.end), start)
-            for w, start in zip(self.windows, starts, strict=True)
         ]
 
     def read(self, true: Sequence[Channels | None], point: Point) -> list[Channels | None]:
@@ -198,6 +229,11 @@ class Composed:
     def run(self, point: Point) -> list[Channels | None]:
         """True channels of every window."""
         return self.rolled(point, self.starts(point))
+
+
+def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:
+    """One and so much of another, channel by channel."""
+    return one if one is None or not other else {n: v + by * other[n] for n, v in one.items()}
 
 
 def settled(window: Recording) -> tuple[Recording, int]:

@@ -10,7 +10,7 @@ import numpy as np
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted
 from simgap.progress import say
 from simgap.robots.gap import fitted_along
-from simgap.robots.linear import Linear, base_at, numeric_at, vary
+from simgap.robots.linear import Linear, base_at, vary
 from simgap.robots.model import Composed, Point
 
 FAR = 5.0  # numerics: usual sizes
@@ -99,9 +99,9 @@ def leaders(
     told = [(f, *_gains(f, kept, held)) for kept in beside for f in every]
     first = ranked([gains for _, gains, _ in told])[: max(count - len(held), FEWEST)]
     place = [{n: k for k, n in enumerate(ranked([gains]))} for _, gains, _ in told]
-    base = numeric_at(composed, base_at(composed, linear.point))
+    base = base_at(composed, linear.point)
     more = {}
-    for name in sorted(first, key=lambda n: not composed.numeric(n)):
+    for name in first:
         say(f"{name} at its best")
         f, _, models = told[int(np.argmin([rank[name] for rank in place]))]
         at = _best_of(f, models[name], name)

@@ -1,7 +1,6 @@
 """What intervals of a set's parameters are to hold beside the noise.
 
-How far they scatter between logs, what the solver's own numerics could make of them, and what the effects
-do that held-out logs do not tell from one of the set.
+How far they scatter between logs, and what the effects do that held-out logs do not tell from one of the set.
 """
 
 from __future__ import annotations
@@ -12,24 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
-
-
-def over_numerics(f: Forms, causes: tuple[int, ...], numerics: Sequence[int]) -> Model:
-    """The set's model with the solver's own `numerics` averaged over: no robot has a step, so whatever
-    another one would make of the simulator is in the parameters' uncertainty."""
-    model, free = fitted(f, causes), [j for j in numerics if j not in causes]
-    if not free or not causes:
-        return model
-    every = tuple(sorted((*causes, *free)))
-    whole = fitted(f, every)
-    at = coordinates(f, every)
-    kept = np.concatenate([np.arange(f.spectrum.num_nuisances), *(at[j] for j in causes)])
-    return replace(
-        model,
-        x=whole.x[kept],
-        covariance=whole.covariance[np.ix_(kept, kept)],
-        at_bound=whole.at_bound[kept],
-    )
 
 
 def scattering(f: Forms, model: Model, fold: np.ndarray) -> Model:

@@ -28,7 +28,7 @@ from simgap.robots.linear import Linear, base_at, linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases
 from simgap.robots.proposals import leaders, point_of, ranked
-from simgap.robots.scatter import over_numerics, scattering
+from simgap.robots.scatter import scattering
 from simgap.robots.search import LEADERS, Found
 from simgap.robots.settle import settled
 from simgap.robots.whiten import Whitener, covariances
@@ -97,14 +97,6 @@ class _Asked:
         score = held_out_scores(f.gap, [every], fold)[:, 0]
         left = float(np.sum(self.sensor(np.nan_to_num(linear.residual)) ** 2)) - rows.size
         return _Fit(point, f, fitted(f, every), fold, score, max(left, 0.0))
-
-    def held(self, fit: _Fit, causes: Sequence[str], numerics: Sequence[str]) -> Model:
-        """A set's model with what its parameters' intervals are to hold beside the noise."""
-        linear = linearise(self.composed, fit.point, [*fitted_along(self.composed), *causes, *numerics])
-        names = [*causes, *(n for n in numerics if n in linear.moved and n not in causes)]
-        f = forms(gap_of(self.composed, linear, self.whiten, self.phases, names))
-        model = over_numerics(f, tuple(range(len(causes))), range(len(causes), len(names)))
-        return scattering(fit.forms, model, fit.fold)
 
     def likely(self, point: Point, out: str, wanted: Sequence[str]) -> list[tuple[str, tuple[Point, ...]]]:
         """Effects that gain most in the place of one that acts at a point, `out`, or that do most nearly what
@@ -180,7 +172,6 @@ def stand_ins(
     point = ended.linear.point
     acting = [n for n in point if n not in fitted_along(composed)]
     others = [n for n in wanted if n not in acting]
-    numerics = [n for n in wanted if composed.numeric(n)]
     given = composed, phases, fold, factor, ended.whiten, ended.covariances.whitener(), ended.linear.dropped
     asked = [_Asked(*given)]
     few = composed.thinned()
@@ -199,7 +190,7 @@ def stand_ins(
                     gap = fit.forms.gap
                     bear = borne_out(gap, range(len(acting)), fit.fold)
                     names = tuple(gap.candidates[j].name for j in bear)
-                    model = asked[-1].held(fit, [*fewer, name], numerics)
+                    model = scattering(fit.forms, fit.model, fit.fold)
                     found.append(StandIn(name, out, fit.forms, model, names))
                     break
     return tuple(found)

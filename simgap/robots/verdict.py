@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from simgap.attribution.search import weights
 from simgap.attribution.shares import Shares
 from simgap.attribution.verdict import LEAST, MOST, Explanation, Verdict, acting, conclude, known
 from simgap.robots.explained import Explained
-from simgap.robots.scatter import over_numerics, scattering
+from simgap.robots.scatter import scattering
 from simgap.robots.stand_ins import StandIn
 
 OPEN = 0.1  # chosen: share of what is left without a small cause that may be left with it
@@ -36,6 +35,7 @@ class RobotVerdict(Verdict):
     shared: tuple[str, ...]  # effects that the shares are of, in their order
     model: Model  # of all that was borne out, too small to be told or not, discrepancies whitened
     chance: dict[str, float]  # of each candidate to act
+    over_noise: float  # rms of what is left, in units of the noise's
     stand_ins: tuple[StandIn, ...] = ()  # what held-out logs do not tell from a cause, each at its best
 
 
@@ -58,14 +58,12 @@ def verdict_on(
     every: Forms,
     fold: np.ndarray,
     forced: bool = False,
-    numerics: tuple[int, ...] = (),
     large_alone: tuple[int, ...] = (),
 ) -> RobotVerdict:
     """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
     `causes` were borne out by held-out rows, and explain what `explains` says, in that order; `every` is the
     gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
-    statistics; `fold` (n,) of each row; `numerics` are candidates of the solver's own; those of `large_alone`
-    are no causes where they are small.
+    statistics; `fold` (n,) of each row; those of `large_alone` are no causes where they are small.
 
     A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
     channels that it moves, and the gap of these is the one that it explains. What is left in others is the
@@ -75,10 +73,9 @@ def verdict_on(
     least = open_where(explains, np.array([j not in large_alone for j in causes], bool))
     kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
     left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
-    value = _beside_numerics(sensor, causes, () if {*kept} & {*numerics} else numerics)
-    detection = detected(value, twins or None)
+    detection = detected(statistic(sensor, [fitted(sensor, causes), fitted(sensor, ())]), twins or None)
     sets = [
-        _explanation(names, m, float(w), causes, kept, known(left, 1 - left))
+        _explanation(names, m, float(w), causes, kept, known(left, explains.gone))
         for m, w in zip(models, weights(models), strict=True)
     ]
     mine = tuple(sorted(names[j] for j in kept))
@@ -99,8 +96,9 @@ def verdict_on(
         shares=replace(parts, each=parts.each[:, [causes.index(j) for j in kept]]),
         left=dict(zip(explains.regimes, explains.left.tolist(), strict=True)) if named else {},
         shared=tuple(names[j] for j in kept),
-        model=scattering(f, over_numerics(f, causes, numerics), fold),
+        model=scattering(f, fitted(f, causes), fold),
         chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
+        over_noise=explains.over_noise,
     )
 
 
@@ -113,19 +111,6 @@ def open_where(explains: Explained, small_too: np.ndarray) -> np.ndarray:
     besides: what stands in leaves much."""
     large = (explains.part >= LEAST) | (small_too[:, None] & (explains.open_without <= OPEN))
     return np.where(large, explains.where_it_acts, 1.0).min(1) if small_too.size else np.zeros(0)
-
-
-def _beside_numerics(f: Forms, causes: tuple[int, ...], numerics: tuple[int, ...]) -> float:
-    """Log Bayes factor of a gap, with the solver's step and integrator such as leave least of it.
-
-    No robot has a step. What another one makes of the simulator is no gap of the robot's where it is too
-    little to be named; where it is named, it is a cause like others, and `numerics` are none.
-    """
-    beside = [acting for k in range(len(numerics) + 1) for acting in combinations(numerics, k)]
-    return min(
-        statistic(f, [fitted(f, tuple(sorted({*causes, *a}))), fitted(f, tuple(sorted(a)))], tuple(sorted(a)))
-        for a in beside
-    )
 
 
 def _explanation(

@@ -1,19 +1,33 @@
-"""A simulator out of a user's Python file: `my_robot.py:Robot`."""
+"""A simulator out of a user's Python file: `my_robot.py:Robot`.
+
+All that a user's code does goes through `calling`, and what it gives back through `given_back`: whatever it
+does, the answer is one line that names its file and line.
+"""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import inspect
 import math
+import signal
 import sys
-from collections.abc import Callable, Mapping
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from hmmseg.errors import InputError, nearest
-from simgap.simulators.protocol import Channel, Parameter, Simulator
+import numpy as np
 
+from hmmseg.errors import InputError, nearest
+from simgap.simulators.protocol import Channel, Channels, Job, Parameter, Simulator, Values, finite
+from simgap.simulators.recording import Recording
+
+PATIENCE = 300.0  # limit: s that one call may take, unless the simulator states a `timeout` of its own
+LONGEST = 1e6  # limit: s; more is a slip of the pen
 BY_LOG = ("shift", "offset")  # what each log may have of its own (`simgap.robot_effects.by_log`)
 
 
@@ -48,27 +62,182 @@ def load_simulator(spec: str) -> UserSimulator:
     path = Path(file)
     if not path.is_file():
         raise InputError(where, f"no such file {file}", "a Python file")
-    module_spec = importlib.util.spec_from_file_location(path.stem, path)
+    module_name = f"hmmseg_simulator_{path.stem}"  # a file called scipy.py does not stand in for SciPy
+    module_spec = importlib.util.spec_from_file_location(module_name, path)
     if module_spec is None or module_spec.loader is None:
         raise InputError(where, f"{file} is no Python file", "FILE.py:NAME")
     module = importlib.util.module_from_spec(module_spec)
-    sys.modules[path.stem] = module  # dataclasses look their module up
-    try:
+    sys.modules[module_name] = module  # dataclasses look their module up
+    with calling(where, str(path), "a file that runs"):
         module_spec.loader.exec_module(module)
         if not hasattr(module, name):
             known = [n for n in vars(module) if not n.startswith("_")]
             raise InputError(where, f"{file} has no {name}", nearest(name, known))
         found = getattr(module, name)
         found = found() if inspect.isclass(found) else found
-    except InputError:
-        raise
-    except Exception as error:  # whatever a user's file may do
-        raise InputError(where, f"{type(error).__name__}: {error}", "a file that runs") from error
     return checked(found, where)
+
+
+class _Late(BaseException):
+    """A call has taken too long; no `except Exception` of the user's holds it up."""
+
+
+@contextmanager
+def calling(where: str, file: str, expected: str = "", patience: float = PATIENCE) -> Iterator[None]:
+    """Within it a user's code runs: whatever it raises becomes an InputError with the line of its `file`, and
+    so does a call of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An
+    interrupt stays one."""
+    timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+
+    def late(*_: Any) -> None:
+        raise _Late
+
+    try:
+        usual = signal.signal(signal.SIGALRM, late) if timed else None
+        try:
+            if timed:
+                signal.setitimer(signal.ITIMER_REAL, patience, 1.0)  # again, where a callback dropped it
+            yield
+        finally:
+            if timed:
+                signal.setitimer(signal.ITIMER_REAL, 0)
+                signal.signal(signal.SIGALRM, usual or signal.SIG_DFL)
+    except (InputError, KeyboardInterrupt):
+        raise
+    except _Late as error:
+        raise InputError(_line(error, where, file), f"took more than {patience:g} s", "a run that ends"
+                         ) from None  # fmt: skip
+    except BaseException as error:  # SystemExit among them
+        said = " ".join(str(error).split())[:SAID]
+        raise InputError(_line(error, where, file), f"{type(error).__name__}: {said}", expected) from error
+
+
+def _line(error: BaseException, where: str, file: str) -> str:
+    """The last line of the user's own file on the way to an exception, in its words for where."""
+    if isinstance(error, SyntaxError) and error.lineno is not None:
+        return f"{error.filename}, line {error.lineno}"
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [f for f in frames if Path(f.filename).resolve() == Path(file).resolve()]
+    return f"{file}, line {own[-1].lineno}" if own else where
+
+
+@dataclass(frozen=True)
+class Checks:
+    """How a user's functions are called: `where` they are named, their `file`, `patience` [s], and the
+    `channels` that a run must give back."""
+
+    where: str
+    file: str
+    patience: float
+    channels: tuple[str, ...]
+
+    def call(self, function: Callable[..., Any], *args: Any) -> Any:
+        """The function's answer."""
+        with calling(self.where, self.file, patience=self.patience):
+            return function(*args)
+
+    def simulate(self, run: Callable[..., Any], parameters: Values, recording: Recording,
+                 start: Values | None = None) -> Channels:  # fmt: skip
+        """One run; it gets copies of all that it might change."""
+        more = () if start is None else (dict(start),)
+        return self.given_back(run, self.call(run, dict(parameters), _lent(recording), *more), recording)
+
+    def simulate_many(self, run: Callable[..., Any], jobs: Sequence[Job]) -> list[Channels | None]:
+        """Several runs at once."""
+        lent = [Job(dict(j.parameters), _lent(j.recording), j.start) for j in jobs]
+        found = self.call(lambda: list(run(lent)))
+        if len(found) != len(jobs):
+            raise InputError(self.of(run), f"gave {len(found)} runs", f"{len(jobs)}, one for each job")
+        told = [None if f is None else self.given_back(run, f, j.recording)
+                for f, j in zip(found, jobs, strict=True)]  # fmt: skip
+        return [None if f is None else finite(f) for f in told]
+
+    def state_at(self, run: Callable[..., Any], recording: Recording, t: float) -> dict[str, Any]:
+        """State name -> (value, standard deviation)."""
+        found = self.call(run, _lent(recording), t)
+        try:
+            out = {str(n): (float(v), float(sd)) for n, (v, sd) in dict(found).items()}
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(self.of(run), f"gave {_shown(found)}",
+                             "{state: (value, standard deviation)}") from None  # fmt: skip
+        for name, (value, sd) in out.items():
+            if not (math.isfinite(value) and math.isfinite(sd) and sd >= 0):
+                raise InputError(
+                    self.of(run), f"state {name}: {value} with standard deviation {sd}", "numbers"
+                )
+        return out
+
+    def contacts(self, run: Callable[..., Any], recording: Recording) -> list[float]:
+        """Times [s]."""
+        found = self.call(run, _lent(recording))
+        try:
+            times = np.asarray(found, float)
+        except (TypeError, ValueError, OverflowError):
+            times = np.full((1, 1), np.nan)
+        if times.ndim != 1 or not np.isfinite(times).all():
+            raise InputError(self.of(run), f"gave {_shown(found)}", "times [s] in one row")
+        return [float(t) for t in times]
+
+    def given_back(self, run: Callable[..., Any], found: Any, recording: Recording) -> Channels:
+        """A run's channels as arrays (num_timesteps,); InputError names the one at fault."""
+        if not isinstance(found, Mapping):
+            raise InputError(self.of(run), f"gave {_shown(found)}", "a dict of channels")
+        out = {}
+        for name in self.channels:
+            if name not in found:
+                raise InputError(self.of(run), f"gave no channel {name!r}", f"{', '.join(self.channels)}")
+            with calling(self.where, self.file):
+                values = np.asarray(found[name])
+            where, rows = f"{self.of(run)}: channel {name}", len(recording)
+            if values.shape != (rows,):
+                raise InputError(where, f"gave {_shown(found[name])}", f"{rows} numbers, one for each time")
+            if values.dtype.kind not in "biuf":
+                try:
+                    values = values.astype(float) if values.dtype.kind == "O" else None
+                except (TypeError, ValueError, OverflowError):
+                    values = None
+                if values is None:
+                    raise InputError(where, f"gave {_shown(found[name])}", "real numbers")
+            out[name] = np.array(values, float)
+        return out
+
+    def of(self, run: Callable[..., Any]) -> str:
+        """A function by its file and line, or as the command named it."""
+        code = getattr(inspect.unwrap(getattr(run, "__func__", run)), "__code__", None)
+        return self.where if code is None else f"{code.co_filename}, line {code.co_firstlineno}"
+
+
+SAID = 200  # look: characters of a user's own message
+
+
+def _shown(value: Any) -> str:
+    """What a value is, in a few words."""
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape} of {value.dtype}"
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return "None" if value is None else f"{type(value).__name__} {str(value)[:40]!r}"
+    return f"{type(value).__name__} of {len(value)}"
+
+
+def _lent(recording: Recording) -> Recording:
+    """The recording with arrays that cannot be written to."""
+    columns = {}
+    for name, values in recording.columns.items():
+        columns[name] = values.view()
+        columns[name].flags.writeable = False
+    t = recording.t.view()
+    t.flags.writeable = False
+    return Recording(recording.name, t, columns, recording.first)
 
 
 def checked(found: Any, where: str) -> UserSimulator:
     """The object as a simulator; InputError names the attribute, parameter or channel at fault."""
+    file = where.removeprefix("--simulator ").rpartition(":")[0]
+    with calling(where, file):
+        return _checked(found, where, file)
+
+
+def _checked(found: Any, where: str, file: str) -> UserSimulator:
     run = found if inspect.isfunction(found) else getattr(found, "simulate", None)
     for name in ("parameters", "channels"):
         if not isinstance(getattr(found, name, None), Mapping):
@@ -79,7 +248,16 @@ def checked(found: Any, where: str) -> UserSimulator:
     channels = {n: _made(Channel, v, f"{where}: channel {n}") for n, v in found.channels.items()}
     if all(c.kind == "command" for c in channels.values()):
         raise InputError(where, "has no channel to compare", "one that is no command")
-    optional = {n: getattr(found, n, None) for n in ("state_at", "contacts", "simulate_many")}
+    limits = {n: getattr(found, n, None) for n in ("window", "timeout")}
+    for name, value in limits.items():
+        if value is not None and not (isinstance(value, int | float) and 0 < value <= LONGEST):
+            raise InputError(f"{where}: {name}", f"{value!r}", f"seconds above 0, {LONGEST:g} at most")
+    wanted = tuple(n for n, c in channels.items() if c.kind != "command")
+    checks = Checks(where, file, float(limits["timeout"] or PATIENCE), wanted)
+    optional = {}
+    for name in ("state_at", "contacts", "simulate_many"):
+        own = getattr(found, name, None)
+        optional[name] = None if own is None else functools.partial(getattr(checks, name), own)
     says = dict(getattr(found, "says", None) or {})
     restarted = "start" in inspect.signature(run).parameters
     given = getattr(found, "by_log", None) or {}
@@ -91,19 +269,16 @@ def checked(found: Any, where: str) -> UserSimulator:
     numerics = frozenset(getattr(found, "numerics", None) or ())
     for name in numerics - parameters.keys():
         raise InputError(f"{where}: numerics", f"no parameter {name}", nearest(name, list(parameters)))
-    window = getattr(found, "window", None)
-    if window is not None and not (isinstance(window, int | float) and 0 < window < math.inf):
-        raise InputError(f"{where}: window", f"{window!r}", "seconds above 0")
     return UserSimulator(
         parameters,
         channels,
-        run,
+        functools.partial(checks.simulate, run),
         restarted,
         says=says,
         poses=poses,
         by_log=by_log,
         numerics=numerics,
-        window=window,
+        window=limits["window"],
         **optional,
     )
 
@@ -120,7 +295,7 @@ def _made(kind: type, value: Any, where: str) -> Any:
             raise InputError(f"{where}: {key}", "unknown key", nearest(str(key), known))
     try:
         return kind(**value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(where, str(error)) from None
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from estimation.actual import read_actual
+from estimation.report import LIMITS, number, read_actual
 from hmmseg.contact.decompose import UNITS
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask
@@ -106,9 +106,8 @@ def _value(entry: Any, where: str, unit: str) -> float:
         if entry.get("unit", unit) != unit:
             raise InputError(f"{where}.unit", f"found {entry['unit']!r}", repr(unit))
         entry = entry.get("value", entry.get("mean"))
-    if isinstance(entry, bool) or not isinstance(entry, int | float) or not 0 < entry < math.inf:
-        raise InputError(where, f"found {entry!r}", f"a positive number in {unit}")
-    return float(entry)
+    low, high = LIMITS[where.rpartition(".")[2].replace("lower_bound", "friction")]
+    return number(entry, where, f"a positive number in {unit}, from {low:g} to {high:g}", low, high)
 
 
 def _friction(entry: Any, where: str) -> float:

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from estimation.actual import compare, disagreements, parse_actual, read_actual
+from estimation.report import compare, disagreements, parse_actual, read_actual
 from hmmseg.errors import InputError
 
 GOOD = {"block1": {"weight": {"unit": "N", "value": 0.343, "sd": 0.0005}}}

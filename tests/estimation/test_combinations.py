@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimation.combinations import simplest_combinations
+from estimation.design import simplest_combinations
 
 NAMES = ("a", "b", "c", "d")
 

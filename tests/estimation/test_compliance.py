@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from estimation.compliance import MISSTATED, SLOPE_SD, UNSTATED, misstated, possible_share
-from estimation.compliance import slope as slope_amid
+from estimation.pads import MISSTATED, SLOPE_SD, UNSTATED, misstated, possible_share
+from estimation.pads import slope as slope_amid
 
 DT = 0.02
 

@@ -5,12 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.design import _combined, build
-from estimation.mode import find_mode
-from estimation.moments import unexpected_bias
-from estimation.nuisance import UNLIKE
+from estimation.design import UNLIKE, _combined, build, unexpected_bias
 from estimation.observations import aligned_weights
-from estimation.posterior import posterior
+from estimation.posterior import find_mode, posterior
 from experiments.worlds import simulated_cases
 from hmmseg.io.rig import Fingertip, Rig, Systematic
 from hmmseg.segmentation.align import align

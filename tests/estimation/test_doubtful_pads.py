@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.doubtful_pads import mixed
-from estimation.nuisance import PadDoubt
-from estimation.sampler import Draws
+from estimation.design import PadDoubt
+from estimation.sampler import Draws, mixed
 
 PROPS = ("weight", "width", "height")
 

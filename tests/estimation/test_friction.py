@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.friction.posterior import FrictionPosterior, friction_posteriors
-from estimation.friction.ratio_bound import largest_ratio
-from estimation.friction.slip import Stretch, slip_evidence
+from estimation.friction import FrictionPosterior, Stretch, friction_posteriors, largest_ratio, slip_evidence
 from estimation.observations import WeighedTrial, Weights, subtask_masks
 from hmmseg.contact.decompose import FREE, subtasks
 from hmmseg.hand.signals import Signals, task_space

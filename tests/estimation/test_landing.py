@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimation.landing import first_push, landing
+from estimation.pads import first_push, landing
 
 DT = 0.01
 TOUCH = 0.503  # s, between two samples

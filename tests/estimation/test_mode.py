@@ -8,9 +8,7 @@ from estimation_scene import SD, UNIT, drawn, make_design
 from scipy.optimize import minimize
 
 from estimation import priors
-from estimation.density import log_density, padded
-from estimation.mode import find_mode
-from estimation.posterior import posterior
+from estimation.posterior import find_mode, log_density, padded, posterior
 
 
 def test_the_mode_is_stationary_and_its_covariance_the_inverse_curvature():

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
-from estimation.channel_noise import MIN_STRETCH, STATED, autocorrelation_time, learned
 from estimation.observations import (
+    MIN_STRETCH,
+    STATED,
+    autocorrelation_time,
     channel_values,
     draw_boundaries,
     gravity_factor,
     held_as_described,
+    learned,
     robust_weights,
     subtask_masks,
 )

@@ -7,9 +7,8 @@ import pytest
 from estimation_scene import TRUE, drawn, make_design
 
 from estimation import priors
-from estimation.compliance import SLOPE_SD
-from estimation.density import REACH, STEP, log_prior
-from estimation.posterior import posterior
+from estimation.pads import SLOPE_SD
+from estimation.posterior import REACH, STEP, log_prior, posterior
 
 FLAT = 1e3  # sd of a prior that is flat against a width of micrometres, but not so flat that digits go
 

@@ -8,15 +8,14 @@ import pytest
 from estimation_scene import TRUE, UNIT, drawn, make_design
 
 from estimation import priors, sampler
-from estimation.mode import find_mode
-from estimation.posterior import posterior
-from estimation.proposal import proposal
+from estimation.posterior import find_mode, posterior
 from estimation.sampler import (
     GROUPS,
     MIN_ESS,
     draw_unknowns,
     effective_sample_size,
     importance,
+    proposal,
     sample,
     split_rhat,
 )
@@ -92,11 +91,18 @@ def test_a_poorly_determined_property_follows_its_log_normal_prior():
 
 
 def test_draws_that_only_the_prior_decides_do_not_pass_as_converged():
-    """An observation far below zero: hardly a draw is positive."""
+    """Observations below zero: hardly a draw is positive, or none."""
     design = make_design(num_trials=1, objects=("left",))
-    bad = replace(design, mean=np.array([-2.0, 0.02, 0.015]), variance=np.array([0.3**2, 1e-12, 1e-12]))
-    found = sample(posterior(bad), seed=0)
-    assert found.prior_ess < 0.05 and not found.converged
+
+    def found(weight, sd):
+        bad = replace(design, mean=np.array([weight, 0.02, 0.015]), variance=np.array([sd**2, 1e-12, 1e-12]))
+        return sample(posterior(bad), seed=0)
+
+    hardly, never = found(-0.5, 0.2), found(-2.0, 0.3)
+    assert hardly.prior_ess < 0.05 and not hardly.converged and "have" in hardly.shortfall
+    assert "R-hat" not in hardly.shortfall and "effective sample size" not in hardly.shortfall
+    assert never.impossible == (0,) and never.flat[:, 0].mean() == pytest.approx(-2.0, abs=0.1)
+    assert never.converged and (never.flat[:, 1:] > 0).all()
 
 
 def test_systematic_resampling_keeps_the_weights():
@@ -135,7 +141,8 @@ def test_progress_is_told(post):
 
 def test_draws_keep_their_shapes(post):
     theta = np.zeros((5, 6))
-    found, efficiency = draw_unknowns(post, theta, np.random.RandomState(0))
+    found, efficiency, impossible = draw_unknowns(post, theta, np.random.RandomState(0))
+    assert impossible == ()
     assert found.shape == (5, len(TRUE) + 2 + 6) and 0.9 < efficiency <= 1.0 + 1e-9
 
 

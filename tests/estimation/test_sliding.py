@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.channel_noise import Noise
-from estimation.landing import landing
-from estimation.observations import WeighedTrial, Weights
-from estimation.sliding import with_slides
+from estimation.observations import Noise, WeighedTrial, Weights, with_slides
+from estimation.pads import landing
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig, Systematic
 

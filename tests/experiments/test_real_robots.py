@@ -35,7 +35,7 @@ def test_tosses_tell_the_scale_on_which_they_are_read(shared):
     assert found["verdict"] in ("named", "set")
     told = {*found["causes"], *found["indistinguishable"]}
     scales = {"readout.scale", "readout:z.gain", "geom:box.size", "readout:z.bias", "readout:z.drift"}
-    assert "readout.scale" in told and told <= scales | {"option.timestep", "option.rk4"}
+    assert "readout.scale" in told and told <= scales
     low, high = found["effects"]["readout.scale"]["parameters"]["scale"]["interval_90"]
     assert -0.026 < low < high < -0.017
     assert found["remainder"]["regimes"]["bodies move in contact"] > 0.2

@@ -2,10 +2,12 @@
 
 import re
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
 import pytest
 
+from experiments.ablation import SPECIAL
 from experiments.estimates import Estimates, summarise_estimates
 from experiments.patch_heldout import table as patched
 from experiments.table_gap import fresh
@@ -51,6 +53,10 @@ def test_every_table_has_what_writes_it_and_a_target():
 def test_a_table_becomes_comma_separated_values():
     text = "### Pooled\n\n" + markdown(["a", "b"], [["1, 2", "`c`"]]) + "\n\nnote"
     assert as_csv(text) == 'Pooled\na,b\n"1, 2",c\nnote\n'
+
+
+def test_what_the_ablation_switches_off_is_there():
+    assert all(callable(resolve_name(where)) for off in SPECIAL.values() for where, _ in off)
 
 
 def test_markdown_and_coverage():

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.actual import read_actual
+from estimation.report import read_actual
 from experiments.fuzz import run
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter, savgol_filter
 
-from hmmseg.hand.pose import smooth
+from hmmseg.hand.tool import smooth
 from hmmseg.segmentation.pads import Squeeze, _joined
 from hmmseg.segmentation.stretches import lagging
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from fault_scene import CARTESIAN, FREE, mended
 
+from estimation.checks import dense
 from estimation.identification import identify_aligned
-from estimation.remarks import dense
 from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
@@ -103,6 +103,8 @@ WRISTS = {
                             r"0\.7 kg in rig\.toml.: they look like kgf"),
     "w, x, y, z": (SWAYING, {}, lambda c: c | {f"q{a}": c[f"q{b}"] for a, b in ("xw", "yx", "zy", "wz")},
                    r'better as w, x, y, z; expected quaternion = \["qy", "qz", "qw", "qx"\] under'),
+    "another mass": (PLAIN, {"tool_mass": 2.0}, lambda c: c,
+                     r"is stated to weigh 2 kg and moves like one of 0\.7\d* kg"),
     "one finger": (PLAIN, {"opening": "finger_1"}, lambda c: c | {"finger_1": c["gap"] / 2},
                    r'halved; expected finger_1 = \{from = "finger_1", unit = 2.0\} under \[columns\]'),
 }  # fmt: skip

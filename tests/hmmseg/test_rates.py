@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hmmseg import Rig, Trial, example_folder
-from hmmseg.hand.rates import late_differences, one_sided, timely
-from hmmseg.hand.signals import task_space
+from hmmseg.hand.signals import late_differences, one_sided, task_space, timely
 
 
 def _trial() -> tuple[Trial, Rig]:

@@ -10,9 +10,8 @@ from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.contact.decompose import decompose, revealed_by
 from hmmseg.errors import InputError
-from hmmseg.hand.opening import closings, grip_of
-from hmmseg.hand.pose import pose_of
-from hmmseg.hand.tool import applied_force, free_tool
+from hmmseg.hand.tool import applied_force, free_tool, pose_of
+from hmmseg.hand.wrist import closings, grip_of
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import read_trial, trial_of
@@ -169,6 +168,21 @@ def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line
     with pytest.raises(InputError, match=line) as told:
         read_trial(columns, rig)
     assert "\n" not in str(told.value)
+
+
+def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):
+    """Readings that grow along the way look like an inertia of the other sign."""
+    setup = Setup(frame="world")
+    columns = wrist_recording(performed[0], setup)
+    for axis in "xyz":
+        if f"p{axis}" in columns:
+            columns[f"F{axis}"] = columns[f"F{axis}"] + 300.0 * (columns[f"p{axis}"] - columns[f"p{axis}"][0])
+    trials = [read_trial(columns, wrist_rig(setup, **said)) for said in ({}, {"reaction": False})]
+    for trial in trials:
+        assert any("go against the hand's own acceleration" in each for each in trial.warnings)
+    np.testing.assert_allclose(trials[0].channels["fy1"], trials[1].channels["fy1"])
+    with pytest.raises(InputError, match=r"pulls up .*expected reaction = false under"):
+        read_trial(columns, wrist_rig(setup, reaction=True))
 
 
 def test_the_line_for_a_flipped_opening_mends_it(performed):

@@ -5,13 +5,18 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder
-from hmmseg_cli.batch import recordings_in
+from hmmseg_cli import batch
+from hmmseg_cli.batch import recordings_in, segment_apart
 from hmmseg_cli.main import main
 
 STACK = Path(__file__).parents[1] / "data/stack"
@@ -106,3 +111,46 @@ def test_the_order_of_a_set_of_names_moves_no_digit(lab):
         done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONHASHSEED": seed})
         found.add(done.stdout)
     assert len(found) == 1
+
+
+class Deadly(Executor):
+    """An executor whose process dies with a recording of this name, and with it all that waits."""
+
+    def __init__(self, name, deaths, error):
+        self.name, self.deaths, self.error, self.broken = name, deaths, error, False
+
+    def submit(self, function, paths, *lab):
+        future = Future()
+        if self.deaths and any(self.name == p.stem for p in paths):
+            self.deaths.pop()
+            self.broken = True
+        if self.broken:
+            future.set_exception(self.error)
+        else:
+            future.set_result([SimpleNamespace(segmentation=str(p)) for p in paths])
+        return future
+
+
+class KilledWorker(Exception):
+    """As Dask names it."""
+
+
+KilledWorker.__module__ = "distributed.scheduler"
+
+
+@pytest.mark.parametrize("error", [BrokenProcessPool(), CancelledError(), KilledWorker()])
+@pytest.mark.parametrize(("times", "lost"), [(1, ()), (2, (6,))])
+def test_a_recording_whose_worker_is_killed_is_done_again_or_left_out(error, times, lost, monkeypatch):
+    deaths = list(range(times))
+
+    @contextmanager
+    def executor(workers, scheduler):
+        yield Deadly("6", deaths, error)
+
+    monkeypatch.setattr(batch, "_executor", executor)
+    monkeypatch.setattr(batch, "replace", lambda _, **new: new.get("file") or SimpleNamespace(**new))
+    paths, said, done = [Path(f"{i}.csv") for i in range(11)], [], []
+    found = list(segment_apart(paths, Path("task"), Path("rig"), 2, None, done.append, said.append))
+    assert [Path(f.segmentation).stem for f in found] == [str(i) for i in range(11) if i not in lost]
+    assert sum(done) == 11 and sum("6.csv: the process" in s for s in said) == len(lost)
+    assert "once more" in said[0]

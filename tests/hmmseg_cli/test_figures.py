@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from estimation.plot import corner, estimates
-from estimation.plot.corner import draw_corner
-from estimation.plot.estimates import draw_estimates
-from estimation.plot.predictive import Prediction, draw_predictive
+from estimation import plots
+from estimation.plots import Prediction, draw_corner, draw_estimates, draw_predictive
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Move
@@ -121,7 +119,7 @@ def test_corner_shows_cm_and_measured_values(tmp_path, texts):
 
 def test_corner_refuses_draws_that_are_not_the_names():
     with pytest.raises(ValueError, match=r"draws of shape \(10, 2\) for 3 names"):
-        draw_corner(np.zeros((10, 2)), NAMES, corner.Path("never.png"))
+        draw_corner(np.zeros((10, 2)), NAMES, plots.Path("never.png"))
 
 
 @pytest.mark.parametrize("actual", [None, {"block1": {"weight": (0.343, 0.0005), "width": (0.0159, 0.0001)}}])
@@ -139,14 +137,14 @@ def test_estimates_of_nothing_at_all(tmp_path):
 
 def test_row_lies_at_the_relative_residual(tmp_path, monkeypatch):
     drawn = {}
-    draw_row = estimates._draw_row
+    draw_row = plots._draw_row
 
     def record(ax, y, key, *rest):
         reach = draw_row(ax, y, key, *rest)
         drawn[key] = [line.get_xdata() for line in ax.lines]
         return reach
 
-    monkeypatch.setattr(estimates, "_draw_row", record)
+    monkeypatch.setattr(plots, "_draw_row", record)
     draw_estimates({"block1": {"weight": PROPERTIES["block1"]["weight"]}}, {"block1": {"weight": (0.4, 0.0)}},
                    tmp_path / "row.png")  # fmt: skip
     wide, narrow, centre = drawn["weight"]

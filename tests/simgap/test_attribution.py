@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from planted_gaps import gap_of, linear, rows_of
 
-from simgap.attribution.attribute import _there, attribute
+from simgap.attribution.attribute import _predicting, _there, attribute
 from simgap.attribution.background import Background
 from simgap.attribution.cells import significant
 from simgap.attribution.detection import detected, leniently, statistic
-from simgap.attribution.heldout import how_far
+from simgap.attribution.heldout import Heldout
+from simgap.attribution.noise import noise_of
 from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import Candidate, Gap, cosines
 from simgap.attribution.search import sought, weights
@@ -123,7 +124,7 @@ def test_twins_tell_by_how_much_the_bayes_factor_is_off():
 def test_of_one_effects_forms_one_acts():
     gap = gap_of({0: 3.0, 1: 3.0})
     alike = tuple(replace(c, name="a") if c.name == "b" else c for c in gap.candidates)
-    found = attribute(replace(gap, candidates=alike), nested=False)
+    found = attribute(replace(gap, candidates=alike), heldout=False)
     assert all(len({alike[j].name for j in m.effects}) == len(m.effects) for m in found.models)
 
 
@@ -134,7 +135,7 @@ def test_what_has_a_variance_of_its_own_explains_its_cells():
     nothing, n = np.zeros(0), rows.time.size
     own = Candidate("roll", (), nothing, nothing, nothing, np.zeros(n), np.zeros((n, 0)), nothing, nothing,
                     frees=np.where(loud, 1e3, 0.0))  # fmt: skip
-    found = attribute(Gap(rows, residual, np.zeros((n, 0)), (own,)), nested=False)
+    found = attribute(Gap(rows, residual, np.zeros((n, 0)), (own,)), heldout=False)
     assert found.causes == ("roll",) and found.remainder.share < 0.1
 
 
@@ -178,17 +179,17 @@ def test_rounding_makes_no_probability_larger_than_one():
     gap = gap_of({1: 3.0})
     one = fitted(forms(gap), (1,))
     several = next(n for n in range(2, 99) if sum(weights([one] * n)) > 1.0)
-    assert attribute(gap, nested=False, models=[one] * several).effects["b"].probability == 1.0
+    assert attribute(gap, heldout=False, models=[one] * several).effects["b"].probability == 1.0
 
 
 def test_two_effects_and_a_healthy_recording():
-    assert attribute(gap_of({0: 3.0, 2: 3.0}), nested=False).causes == ("a", "c")
+    assert attribute(gap_of({0: 3.0, 2: 3.0}), heldout=False).causes == ("a", "c")
     healthy = attribute(gap_of({}, seed=5))
     assert healthy.verdict == "none" and healthy.where == () and healthy.how_far is None
 
 
 def test_effects_that_nothing_tells_apart_are_a_set():
-    found = attribute(gap_of({0: 3.0}, same=True), nested=False)
+    found = attribute(gap_of({0: 3.0}, same=True), heldout=False)
     assert found.verdict == "set" and {*found.causes, *found.indistinguishable} == {"a", "b"}
 
 
@@ -205,9 +206,9 @@ def test_what_no_effect_explains_is_unknown_and_told_where():
 def test_a_gap_below_what_matters_is_none_and_told_with_its_size():
     gap = gap_of({1: 3.0})
     n = gap.residual.size
-    small = attribute(replace(gap, tolerance=np.full(n, 10.0)), nested=False)
+    small = attribute(replace(gap, tolerance=np.full(n, 10.0)), heldout=False)
     assert small.verdict == "none" and small.small_gap is not None and 0 < small.small_gap.size < 1
-    assert attribute(replace(gap, tolerance=np.full(n, 0.05)), nested=False).verdict == "named"
+    assert attribute(replace(gap, tolerance=np.full(n, 0.05)), heldout=False).verdict == "named"
 
 
 def test_a_prior_that_tolerates_is_a_prior_and_leaves_what_matters_as_likely():
@@ -237,11 +238,11 @@ def test_what_has_no_name_explains_only_what_names_do_not():
     a, b, c, d = gap.candidates
     both = np.concatenate([a.jacobian, d.jacobian], 1)
     anything = linear("anything", both, named=False)  # has the cause within it, and a little more
-    told = attribute(replace(gap, candidates=(a, b, c, anything)), nested=False)
+    told = attribute(replace(gap, candidates=(a, b, c, anything)), heldout=False)
     assert told.models[0].effects == (3,)  # more likely than the cause alone
     assert told.verdict == "named" and told.causes == ("a",)
     # Where names leave most of the gap it is unknown.
-    rest = attribute(replace(gap, candidates=(b, c, anything)), nested=False)
+    rest = attribute(replace(gap, candidates=(b, c, anything)), heldout=False)
     assert rest.verdict == "unknown" and rest.causes == ()
 
 
@@ -255,15 +256,82 @@ def test_a_cause_of_a_sliver_of_the_gap_leaves_it_unknown():
 def test_a_noise_stated_too_low_is_no_gap():
     gap = gap_of({}, seed=11)
     louder = Gap(gap.rows, 1.25 * gap.residual, gap.nuisance, gap.candidates)
-    found = attribute(louder, nested=False)
+    found = attribute(louder, heldout=False)
     assert found.verdict == "none"
     assert np.mean(list(found.noise.values())) == pytest.approx(1.25, abs=0.15)
 
 
-def test_how_far_is_nested_and_covers_what_was_planted():
+def test_how_far_covers_what_was_planted():
     gap = gap_of({0: 4.0}, seed=4)
-    far = how_far(gap, np.ones(3))
+    held = Heldout.of(gap, np.ones(3), (0, 1))
+    assert held is not None
+    far = held.how_far((0,))
     push = gap.candidates[0].jacobian[:, 0] * 4.0
     assert far is not None and far.noise_floor == 1.0
     assert far.before - 1 == pytest.approx(float(push @ push) / gap.residual.size, rel=0.35)
     assert far.interval_90[0] < far.fraction <= 1.0 and far.fraction > 0.85
+
+
+def test_a_trial_is_predicted_with_all_that_the_others_leave_open():
+    """Against the dense covariance of a trial's rows, all else as the others have it."""
+    gap = gap_of({0: 2.0, 1: -1.0}, seed=2)
+    held = Heldout.of(gap, np.array([1.0, 1.3, 0.8]), (0, 1))
+    assert held is not None
+    for effects in ((), (0,), (0, 1)):
+        squares = held._squares(effects)[0]
+        for k, (train, _) in enumerate(held.folds):
+            model, mine = fitted(train, effects), gap.rows.trial == k
+            columns = np.concatenate([gap.nuisance, *(gap.candidates[j].jacobian for j in effects)], 1)[mine]
+            noise = np.array([1.0, 1.3, 0.8])[gap.rows.channel[mine]]
+            off = gap.residual[mine] - columns @ model.x
+            covariance = np.diag(noise) + columns @ model.covariance @ columns.T
+            assert squares[k] == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-6)
+
+
+def test_what_is_of_one_trial_takes_nothing_off_the_held_out_share():
+    """Nuisances of each trial: others know nothing of them, and the cause is as good as without them."""
+    gap = gap_of({0: 4.0}, seed=4)
+    of_trial = np.eye(4)[gap.rows.trial] * (gap.rows.channel == 1)[:, None]
+    rough = replace(gap, residual=gap.residual + of_trial @ [1.5, -2.0, 1.0, -1.0],
+                    nuisance=np.concatenate([gap.nuisance, of_trial], 1))  # fmt: skip
+    found = [Heldout.of(g, np.ones(3), (0,)) for g in (gap, rough)]
+    plain, mixed = (h.how_far((0,)) for h in found if h is not None)
+    assert plain is not None and mixed is not None
+    assert mixed.fraction == pytest.approx(plain.fraction, abs=0.05)
+
+
+def test_causes_are_those_without_which_other_trials_are_predicted_worse():
+    gap = gap_of({0: 4.0, 2: 3.0}, seed=4)
+    held = Heldout.of(gap, np.ones(3), range(4))
+    assert held is not None
+    assert _predicting(held, (0, 1, 2, 3)) == (0, 2)
+    assert held.gain((0, 2), (0,)) > 3 > held.gain((0, 1, 2), (0, 2))
+
+
+def test_what_helps_the_trials_it_was_found_in_alone_is_no_cause():
+    """Half a gap is one trial's: an effect that takes it makes no other smaller."""
+    gap = gap_of({}, seed=5)
+    push, own = gap.candidates[0].jacobian[:, 0], gap.rows.trial == 1
+    residual = gap.residual + np.where(own, 12.0 * push, 0.0)
+    found = attribute(replace(gap, residual=residual))
+    assert found.detection.p_value < 1e-6 and found.verdict == "unknown"
+
+
+def test_causes_of_less_than_the_wanted_share_of_held_out_gap_are_unknown():
+    """A cause that surely acts, in a gap most of which is something else: in the other channels."""
+    gap = gap_of({0: 3.0}, seed=6)
+    rest = 9.0 * np.sin(gap.rows.time * 40.0 + gap.rows.trial) * (gap.rows.channel == 2)
+    found = attribute(replace(gap, residual=gap.residual + rest))
+    assert found.verdict == "unknown" and found.probabilities["unknown"] > 0.5
+    assert attribute(gap).causes == ("a",)
+
+
+def test_the_level_of_the_noise_is_that_of_its_mean_square_in_small_groups_too():
+    """A median of squares is less than their mean, by 6 % in groups of 6 to 18."""
+    found = []
+    for seed in range(20):
+        rng, rows = np.random.default_rng(seed), rows_of(trials=3, parts=12)
+        gap = Gap(rows, rng.standard_normal(rows.time.size), np.zeros((rows.time.size, 0)), ())
+        f = forms(gap)
+        found.append(noise_of(f, fitted(f, ())) ** 2)
+    assert np.mean(found) == pytest.approx(1.0, abs=0.04)

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
-from simgap.effects.backlash import play, within
+from simgap.effects.geometry import play, within
 from simgap.gap.between import sensed
 from simgap.gap.grips import ANYWHERE, SLIDE, _followed
 from simgap.gap.memory import driven

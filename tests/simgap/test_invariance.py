@@ -67,4 +67,4 @@ def test_what_changes_sign_between_trials_is_no_cause():
     f = forms(gap)
     model = next(m for m in sought(f) if m.effects == (0,))
     assert invariance(f, model, 0, rows.trial).log_bayes_factor < -3
-    assert attribute(gap, nested=False).verdict == "unknown"
+    assert attribute(gap, heldout=False).verdict == "unknown"

@@ -146,37 +146,61 @@ def test_a_patch_touches_only_what_changes(files):
     mujoco.MjModel.from_xml_string(again)
 
 
-def test_a_share_of_another_integrator_is_that_one_at_a_finer_step(files):
-    """What a method of first order is off by goes with its step: a third of it at a third of the step."""
-    from simgap.simulators.mjcf.load import load_mjcf
-    from simgap.simulators.mjcf.patch import SPELT
+def test_a_line_between_samples_is_half_a_sample_sooner():
+    from simgap.simulators.mjcf.signals import Held
 
-    def swung(xml: str, **change: float) -> np.ndarray:
-        found = load_mjcf(*files(xml.replace('name="pivot"', 'name="pivot" damping="0.2"')))
-        t = np.arange(0, 2, 0.01)
-        log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.sin(5 * t)})
-        found.effects([log])
-        values = {n: p.nominal for n, p in found.simulator.parameters.items()}
-        values |= {f"option.{n}": v for n, v in change.items()}
-        (channels,) = found.simulator.simulate_many([Job(values, log, {"q": 0.1, "q_rate": 0.0})])
-        assert channels is not None
-        return channels["q"]
-
-    coarse = XML.replace('timestep="0.001"', 'timestep="0.01"')
-    plain = swung(coarse)
-    for name in ("euler", "implicit", "implicitfast"):
-        fine = XML.replace('"0.001" integrator="RK4"', f'"0.0025" integrator="{SPELT[name]}"')
-        true = swung(fine)
-        off, left = np.abs(plain - true).max(), np.abs(swung(coarse, **{name: 0.25}) - true).max()
-        assert off > 1e-4 and left < 0.1 * off, name
-    np.testing.assert_allclose(swung(coarse.replace("RK4", "Euler"), rk4=1.0), plain, atol=1e-12)
+    held = Held(np.array([0.0, 0.01, 0.02]), np.arange(0, 0.02, 0.005))
+    np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 1.0), [0.5, 1.5, 1.75, 1.25])
+    np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 0.5), [0.25, 0.75, 1.875, 1.625])
 
 
-def test_the_model_s_own_integrator_is_no_candidate(files):
-    found, _, _ = loaded(files)
-    mine = {"euler", "rk4", "implicit", "implicitfast"} & {n[7:] for n in found.simulator.parameters}
-    assert mine == {"euler", "implicit", "implicitfast"}
-    with pytest.raises(InputError, match=r"option\.rk4: is the model's own integrator"):
-        loaded(files, "option.rk4")
+def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files):
+    from simgap.robot_effects import candidates
+    from simgap.robot_effects.base import Setting
+
+    found, log, _ = loaded(files)
+    made = candidates(Setting(found.simulator, [log]))
+    assert {n for n, e in made.items() if e.fitted} == found.simulator.numerics
+    assert found.simulator.numerics == {"option.timestep", "option.hold", "option.iterations"}
     with pytest.raises(InputError, match="option has no integratr"):
         loaded(files, "option.integratr")
+
+
+def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(files):
+    from simgap.robot_effects import UNMEASURED, effects_of
+
+    found, log, more = loaded(files)
+
+    def made(described: str):
+        from simgap.simulators.mjcf.load import load_mjcf
+
+        again = load_mjcf(*files(described=described + MAP))
+        more = again.effects([log])
+        return effects_of(again.simulator, [log], more)
+
+    usual = effects_of(found.simulator, [log], more)
+    stated = made('uncertain = ["joint:*.damping"]\n[sd]\n"body:bob.mass" = 0.002\n')
+    assert not usual["joint:pivot.damping"].fitted and stated["joint:pivot.damping"].fitted
+    assert not stated["joint:pivot.frictionloss"].fitted
+    assert stated["body:bob.mass"].parameters["mass"].sd == 0.002
+    wide = effects_of(found.simulator, [log], more, UNMEASURED)
+    assert wide["joint:pivot.frictionloss"].fitted and not wide["body:bob.mass"].fitted
+    with pytest.raises(InputError, match=r"uncertain: nothing is called joint:pivot\.dampin.*did you mean"):
+        made('uncertain = ["joint:pivot.dampin"]\n')
+    for line in ("sd = 1\n", '[sd]\n"body:bob.mass" = -1\n', "uncertain = 3\n"):
+        with pytest.raises(InputError):
+            made(line)
+
+
+def test_mujoco_s_warnings_are_counted_and_no_file_is_left(files, tmp_path, monkeypatch):
+    from simgap.simulators.mjcf.engine import warned
+
+    monkeypatch.chdir(tmp_path)
+    warned()
+    found, log, _ = loaded(files)
+    values = {n: p.nominal for n, p in found.simulator.parameters.items()}
+    pushed = log.with_columns({"u": np.full(len(log), 1e300)})
+    found.simulator.simulate_many([Job(values, pushed, {"q": 0.1, "q_rate": 0.0})] * 3)
+    (line,) = warned()
+    assert line.startswith("MuJoCo: ") and line.endswith(" times)") and warned() == []
+    assert not list(tmp_path.glob("*.TXT"))

@@ -1,7 +1,10 @@
 """A played session: the hand on springs, worlds side by side, the server, and a browser that stacks."""
 
 import asyncio
+import base64
+import hashlib
 import json
+import socket as socketlib
 import subprocess
 import sys
 import threading
@@ -221,13 +224,39 @@ def test_the_socket_plays_and_shrugs_at_nonsense(server):
 
 def test_another_page_is_refused(server):
     where, _ = server
-    with (
-        pytest.raises(ConnectionClosed, match="another page"),
-        connect(f"ws://{where}socket", origin="http://evil.example") as socket,
-    ):
-        socket.recv(timeout=30)
-    with pytest.raises(InvalidStatus):
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(f"ws://{where}socket", origin="http://evil.example").close()
+    with pytest.raises(InvalidStatus, match="403"):
         connect(f"ws://{where}socket", additional_headers={"Host": "evil.example"}).close()
+
+
+def test_the_page_says_what_it_may_load_and_odd_headers_are_refused(server):
+    where, _ = server
+    host, port = where.rstrip("/").split(":")
+
+    def answer(*headers: str) -> str:
+        with socketlib.create_connection((host, int(port)), timeout=30) as raw:
+            raw.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).encode())
+            return b"".join(iter(lambda: raw.recv(65536), b"")).decode()
+
+    page = answer(f"Host: {host}:{port}")
+    policy = next(line for line in page.splitlines() if line.startswith("Content-Security-Policy"))
+    assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy
+    script = page.partition("<script>")[2].partition("</script>")[0]
+    assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in policy
+    for headers in ((f"Host: {host}:{port}", f"Host: {host}:{port}"), (), ("Host: evil.example:80",)):
+        assert answer(*headers).startswith("HTTP/1.1 403")
+
+
+def test_a_session_replaces_no_file(session, tmp_path):
+    session.advance(1500)
+    (tmp_path / "trial_02.csv").write_text("mine")
+    assert [session.save(tmp_path)[-1].name for _ in range(2)] == ["trial_01.csv", "trial_03.csv"]
+    assert (tmp_path / "trial_02.csv").read_text() == "mine"
+    (tmp_path / "rig.toml").write_text("rate = 7")
+    with pytest.raises(InputError, match=r"rig\.toml: is there already, and not this session's"):
+        session.save(tmp_path)
+    assert (tmp_path / "rig.toml").read_text() == "rate = 7" and len(list(tmp_path.iterdir())) == 6
 
 
 @pytest.mark.slow

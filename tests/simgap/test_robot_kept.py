@@ -7,6 +7,7 @@ import os
 import numpy as np
 import pytest
 
+from hmmseg.cache import CacheWarning
 from simgap.robots.describe import body
 from simgap.robots.diagnose import diagnose
 from simgap.robots.kept import Kept, kept_for, modules_beside
@@ -85,8 +86,9 @@ def test_a_step_cut_short_is_made_again(tmp_path):
     kept = Kept(tmp_path)
     assert kept("one", lambda: [1, 2]) == [1, 2]
     assert kept("one", lambda: [3]) == [1, 2] and kept.of("part")("one", lambda: [3]) == [3]
-    (tmp_path / "one.pickle").write_bytes(b"\x80\x05cut")
-    assert kept("one", lambda: [3]) == [3]
+    (tmp_path / "one.npz").write_bytes(b"PK cut")
+    with pytest.warns(CacheWarning, match=r"one\.npz: not as it was written; made anew"):
+        assert kept("one", lambda: [3]) == [3]
 
 
 def test_other_inputs_have_another_folder(tmp_path, monkeypatch):

@@ -155,38 +155,3 @@ def test_how_far_out_an_effect_lies_does_not_hang_on_how_many_parameters_it_has(
         x[0] = 7.0
         priors.append(log_prior(f, replace(fitted(f, (0,)), x=x)))
     assert priors == pytest.approx([-np.log(50.0)] * 2)
-
-
-class Stepped:
-    """A course of a size, which a solver's step is as good as a change of."""
-
-    parameters = {  # noqa: RUF012
-        "size": {"nominal": 1.0, "sd": 0.3, "unit": "1"},
-        "step": {"nominal": 0.0, "sd": 0.1, "unit": "1"},
-    }
-    channels = {"y": {"unit": "m", "kind": "position", "noise": 0.01}}  # noqa: RUF012
-    numerics = ("step",)
-
-    def simulate(self, parameters, recording):
-        """At the recording's times."""
-        size, step = parameters["size"], parameters["step"]
-        return {"y": (size + step) * np.sin(3 * recording.t) + 0.1 * step * np.cos(3 * recording.t)}
-
-
-def test_what_stands_in_is_as_unsure_of_the_solver_s_step_as_the_cause_is():
-    t, rng = np.arange(0.0, 4.0, 0.02), np.random.default_rng(2)
-    course = 1.2 * np.sin(3 * t)
-    recorded = [Recording(f"{k}", t, {"y": course + 0.01 * rng.standard_normal(t.size)}) for k in range(3)]
-    simulator = checked(Stepped(), "stepped")
-    composed = Composed.of(simulator, recorded, candidates(Setting(simulator, recorded)), {"y": 0.01})
-    linear = linearise(composed, {}, ["size"])
-    sensor = covariances(composed, linear).whitener()
-    phases, every = phases_of(simulator, recorded), np.ones(linear.rows.log.size)
-    asked = _Asked(composed, phases, linear.rows.log, every, sensor, sensor, 0)
-    alone = asked.fit({"size": {"size": 1.2}}, ["size"])
-    assert alone is not None
-    sds = [
-        composed.effects["size"].parameters["size"].sd * np.sqrt(float(model.covariance[0, 0]))
-        for model in (asked.held(alone, ["size"], numerics) for numerics in ([], ["step"]))
-    ]
-    assert sds[0] < 0.002 and 0.005 < sds[1] < 0.1

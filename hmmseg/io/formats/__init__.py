@@ -64,13 +64,22 @@ def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
     file, part = split_part(path)
     kind = kind_of(file)
     try:
-        return _module(kind, path).read(file, part, wanted)
+        return checked_width(_module(kind, path).read(file, part, wanted))
     except InputError:
         raise
     except Exception as error:  # parsers of hostile files raise anything
         raise InputError(
             str(path), f"cannot be read ({_told(error)})", "a table with a header row"
         ) from error
+
+
+def checked_width(table: Table) -> Table:
+    """The table; InputError where it has more columns than any recording."""
+    from hmmseg.io.table import MAX_COLUMNS  # loads NumPy, which `hmmseg --help` does without
+
+    if len(table.names) > MAX_COLUMNS:
+        raise InputError(table.file, f"has {len(table.names)} columns", f"{MAX_COLUMNS} at most")
+    return table
 
 
 def rows_of(path: Path, kind: str) -> int | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import Table
+from hmmseg.io.table import MAX_COLUMNS, Table
 from hmmseg.io.units import known_unit
 
 COMMENTS = ("#", "%", "//")
+MAX_LINE = 10_000_000  # limit: bytes of the first line
 SPACES = r"\s+"
 SAID_SEPARATOR = re.compile(r"sep=(.)", re.IGNORECASE)  # first line of a spreadsheet's CSV
 TEXT = frozenset(range(256)) - set(range(9)) - set(range(14, 32)) - {127}  # bytes that a text may have
@@ -71,8 +73,8 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
 
 def check_unique(names: Sequence[str], where: str) -> None:
     """InputError where two columns have one name."""
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
 
 
@@ -131,6 +133,8 @@ def _layout(path: Path, encoding: str) -> Layout:
                 while header and not header[-1].strip():  # separators at the ends of lines
                     header.pop()
                 most = len(header)
+                if most > MAX_COLUMNS:
+                    raise InputError(str(path), f"has {most} columns", f"{MAX_COLUMNS} at most")
                 if number in skipped[-1:]:
                     continue
             if text.count('"') % 2:
@@ -186,7 +190,9 @@ def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] |
 
 def _encoding(path: Path) -> str:
     with path.open("rb") as file:
-        start = file.read(4)
+        start = file.readline(MAX_LINE)
+    if len(start) == MAX_LINE:
+        raise InputError(f"{path}: row 1", f"is longer than {MAX_LINE} bytes", "a table with a header row")
     return "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 

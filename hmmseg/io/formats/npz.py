@@ -16,6 +16,8 @@ from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
 
 MAX_MEMBER = 16 * MAX_ROWS  # bytes of one array
 MAX_ARCHIVE = 8 * MAX_MEMBER  # bytes of all that are read
+BOMB = 2**28  # limit: bytes; an archive that unpacks to more than this
+PACKED = 200  # limit: and to so many times its size holds nothing that was measured: readings have noise
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -36,11 +38,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
             name for name in names
             if wanted is None or name in wanted or any(each.startswith(f"{name}[") for each in wanted)
         ]  # fmt: skip
-        left = MAX_ARCHIVE
-        for name in chosen:
-            left -= _claimed(path, archive, name)
-            if left < 0:
-                raise InputError(str(path), f"unpacks to more than {MAX_ARCHIVE} bytes", "a recording")
+        _check_size(path, sum(_claimed(path, archive, name) for name in chosen))
         file.seek(0)
         arrays = np.load(file, allow_pickle=False)
         columns = flat({name: arrays[name] for name in chosen})
@@ -101,10 +99,15 @@ def unpack(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an archive by name, with the same checks."""
     with zipfile.ZipFile(path) as archive:
         names = [each.filename.removesuffix(".npy") for each in archive.infolist()]
-        for name in names:
-            _claimed(path, archive, name)
+        _check_size(path, sum(_claimed(path, archive, name) for name in names))
     with np.load(path, allow_pickle=False) as file:
         return {name: file[name] for name in names}
+
+
+def _check_size(path: Path, size: int) -> None:
+    packed = path.stat().st_size
+    if size > MAX_ARCHIVE or (size > BOMB and size > PACKED * packed):
+        raise InputError(str(path), f"unpacks from {packed} to {size} bytes", "a recording")
 
 
 def _claimed(path: Path, archive: zipfile.ZipFile, name: str) -> int:

@@ -15,7 +15,8 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
-from simgap.simulators.mjcf.settable import INTEGRATORS, integrator_of, setting_of
+from simgap.simulators.mjcf.runs import HOLD
+from simgap.simulators.mjcf.settable import setting_of
 from simgap.simulators.mjcf.setting import Setting, name_of, names_of
 from simgap.simulators.mjcf.state_friction import SHARE, sizes_of, state_friction
 from simgap.simulators.protocol import Parameter
@@ -129,15 +130,15 @@ class _Catalogue:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
 
     def add_options(self) -> None:
-        """Gravity's direction and the simulator's own step, integrator and solver."""
+        """Gravity's direction, and of the simulation its step, its solver and how it holds commands."""
         if np.linalg.norm(self.model.opt.gravity) > 0:
             for axis in ("tilt_x", "tilt_y"):
                 self.add(f"option.{axis}", 0.01, "the base is tilted", effect="gravity.direction")
         says = "the simulator's own time step, relative"
         self.add("option.timestep", 0.5, says, low=-1.1, high=1.0)
-        for name in (n for n in INTEGRATORS if integrator_of(n) != int(self.model.opt.integrator)):
-            says = f"the simulator's integrator: this share of what {name} gives"
-            self.add(f"option.{name}", 0.5, says, low=0.0, high=1.1)
+        if self.simulator.driven:
+            says = "commands between samples: in steps (0), in lines (1, half a sample sooner), as late (-1)"
+            self.add(HOLD, 0.5, says, low=-1.0, high=1.0)
         if self.simulator.touching:
             says = "iterations of the simulator's solver: ten times as many"
             self.add("option.iterations", 0.3, says, low=0.0, high=1.0)

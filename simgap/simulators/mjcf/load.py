@@ -72,13 +72,18 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     if mujoco.__version__ == "4.0.0":
         raise InputError("--mjcf", "MuJoCo 4.0.0 has a solver bug", "another version from 3 on")
     if not xml.is_file():
-        raise InputError(f"--mjcf {xml}", "no such file", "an MJCF file")
+        raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
+    if xml.suffix.lower() == ".mjb":
+        raise InputError(f"--mjcf {xml}", "is compiled: no sensor can be added", "its MJCF or URDF file")
     described = read_map(map_file)
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
         plain = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
+    if not SHORTEST <= plain.opt.timestep <= 1.0:
+        raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
+                         f"from {SHORTEST:g} to 1 s")  # fmt: skip
     from simgap.simulators.mjcf.settable import setting_of
     from simgap.simulators.mjcf.setting import names_of
 
@@ -251,6 +256,7 @@ def _check_unit(described: Map, column: Mapped, si: str) -> None:
         )
 
 
+SHORTEST = 1e-6  # limit: s of a solver's step; a second of it would take minutes
 LATITUDE = 0.2  # limit: share of a joint's range by which a log may exceed it
 
 

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.schema import read_toml
+from hmmseg.io.schema import LARGEST, read_toml
 from hmmseg.io.units import si_factor
+from simgap.simulators.user import LONGEST
 
 THINGS = ("joint", "actuator", "sensor", "body", "site")
 AXES = {"body": ("x", "y", "z", "qw", "qx", "qy", "qz"), "site": ("x", "y", "z", "qw", "qx", "qy", "qz")}
@@ -30,7 +31,7 @@ KINDS = {
     "site": ("position",),
 }
 KEYS = (*THINGS, "kind", "axis", "unit", "noise", "sign", "offset")
-TOP = ("columns", "time", "window", "keyframe")
+TOP = ("columns", "time", "window", "keyframe", "uncertain", "sd")
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Mapped:
 @dataclass(frozen=True)
 class Map:
     """The columns, the `time` column with its factor to s, windows' `length` [s], the `keyframe` to start
-    what no column tells from."""
+    what no column tells from; `uncertain`: patterns of what was never measured, `sd` by name of what was."""
 
     file: str
     columns: Mapping[str, Mapped]
@@ -60,7 +61,8 @@ class Map:
     time_factor: float = 1.0
     length: float | None = None
     keyframe: str | None = None
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    uncertain: tuple[str, ...] = ()
+    sd: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_map(path: Path) -> Map:
@@ -74,6 +76,17 @@ def read_map(path: Path) -> Map:
         raise InputError(f"{path}: columns", "missing", "a table [columns.NAME] for each column of the logs")
     time = raw.get("time", {})
     time = {"column": time} if isinstance(time, str) else time
+    if not isinstance(time, dict) or not isinstance(time.get("column", ""), str):
+        raise InputError(
+            f"{path}: time", f"found {time!r:.40}", 'a column\'s name, or {column = "...", unit = "..."}'
+        )
+    window, keyframe = _number(raw, "window", str(path)), raw.get("keyframe")
+    if window is not None and not 0 < window <= LONGEST:
+        raise InputError(f"{path}: window", f"found {window:g}", f"seconds above 0, {LONGEST:g} at most")
+    if keyframe is not None and not isinstance(keyframe, str):
+        raise InputError(
+            f"{path}: keyframe", f"found {keyframe!r:.40}", "the name of a keyframe of the model"
+        )
     found = {name: _mapped(name, entry, f"{path}: columns.{name}") for name, entry in columns.items()}
     if all(m.kind == "command" for m in found.values()):
         raise InputError(
@@ -84,9 +97,27 @@ def read_map(path: Path) -> Map:
         found,
         time.get("column", "t"),
         _unit(time.get("unit"), f"{path}: time.unit"),
-        _number(raw, "window", str(path)),
-        raw.get("keyframe"),
+        window,
+        keyframe,
+        _patterns(raw.get("uncertain", []), f"{path}: uncertain"),
+        _deviations(raw.get("sd", {}), f"{path}: sd"),
     )
+
+
+def _patterns(names: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise InputError(where, f"{names!r}", 'a list of names such as "joint:elbow.frictionloss"')
+    return tuple(names)
+
+
+def _deviations(stated: Any, where: str) -> dict[str, float]:
+    if not isinstance(stated, dict):
+        raise InputError(where, "is no table", '"body:arm.mass" = 0.01, say')
+    found = {name: _number(stated, name, where) for name in stated}
+    for name, sd in found.items():
+        if sd <= 0:
+            raise InputError(f"{where}.{name}", f"{sd:g}", "above 0")
+    return found
 
 
 def _mapped(column: str, entry: Any, where: str) -> Mapped:
@@ -142,8 +173,8 @@ def _number(entry: Mapping[str, Any], key: str, where: str, default: Any = None)
     if key not in entry:
         return default
     value = entry[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}.{key}", f"{value!r}", "a number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise InputError(f"{where}.{key}", f"{value!r:.40}", "a number")
     return float(value)
 
 

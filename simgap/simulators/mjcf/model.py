@@ -15,7 +15,7 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
-from simgap.simulators.mjcf.runs import Runs
+from simgap.simulators.mjcf.runs import HOLD, Runs
 from simgap.simulators.mjcf.setting import Setting
 from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
@@ -143,8 +143,18 @@ class MjcfSimulator:
 
     @property
     def numerics(self) -> frozenset[str]:
-        """Parameters of the solver, not of the robot: what they change is small, and costs further runs."""
-        return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
+        """Parameters of the simulation, not of the robot."""
+        return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n == HOLD)
+
+    @property
+    def uncertain(self) -> tuple[str, ...]:
+        """Patterns of what was never measured, as the map has it."""
+        return self.map.uncertain
+
+    @property
+    def sd(self) -> Mapping[str, float]:
+        """Standard deviations that the map states, by effect."""
+        return self.map.sd
 
     @property
     def states(self) -> tuple[str, ...]:

@@ -3,37 +3,48 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from simgap.robots.diagnose import RobotDiagnosis
+from simgap.robots.model import Composed, Point
+from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.setting import object_id
 
-SPELT = {"euler": "Euler", "rk4": "RK4", "implicit": "implicit", "implicitfast": "implicitfast"}  # in MJCF
 
+def patched(model: Path, composed: Composed, point: Point, changed: Sequence[str]) -> tuple[str, list[str]]:
+    """The XML's text with some effects at a point, and those that no attribute of it holds.
 
-def patched(xml: Path, found: RobotDiagnosis) -> tuple[str, list[str]]:
-    """The XML's text with the causes at their values, and the causes that no attribute of it holds.
-
-    Values are written where the file states the object; inertia that geoms imply is stated explicitly.
+    Values are written where the file states the object; inertia that geoms imply is stated explicitly. What
+    is no MJCF (a URDF) is written as MuJoCo has it.
     """
-    simulator = found.composed.simulator
-    text, untouched = xml.read_text(encoding="utf-8"), []
-    parameters = found.composed.parameters(found.linear.point)
-    for cause in found.verdict.causes:
-        effect = found.composed.effects[cause]
+    simulator: Any = composed.simulator
+    text, untouched = text_of(model), []
+    parameters = composed.parameters(point)
+    for one in changed:
+        effect = composed.effects[one]
         if not effect.model:
-            untouched.append(f"{cause}: {effect.says}")
+            untouched.append(f"{one}: {effect.says}")
             continue
         for name in effect.model.values():
-            changed = _written(text, simulator, name, parameters)
-            if changed is None:
+            there = _written(text, simulator, name, parameters)
+            if there is None:
                 untouched.append(f"{name}: {effect.says}")
             else:
-                text = changed
+                text = there
     return text, untouched
+
+
+def text_of(model: Path) -> str:
+    """A model as MJCF."""
+    text = model.read_text(encoding="utf-8")
+    if re.search(r"<mujoco\b[^>]*>", text) and "<robot" not in text:
+        return text
+    spec = mujoco.MjSpec.from_file(str(model))
+    spec.compile()
+    return spec.to_xml()
 
 
 def _written(text: str, simulator, name: str, parameters: Mapping[str, float]) -> str | None:
@@ -70,8 +81,6 @@ def _actuator(model, thing: str, attribute: str, value: float) -> str | None:
 
 
 def _option(model, name: str, attribute: str, value: float, parameters: Mapping[str, float]) -> str | None:
-    if attribute == "integrator":  # a share is none: the nearer of the two
-        return SPELT[name] if round(value) == 1 else None
     if attribute == "timestep":
         return number(model.opt.timestep * max(1 + value, 0.25))
     if attribute != "gravity":

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.runs import HOLD
 from simgap.simulators.mjcf.settable_parts import actuator_setting, body_setting, geom_setting, joint_setting
 from simgap.simulators.mjcf.setting import Setting, names_of
 
@@ -24,18 +24,12 @@ KNOWN = {
     "site": (),
     "equality": (),
 }
-INTEGRATORS = {"euler": "EULER", "rk4": "RK4", "implicit": "IMPLICIT", "implicitfast": "IMPLICITFAST"}
-OPTIONS = ("tilt_x", "tilt_y", "timestep", *INTEGRATORS, "iterations")
-
-
-def integrator_of(name: str) -> int:
-    """MuJoCo's number of an integrator."""
-    return int(getattr(mujoco.mjtIntegrator, f"mjINT_{INTEGRATORS[name]}"))
+OPTIONS = ("tilt_x", "tilt_y", "timestep", "iterations", "hold")
 
 
 def option_setting(model: Any, attribute: str) -> Setting | None:
-    """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), one of INTEGRATORS
-    (0: the model's own, 1: this one; None if it is that), iterations (0: as they are, 1: ten times)."""
+    """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), iterations (0: as it
+    is, 1: ten times), hold (of commands between samples; 0: in steps, 1: in lines to the next)."""
     down = np.array(model.opt.gravity)
     if attribute in ("tilt_x", "tilt_y"):
         axis = 0 if attribute == "tilt_x" else 1
@@ -55,17 +49,8 @@ def option_setting(model: Any, attribute: str) -> Setting | None:
         return Setting(
             "option.timestep", "1", lambda m: 0.0, scale, False, ("option", "", "timestep", None), -0.75
         )
-    if attribute in INTEGRATORS:
-        number = integrator_of(attribute)
-        if number == int(model.opt.integrator):
-            return None
-
-        def other(m: Any, value: float) -> None:
-            m.opt.integrator = number
-
-        return Setting(
-            f"option.{attribute}", "1", lambda m: 0.0, other, False, ("option", "", "integrator", None), 1.0
-        )
+    if attribute == "hold":  # of the commands and not of the model: `Runs` has it
+        return Setting(HOLD, "1", lambda m: 0.0, lambda m, value: None, False, None)
     if attribute == "iterations":
         count = int(model.opt.iterations)
 
@@ -85,8 +70,6 @@ def setting_of(model: Any, name: str) -> Setting:
     kind, _, thing = head.partition(":")
     if kind == "option" and dot:
         found = option_setting(model, attribute)
-        if found is None and attribute in INTEGRATORS:
-            raise InputError(where, "is the model's own integrator", "another one")
         if found is None:
             raise InputError(where, f"option has no {attribute}", nearest(attribute, OPTIONS))
         return found

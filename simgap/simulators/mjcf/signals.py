@@ -20,20 +20,25 @@ class Held:
         self.width = np.diff(self.edges)
         self.at = self._at(since)
 
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Means (..., steps) of a column (..., n); missing samples hold the one before."""
+    def __call__(self, values: np.ndarray, line: float = 0.0) -> np.ndarray:
+        """Means (..., steps) of a column (..., n); missing samples hold the one before. `line`: the share of
+        the line to the next sample, in the place of a step."""
         seen = np.isfinite(values)
         if seen.all():
             t, u, k = self.since, values, self.at
         elif values.ndim > 1:
-            return np.stack([Held(t, self.times)(v) for t, v in zip(self.since, values, strict=True)])
+            each = zip(self.since, values, strict=True)
+            return np.stack([Held(t, self.times)(v, line) for t, v in each])
         else:
             t, u = self.since[seen], values[seen]
             k = self._at(t)
-        done = np.cumsum(u[..., :-1] * np.diff(t), -1)
+        rise, wide = np.diff(u), np.diff(t)
+        done = np.cumsum((u[..., :-1] + 0.5 * line * rise) * wide, -1)
         area = np.concatenate([np.zeros((*done.shape[:-1], 1)), done], -1)
-        here, held, begun = (np.take_along_axis(v, k, -1) for v in (area, u, t))
-        return np.diff(here + held * (self.edges - begun)) / self.width
+        slope = np.concatenate([line * rise / wide, np.zeros((*done.shape[:-1], 1))], -1)
+        here, held, begun, steep = (np.take_along_axis(v, k, -1) for v in (area, u, t, slope))
+        late = self.edges - begun
+        return np.diff(here + (held + 0.5 * steep * late) * late) / self.width
 
     def _at(self, t: np.ndarray) -> np.ndarray:
         """The sample that is held at each edge."""

@@ -1,0 +1,535 @@
+"""Friction of the fingers against each block: its lower bound, and its value where a grip slipped.
+
+Coulomb's law: |shear| <= mu x normal force in every held sample (the paper's Table 3 takes the
+largest ratio of the recorded ones). The bound here is the posterior of the largest true ratio
+(ratio_bound.py); a finger that slips (slip.py) is at the limit, so the bound is then mu itself.
+Where a block is slid, the net force tells the friction against its support (ground.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from estimation.observations import MIN_FREE, WeighedTrial, gravity_factor
+from estimation.report import summary
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
+from hmmseg.hand.signals import Signals
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.task import BlockTask
+from hmmseg.levels import SURE
+from hmmseg.robust import robust_sd
+from hmmseg.segmentation.emissions import acceleration
+
+MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
+FEWEST = 4  # numerics: samples of sliding
+WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little to tell
+COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
+
+
+@dataclass(frozen=True)
+class GroundFriction:
+    """Posterior draws (num_draws,) of the friction coefficient against `support` ("ground" or a block)."""
+
+    support: str
+    mu_draws: np.ndarray
+
+
+def ground_friction(
+    weighed: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
+    sd_force: float, rng: np.random.Generator, num_draws: int,
+) -> GroundFriction | None:  # fmt: skip
+    """Friction of a block on what it is slid on; None where it is not, or where that tells too little.
+
+    The last support counts where a task slides the block on several.
+    """
+    slid = [s for s in steps if s.object == obj and s.state == SLIDING and s.move is not None]
+    if not slid:
+        return None
+    support = task.performed[slid[-1].move or 0].to
+    rows = [_rows(a, s, rig) for a in weighed for s in slid if task.performed[s.move or 0].to == support]
+    table = np.concatenate(rows)
+    if len(table) < FEWEST:
+        return None
+    stated = weighed[0].signals.sd_force
+    noise = 2 * (stated if np.isfinite(stated) else sd_force) ** 2
+    log_posterior = _log_posterior(table, noise, _carried(weighed, steps, obj, rig, noise))
+    probability = np.exp(log_posterior - log_posterior.max())
+    cdf = np.cumsum(probability * np.gradient(COEFFICIENTS))
+    draws = np.interp(rng.uniform(size=num_draws) * cdf[-1], cdf, COEFFICIENTS)
+    return GroundFriction(support, draws) if draws.std() < WIDEST * draws.mean() else None
+
+
+def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
+    """Rows (num_samples, 3) of d fx [N], d a / g and fy [N] while the block surely slides."""
+    s, free = a.signals, a.weights.free
+    sliding = a.masks[:, step.index].all(axis=0) & np.isfinite(s.fx + s.fy + s.vx)
+    if not sliding.any():
+        return np.zeros((0, 3))
+    direction = np.sign(np.median(s.vx[sliding]))
+    sd = np.where(np.isfinite(s.sd_vx), s.sd_vx, 0.0) / np.sqrt(2.0)
+    sliding &= direction * np.nan_to_num(s.vx) > MOVING * sd
+    bias_x, bias_y = (float(free @ np.nan_to_num(f)) for f in (s.fx, s.fy))
+    lag = direction * np.nan_to_num(acceleration(s.t, s.vx)) / rig.gravity
+    return np.stack([direction * (s.fx - bias_x), lag, s.fy - bias_y], axis=1)[sliding]
+
+
+def _carried(
+    weighed: Sequence[WeighedTrial], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
+) -> tuple[float, float] | None:
+    """Weight and its sd [N] as carries of the same block tell it; None where it is not carried."""
+    moves = [s.move for s in steps if s.object == obj and s.state == ABOVE_GROUND and s.move is not None]
+    means, counts = [], []
+    for a in weighed:
+        factor, s = gravity_factor(a.signals, rig), a.signals
+        bias = float(a.weights.free @ np.nan_to_num(s.fy))
+        for move in moves:
+            weight, count = a.weights.grips[move]["force"].mean(axis=0), a.weights.counts[move]["force"]
+            if count.min() > 0:
+                means.append(float(weight @ np.nan_to_num(s.fy - bias) / (weight @ factor)))
+                counts.append(float(count.mean()))
+    if not means:
+        return None
+    total = float(np.sum(counts))
+    return float(np.dot(means, counts) / total), float(np.sqrt(noise / total)) + 0.005 * abs(means[0])
+
+
+def _log_posterior(table: np.ndarray, noise: float, carried: tuple[float, float] | None) -> np.ndarray:
+    """Log density (num_coefficients,) of the law with noise in both net forces, weight marginalised.
+
+    For a given mu the law is linear in W: d fx + mu fy = W (mu + d a / g). The prior of W is
+    Gaussian as `carried` has it, otherwise flat in its logarithm.
+    """
+    left = table[:, 0] + COEFFICIENTS[:, None] * table[:, 2]
+    right = COEFFICIENTS[:, None] + table[:, 1]
+    variance = noise * (1 + COEFFICIENTS**2)
+    mean, precision = (0.0, 0.0) if carried is None else (carried[0], carried[1] ** -2)
+
+    def fitted(inflated: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        information = (right**2).sum(axis=1) / inflated + precision
+        weight = ((left * right).sum(axis=1) / inflated + mean * precision) / information
+        square = ((left - weight[:, None] * right) ** 2).sum(axis=1) / inflated
+        return square + precision * (weight - mean) ** 2, weight, information
+
+    excess = max(float(fitted(variance)[0].min()) / max(len(table) - 2, 1), 1.0)
+    square, weight, information = fitted(variance * excess)
+    out = -0.5 * (square + len(table) * np.log(variance) + np.log(information))
+    flat = np.log(np.maximum(weight, 1e-6)) if carried is None else 0.0
+    return np.where(weight > 0, out - flat, -np.inf)
+
+
+PRIOR = 0.05  # prior: probability of slip before the anchors are seen
+SLIPPED = 0.99  # chosen: probability from which slip is said to be seen
+STRAY = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
+STRAY_DRIFT = 2e-3  # prior: m per root second
+SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s of a slipping pad
+STUCK = 0.5  # prior: probability that a pad near its limit holds all the same
+PERSISTENCE = 0.01  # prior: s over which the speed of a slipping pad varies
+DRIFTS = (0.0, 3e-5, 1e-4, 3e-4)  # prior: m per root second
+DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior: of these: most pads hold still
+ANYWHERE = 0.01  # prior: m; prior sd of an anchor's height
+NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One finger on one resting block, arrays (num_samples,).
+
+    `t` [s], `anchor` [m] (height less nominal shear deflection) and its noise `sd` [m], `shear`
+    [N], `ratio` of shear to normal force (signed) and its noise `ratio_sd`; `compliance` [m/N] is
+    the standard deviation of the pad's error.
+    """
+
+    t: np.ndarray
+    anchor: np.ndarray
+    sd: np.ndarray
+    shear: np.ndarray
+    ratio: np.ndarray
+    ratio_sd: np.ndarray
+    compliance: float
+
+
+@dataclass(frozen=True)
+class SlipEvidence:
+    """Posterior probability of slip, the log Bayes factor behind it, and whether slip was seen."""
+
+    probability: float
+    log_bayes_factor: float
+    seen: bool
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Stretches of one length after padding, arrays (num_stretches, longest)."""
+
+    t: np.ndarray
+    anchor: np.ndarray
+    variance: np.ndarray
+    shift: np.ndarray
+    there: np.ndarray
+
+
+def slip_evidence(
+    stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
+) -> SlipEvidence:
+    """Slip of one block's grips, its coefficient being its bound: draws (num_draws,).
+
+    `others`: stretches with other blocks, which tell how much anchors drift without slip.
+    """
+    stretches = [s for s in stretches if s.t.size > 2]
+    every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])
+    if not stretches:
+        return SlipEvidence(PRIOR, 0.0, False)
+    count, batch = len(stretches), _padded(every)
+    stray = _log_likelihood(batch, STRAY_DRIFT) + np.log(STRAY)
+    still = np.stack([_log_likelihood(batch, drift) for drift in DRIFTS]) + np.log(1 - STRAY)
+    still = np.logaddexp(still, stray)
+    log_drift = np.log(np.asarray(DRIFT_PRIOR))[:, None]
+    moved = []
+    for coefficient in np.quantile(bound_draws, (0.1, 0.5, 0.9)):
+        own = still.copy()
+        own[:, :count] = _may_slip(batch, still, *_slip_path(every[:count], float(coefficient), batch))
+        moved.append(own)
+    joint = log_drift.T + np.sum(moved, axis=2)
+    factor = float(logsumexp(joint) - np.log(len(moved)) - logsumexp(log_drift[:, 0] + still.sum(axis=1)))
+    odds = factor + np.log(PRIOR / (1 - PRIOR))
+    probability = float(1 / (1 + np.exp(-np.clip(odds, -700, 700))))
+    return SlipEvidence(probability, factor, probability > SLIPPED)
+
+
+def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
+    """Anchor noise raised to what second differences show, where the stated noise is too small."""
+    bends = [np.diff(s.anchor, 2) / s.sd[1:-1] for s in stretches if s.t.size > 3]
+    if not bends:
+        return stretches
+    shown = robust_sd(np.concatenate(bends)) / np.sqrt(6.0)
+    return [replace(s, sd=s.sd * max(shown, 1.0)) for s in stretches]
+
+
+def _padded(stretches: list[Stretch]) -> _Batch:
+    shape = (len(stretches), max(s.t.size for s in stretches))
+    out = _Batch(np.zeros(shape), np.zeros(shape), np.ones(shape), np.zeros(shape), np.zeros(shape, bool))
+    for i, s in enumerate(stretches):
+        n = s.t.size
+        out.t[i, :n], out.variance[i, :n], out.there[i, :n] = s.t - s.t[0], s.sd**2, True
+        out.anchor[i, :n] = s.anchor - np.median(s.anchor)
+        out.shift[i, :n] = s.compliance * (s.shear - s.shear.mean())
+    return out
+
+
+def _slip_path(stretches: list[Stretch], coefficient: float, batch: _Batch) -> tuple[np.ndarray, np.ndarray]:
+    """Time [s] during which each pad may have slipped until each sample, and the same signed by shear.
+
+    Arrays (len(stretches), longest stretch).
+    """
+    time, signed = np.zeros((2, len(stretches), batch.t.shape[1]))
+    for i, s in enumerate(stretches):
+        near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - NEAR * s.ratio_sd)
+        sign = np.where(near[1:] != 0, near[1:], near[:-1])
+        steps = np.diff(s.t)
+        time[i, 1 : s.t.size] = np.cumsum(steps * np.abs(sign))
+        signed[i, 1 : s.t.size] = np.cumsum(steps * sign)
+    return time, signed
+
+
+def _may_slip(batch: _Batch, still: np.ndarray, time: np.ndarray, signed: np.ndarray) -> np.ndarray:
+    """Log density (num_drifts, num_stretches) where each pad slips at some speed or is stuck."""
+    out = still[:, : len(time)].copy()
+    near = np.flatnonzero(time.any(axis=1))
+    if near.size == 0:
+        return out
+    chosen = _Batch(*(values[near] for values in vars(batch).values()))
+    for i, drift in enumerate(DRIFTS):
+        moving = [_log_likelihood(chosen, drift, v, time[near], signed[near]) for v in SPEEDS]
+        slips = logsumexp(moving, axis=0) + np.log((1 - STUCK) / len(SPEEDS))
+        out[i, near] = np.logaddexp(slips, out[i, near] + np.log(STUCK))
+    return out
+
+
+def _log_likelihood(
+    batch: _Batch, drift: float, speed: float = 0.0,
+    time: np.ndarray | None = None, signed: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Log density (num_stretches,) of the anchors under one drift and one speed of slip."""
+    there = batch.there[:, :, None] & batch.there[:, None, :]
+    covariance = ANYWHERE**2 + batch.shift[:, :, None] * batch.shift[:, None, :]
+    covariance += drift**2 * np.minimum(batch.t[:, :, None], batch.t[:, None, :])
+    residual = batch.anchor
+    if time is not None and signed is not None:
+        covariance += speed**2 * PERSISTENCE * np.minimum(time[:, :, None], time[:, None, :])
+        residual = residual - speed * signed
+    covariance = np.where(there, covariance, 0.0) + batch.variance[:, :, None] * np.eye(there.shape[1])
+    # Padding has unit variance and no residual, so it adds nothing to either term.
+    factor = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(factor, residual[:, :, None])[:, :, 0]
+    diagonal = np.diagonal(factor, axis1=1, axis2=2)
+    size = batch.there.sum(axis=1)
+    return -0.5 * (white**2).sum(axis=1) - np.log(diagonal).sum(axis=1) - 0.5 * size * np.log(2 * np.pi)
+
+
+CONCENTRATION = 1.0  # prior: weight of G, in samples
+BINS_PER_SD = 3.0  # numerics: bins of G to the smallest noise
+MAX_BINS = 300  # numerics: of G at most: its cost is linear in them
+GLITCH = 0.01  # prior: share of samples that say nothing: a bound must rest on more than one
+BURN_IN, SWEEPS = 20, 48  # numerics: of Gibbs sampling: left out, and kept
+CORROBORATING = 8  # chosen: samples of which surely not all are glitches
+REACH = 5.0  # numerics: standard deviations beyond which a sample cannot be the largest
+
+
+def largest_ratio(
+    ratio: np.ndarray, sd: np.ndarray, held: np.ndarray, rng: np.random.Generator, num_draws: int
+) -> np.ndarray:
+    """Posterior draws (num_draws,) of the largest true ratio.
+
+    `ratio`, `sd` (num_samples,): measured absolute ratios and their noise; `held`
+    (num_alignments, num_samples): under which drawn alignment each sample counts. Alignments are
+    marginalised in the maximum; G is learned from the samples of all of them.
+    """
+    edges = _edges(ratio, sd)
+    centres = (edges[1:] + edges[:-1]) / 2
+    # A Dirichlet's upper part is independent of how its lower part is split: samples that cannot
+    # be the largest enter by their number only.
+    often = held.mean(axis=0)
+    lower = np.sort(np.where(often == often.max(), ratio - REACH * sd, 0.0))
+    cut = lower[-min(CORROBORATING, lower.size)]
+    high = ratio + REACH * sd > cut
+    top = centres > cut - REACH * sd[high].max()
+    low_count = float((~high).sum()) + CONCENTRATION * float(np.mean(~top))
+    prior = np.full(int(top.sum()), CONCENTRATION / centres.size)
+    likelihood = _likelihood(ratio[high], sd[high], centres[top])
+    log_likelihood = np.log(likelihood + 1e-300)
+    glitch = GLITCH / (1 - GLITCH) / edges[-1]
+    held = held[:, high]
+    weights = np.full(prior.size, 1.0 / centres.size)
+    cdf = np.zeros(prior.size)
+    for sweep in range(BURN_IN + SWEEPS):
+        shares = np.cumsum(likelihood * weights, axis=1)
+        total = shares[:, -1] + glitch
+        if sweep >= BURN_IN:
+            log_below = np.log((shares + glitch) / total[:, None])
+            cdf += np.exp(held @ log_below).mean(axis=0) / SWEEPS
+        bins = (shares < (rng.uniform(size=total.size) * total)[:, None]).sum(axis=1)
+        true = bins < prior.size
+        counts = _moved(bins[true], log_likelihood[true], rng)
+        weights = rng.standard_gamma(counts + prior)
+        weights /= weights.sum() + rng.standard_gamma(low_count + 1e-9)
+    levels = np.concatenate([[0.0], np.maximum.accumulate(cdf)])
+    upper = edges[np.flatnonzero(top)[0] :]
+    quantiles = (rng.permutation(num_draws) + rng.uniform(size=num_draws)) / num_draws
+    return np.interp(quantiles * levels[-1], levels, upper)
+
+
+def _edges(ratio: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Bins of G from 0 past the largest ratio."""
+    end = float(np.max(ratio + REACH * sd))
+    return np.linspace(0.0, end, int(np.clip(BINS_PER_SD * end / sd.min(), 20, MAX_BINS)) + 1)
+
+
+def _likelihood(ratio: np.ndarray, sd: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Density (num_samples, num_bins) of measured absolute ratios given the true ones."""
+    z = np.stack([ratio[:, None] - centres, ratio[:, None] + centres]) / sd[:, None]
+    return np.exp(-0.5 * z**2).sum(axis=0) / (sd[:, None] * np.sqrt(2 * np.pi))
+
+
+def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Samples in each bin (num_bins,) once every atom has been drawn anew, its samples with it.
+
+    Without this step an atom with many samples would never leave its bin.
+    """
+    atoms, member = np.unique(bins, return_inverse=True)
+    joint = np.zeros((atoms.size, log_likelihood.shape[1]))
+    np.add.at(joint, member, log_likelihood)
+    places = np.argmax(joint + rng.gumbel(size=joint.shape), axis=1)
+    sizes = np.bincount(member, minlength=atoms.size)
+    return np.bincount(places, weights=sizes, minlength=log_likelihood.shape[1])
+
+
+# chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
+# ratio of two small forces says little: samples below this share of the grip's median are left out.
+FIRM = 0.5
+DRAWS = 2000  # numerics: of each coefficient
+
+
+@dataclass(frozen=True)
+class FrictionPosterior:
+    """Friction coefficient of the fingers on one block.
+
+    `lower_bound` is the 5 % quantile of `bound_draws` (num_draws,), the posterior of the largest
+    ratio reached; None with a `reason` where the block was not held. `mu_draws` (num_draws,) only
+    where slip was seen; `reason` then is None and otherwise says why there is no value. `ground`
+    is the friction of the block on its support where it was slid.
+    """
+
+    lower_bound: float | None
+    bound_draws: np.ndarray | None = None
+    mu_draws: np.ndarray | None = None
+    slip: SlipEvidence | None = None
+    reason: str | None = None
+    ground: GroundFriction | None = None
+
+    def to_json(self) -> dict:
+        """The entry `friction` of one block in the JSON of `identify`."""
+        out: dict = {"unit": "1", "lower_bound": self.lower_bound}
+        if self.mu_draws is not None:
+            out |= summary(self.mu_draws, "1")
+        if self.slip is not None:
+            out["slip"] = {
+                "seen": self.slip.seen,
+                "probability": self.slip.probability,
+                "log_bayes_factor": self.slip.log_bayes_factor,
+            }
+        if self.ground is not None:
+            out["ground"] = summary(self.ground.mu_draws, "1") | {"support": self.ground.support}
+        return out
+
+
+@dataclass(frozen=True)
+class _Forces:
+    """Bias-free forces (num_timesteps,) of one finger and their noise sd [N]."""
+
+    normal: np.ndarray
+    shear: np.ndarray
+    sd_normal: float
+    sd_shear: float
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Held samples of one block: ratios, their noise, alignments (num_alignments, num_samples)."""
+
+    ratio: np.ndarray
+    sd: np.ndarray
+    held: np.ndarray
+
+
+def friction_posteriors(
+    weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
+    rng: np.random.Generator,
+) -> dict[str, FrictionPosterior]:  # fmt: skip
+    """Friction of every object of the task, all trials pooled, alignments marginalised.
+
+    `sd_force`: noise of one force sample [N] where the signals do not state it.
+    """
+    steps = subtasks(task)
+    fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
+    held = {obj: _held(weighed, fingers, steps, obj) for obj in task.objects}
+    resting = {obj: _stretches(weighed, fingers, steps, obj, rig) for obj in task.objects}
+    out = {}
+    for obj in task.objects:
+        ground = ground_friction(weighed, task, steps, obj, rig, sd_force, rng, DRAWS)
+        samples = held[obj]
+        if samples.ratio.size == 0:
+            reason = f"the recording never shows {obj} held firmly"
+            out[obj] = FrictionPosterior(None, reason=reason, ground=ground)
+            continue
+        draws = largest_ratio(samples.ratio, samples.sd, samples.held, rng, DRAWS)
+        others = [s for other in task.objects if other != obj for s in resting[other]]
+        slip = slip_evidence(resting[obj], others, draws)
+        draws = draws * _gain_factor(rig, rng)
+        reason = None if slip.seen else f"no finger was seen to slip on {obj}: a bound is all it tells"
+        out[obj] = FrictionPosterior(
+            float(np.quantile(draws, 0.05)), draws, draws if slip.seen else None, slip, reason, ground
+        )
+    return out
+
+
+def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
+    """Forces of one finger less their mean in free motion, where they ought to vanish.
+
+    What free motion shows beyond the sensors' noise counts as noise (a cable that pulls).
+    """
+    free, stated = a.weights.free > 0, a.signals.sd_force
+    stated = stated if np.isfinite(stated) else sd_force
+    centred, sds = [], []
+    for name in (f"fx{finger}", f"fy{finger}"):
+        values = getattr(a.signals, name)
+        if free.sum() >= MIN_FREE:
+            bias = float(values[free].mean())
+            shown = robust_sd(values[free] - bias)
+            sd = max(stated, shown) * np.sqrt(1 + 1 / free.sum())
+        else:
+            bias = 0.0
+            sd = np.hypot(stated, rig.systematic.force_bias[FORCE_CHANNELS.index(name)])
+        centred.append(values - bias)
+        sds.append(float(sd))
+    inward = 1.0 if finger == 1 else -1.0
+    return _Forces(inward * centred[0], centred[1], sds[0], sds[1])
+
+
+def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
+    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment."""
+    recorded = np.isfinite(forces.normal + forces.shear)
+    core = (holding.mean(axis=0) > 0.5) & recorded
+    if not core.any():
+        return np.zeros(core.size, bool)
+    least = max(FIRM * float(np.median(forces.normal[core])), SURE * forces.sd_normal)
+    return recorded & (np.nan_to_num(forces.normal) > least)
+
+
+def _ratio(forces: _Forces, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Signed ratios of the samples in use and their noise, to first order."""
+    ratio = forces.shear[use] / forces.normal[use]
+    return ratio, np.hypot(forces.sd_shear, ratio * forces.sd_normal) / forces.normal[use]
+
+
+def _held(
+    weighed: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str
+) -> _Held:
+    moves = sorted({s.move for s in steps if s.object == obj and s.move is not None})
+    ratios, sds, masks = [np.zeros(0)], [np.zeros(0)], []
+    for a, pair in zip(weighed, fingers, strict=True):
+        for move in moves:
+            members = [s.index for s in steps if s.move == move and s.state != FREE]
+            holding = np.any(a.masks[:, members], axis=1)
+            for forces in pair:
+                use = _firm(forces, holding) & holding.any(axis=0)
+                ratio, sd = _ratio(forces, use)
+                ratios.append(np.abs(ratio))
+                sds.append(sd)
+                masks.append(holding[:, use])
+    held = np.concatenate(masks, axis=1) if masks else np.zeros((1, 0), bool)
+    return _Held(np.concatenate(ratios), np.concatenate(sds), held)
+
+
+def _stretches(
+    weighed: Sequence[WeighedTrial],
+    fingers: list[list[_Forces]],
+    steps: tuple[Subtask, ...],
+    obj: str,
+    rig: Rig,
+) -> list[Stretch]:
+    """Each finger on the resting block, samples that every alignment has there."""
+    compliance = 1 / rig.fingertip.shear_stiffness
+    out = []
+    for a, pair in zip(weighed, fingers, strict=True):
+        for step in steps:
+            if step.object != obj or step.state != ON_GROUND:
+                continue
+            resting = a.masks[:, step.index]
+            for number, forces in enumerate(pair, 1):
+                height = getattr(a.signals, f"y{number}")
+                use = resting.all(axis=0) & _firm(forces, resting) & np.isfinite(height)
+                ratio, ratio_sd = _ratio(forces, use)
+                sd = np.hypot(_height_noise(a.signals, height)[use], forces.sd_shear * compliance)
+                out.append(Stretch(
+                    a.signals.t[use], (height - forces.shear * compliance)[use], sd,
+                    forces.shear[use], ratio, ratio_sd, compliance,
+                ))  # fmt: skip
+    return out
+
+
+def _height_noise(signals: Signals, height: np.ndarray) -> np.ndarray:
+    """Noise sd (num_timesteps,) of one finger's height [m]; learned where the rig states none."""
+    bend = np.abs(np.diff(height, 2))
+    learned = robust_sd(bend[np.isfinite(bend)]) / np.sqrt(6.0) if np.isfinite(bend).any() else 1e-4
+    return np.where(np.isfinite(signals.sd_y), signals.sd_y, max(learned, 1e-7))
+
+
+def _gain_factor(rig: Rig, rng: np.random.Generator) -> np.ndarray:
+    """Factors (DRAWS,) by which uncertain force gains stretch every ratio."""
+    gain = np.asarray(rig.systematic.force_gain)
+    worst = max(np.hypot(gain[0], gain[1]), np.hypot(gain[2], gain[3]))
+    return np.exp(worst * rng.standard_normal(DRAWS))

@@ -1,1 +1,0 @@
-"""Friction coefficients: bounds, slip and supports."""

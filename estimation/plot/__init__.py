@@ -1,1 +1,0 @@
-"""Figures of an identification; functions draw into a figure and return its axes."""

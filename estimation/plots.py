@@ -1,0 +1,295 @@
+"""Figures of an identification: the corner plot, estimates against measurements, and predicted signals."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from scipy.special import ndtri
+
+from estimation.identification import Identification
+from estimation.observations import channel_values, gravity_factor
+from estimation.report import Actual
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE
+from hmmseg.numbers import SHOWN
+from hmmseg.plot.spans import name_spans, shade_spans
+from hmmseg.plot.style import BLUE, GREY, INK, RED, canvas
+from hmmseg.segmentation.spans import Segmentation
+
+
+@dataclass(frozen=True)
+class PredictedSignal:
+    """A recorded signal (num_timesteps,) and the central 90 % band of a new sample.
+
+    `low`, `median`, `high` are NaN where the model predicts nothing of the signal. SI units.
+    """
+
+    name: str
+    observed: np.ndarray
+    low: np.ndarray
+    median: np.ndarray
+    high: np.ndarray
+
+
+def predicted_signals(found: Identification, trial: int) -> tuple[np.ndarray, list[PredictedSignal]]:
+    """Times (num_timesteps,) [s] and, of one trial, the net vertical force and finger distance."""
+    weighed = found.weighed[trial]
+    signals, masks = weighed.signals, weighed.masks.mean(axis=0) > 0.5
+    factor = gravity_factor(signals, found.rig)
+    given = signals.distance - channel_values(signals, found.rig)["distance"]
+    force, distance = (np.full((2, signals.t.size), np.nan) for _ in range(2))
+    for step in found.aligned.subtasks:
+        inside = masks[step.index]
+        obj = str(step.object)
+        if step.state == ABOVE_GROUND and (obj, "weight") in found.names:
+            weight = found.of(obj, "weight")
+            force[0, inside] = weight.mean() * factor[inside]
+            force[1, inside] = np.hypot(np.sqrt(found.noise.variance["force"]), weight.std())
+        if step.state != FREE and (obj, "width") in found.names:
+            width = found.of(obj, "width")
+            distance[0, inside] = width.mean() + given[inside]
+            distance[1, inside] = np.hypot(np.sqrt(found.noise.variance["distance"]), width.std())
+    half = float(ndtri(0.95))
+    return signals.t, [
+        PredictedSignal(name, observed, mean - half * sd, mean, mean + half * sd)
+        for name, observed, (mean, sd) in (
+            ("net vertical force", signals.fy, force), ("finger distance", signals.distance, distance),
+        )
+    ]  # fmt: skip
+
+
+SIZE = 1.25  # look: in, a panel
+LEFT, RIGHT = 0.95, 0.3  # look: in, margins (below and above alike)
+WIDEST = 0.6  # look: share of a panel by which a measured value may widen its range
+
+
+def draw_corner(
+    draws: np.ndarray,
+    names: Sequence[tuple[str, str]],
+    path: Path | None = None,
+    actual: Actual | None = None,
+) -> np.ndarray:
+    """Posterior draws (num_draws, num_properties) of the (object, property) pairs, SI units.
+
+    Contours hold 39, 68 and 95 % of the probability, dashed lines are the quantiles 2.5, 50 and
+    97.5 %. Measured values of `actual` are lines; one that lies far outside the draws is left out,
+    its panel saying so. Returns the axes (num_properties, num_properties); ValueError for draws of
+    another width than names.
+    """
+    if draws.ndim != 2 or draws.shape[1] != len(names):
+        raise ValueError(f"draws of shape {draws.shape} for {len(names)} names")
+    factors = np.array([SHOWN[prop][0] for _, prop in names])
+    shown = draws * factors
+    labels = [f"{obj}\n{prop} [{SHOWN[prop][1]}]" for obj, prop in names]
+    truths = [_measured(actual, obj, prop) for obj, prop in names]
+    low, high = np.percentile(shown, 0.05, axis=0), np.percentile(shown, 99.95, axis=0)
+    ranges, lines = [], []
+    for i, truth in enumerate(truths):
+        pad = 0.06 * (high[i] - low[i]) + 1e-12
+        a, b, reach = low[i] - pad, high[i] + pad, WIDEST * (high[i] - low[i])
+        near = truth is not None and low[i] - reach <= truth <= high[i] + reach
+        lines.append(truth if near else None)
+        ranges.append((min(a, truth - pad), max(b, truth + pad)) if near and truth is not None else (a, b))
+    plot = _corner_function()
+    size = SIZE * len(names) + LEFT + RIGHT
+    with canvas(path, width=size, height=size, layout=None) as figure:
+        plot(
+            shown, fig=figure, labels=labels, range=ranges, truths=lines, truth_color=RED, color=BLUE,
+            bins=30, smooth=0.8, quantiles=(0.025, 0.5, 0.975), plot_datapoints=False,
+            plot_density=False, fill_contours=True, levels=(0.393, 0.68, 0.95), max_n_ticks=3,
+            hist_kwargs={"linewidth": 0.9}, label_kwargs={"fontsize": 8}, labelpad=0.12,
+        )  # fmt: skip
+        figure.subplots_adjust(LEFT / size, LEFT / size, 1 - RIGHT / size, 1 - RIGHT / size)
+        axes = np.array(figure.axes).reshape(len(names), len(names))
+        for i, (truth, line) in enumerate(zip(truths, lines, strict=True)):
+            if truth is not None and line is None:
+                axes[i, i].set_title(f"measured {truth:.4g}", color=RED, fontsize=7)
+        if any(line is not None for line in lines):
+            figure.text(1 - RIGHT / size, 0.99, "lines: measured", color=RED, ha="right", va="top")
+        return axes
+
+
+def _corner_function() -> Callable:
+    """corner's function; its ArviZ announces its own refactoring at import, which helps no user."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="\\s*ArviZ is undergoing", category=FutureWarning)
+        from corner.corner import corner
+    return corner
+
+
+def _measured(actual: Actual | None, obj: str, prop: str) -> float | None:
+    found = None if actual is None else actual.get(obj, {}).get(prop)
+    return None if found is None else found[0] * SHOWN[prop][0]
+
+
+ORDER = ("weight", "width", "height", "friction")
+
+
+def draw_estimates(
+    properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path | None = None
+) -> Axes:
+    """One row a property: 68 and 95 % interval in % of the measured value, numbers beside it.
+
+    `properties` is the JSON of `identify`. Without a measured value the row is drawn about the
+    estimate itself (open marker); a property that is None or only bounded says so.
+    """
+    rows = [(obj, key) for obj, entry in properties.items() for key in ORDER if key in entry]
+    with canvas(path, height=1.1 + 0.27 * len(rows)) as figure:
+        ax = figure.subplots()
+        reach = [0.0]
+        for y, (obj, key) in enumerate(rows):
+            measured = None if actual is None else actual.get(obj, {}).get(key)
+            reach.append(_draw_row(ax, y, key, properties[obj][key], measured))
+        limit = 1.08 * max(reach) or 1.0
+        ax.set_xlim(-limit, limit)
+        ax.axvline(0, color=INK, lw=0.6, zorder=0)
+        ax.set_yticks(range(len(rows)), [f"{obj} {key}" for obj, key in rows])
+        ax.tick_params(axis="y", length=0)
+        ax.set_ylim(len(rows) - 0.4, -0.6)
+        ax.spines["left"].set_visible(False)
+        for y in range(1, len(rows)):
+            if rows[y][0] != rows[y - 1][0]:
+                ax.axhline(y - 0.5, color=GREY, lw=0.5)
+        head = "mean ± sd  (measured)" if actual else "mean ± sd"
+        ax.text(1.02, -0.85, head, transform=ax.get_yaxis_transform(), va="bottom", fontsize=7.5,
+                style="italic")  # fmt: skip
+        ax.set_xlabel("Estimate less measured value [%]" if actual else "About the estimate [%]")
+        handles = [Line2D([], [], color=BLUE, lw=3.2, solid_capstyle="butt", label="68 % interval"),
+                   Line2D([], [], color=BLUE, lw=1.0, label="95 % interval")]  # fmt: skip
+        if actual:
+            handles = [Line2D([], [], color=BLUE, marker="o", ls="", ms=3.5, label="estimate"), *handles]
+            handles += [Patch(color=GREY, alpha=0.4, lw=0, label="measured, ± 1 sd")]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        return ax
+
+
+def _draw_row(
+    ax: Axes, y: int, key: str, estimate: dict | None, measured: tuple[float, float] | None
+) -> float:
+    """Draw one property; returns the largest distance from 0 that it needs [%]."""
+    factor, unit = SHOWN[key]
+    beside = ax.get_yaxis_transform()
+
+    def note(text: str) -> None:
+        ax.text(1.02, y, text, transform=beside, va="center", ha="left", fontsize=7.5)
+
+    reach = 0.0
+    if measured is not None and estimate is not None and "mean" in estimate:
+        measured_sd = 100 * measured[1] / measured[0]
+        ax.fill_betweenx([y - 0.32, y + 0.32], -measured_sd, measured_sd, color=GREY, alpha=0.4, lw=0)
+        reach = measured_sd
+    if estimate is None:
+        ax.text(0, y, " not determined ", va="center", ha="center", fontsize=7.5, style="italic",
+                color=GREY, backgroundcolor="white")  # fmt: skip
+        note(("–" + _against(measured, factor)) if measured else "")
+        return reach
+    if "mean" not in estimate:
+        ax.text(0, y, " lower bound only ", va="center", ha="center", fontsize=7.5, style="italic",
+                color=GREY, backgroundcolor="white")  # fmt: skip
+        note(f"≥ {estimate['lower_bound'] * factor:.2f} {unit}".rstrip() + _against(measured, factor))
+        return reach
+    reference = estimate["mean"] if measured is None else measured[0]
+    for interval, width in (("interval_95", 1.0), ("interval_68", 3.2)):
+        ends = [100 * (value / reference - 1) for value in estimate[interval]]
+        ax.plot(ends, [y, y], color=BLUE, lw=width, solid_capstyle="butt")
+        reach = max(reach, *map(abs, ends))
+    centre = 100 * (estimate["mean"] / reference - 1)
+    ax.plot(centre, y, "o", color=BLUE, ms=3.5, mfc=BLUE if measured else "white", zorder=3)
+    digits = _digits(estimate["sd"] * factor)
+    shown = f"{estimate['mean'] * factor:.{digits}f} ± {estimate['sd'] * factor:.{digits}f} {unit}"
+    note(shown.rstrip() + _against(measured, factor))
+    return max(reach, abs(centre))
+
+
+def _against(measured: tuple[float, float] | None, factor: float) -> str:
+    if measured is None:
+        return ""
+    value, sd = measured[0] * factor, measured[1] * factor
+    return f"  ({value:.{max(0, _digits(sd) - 1)}f})" if sd > 0 else f"  ({value:.4g})"
+
+
+def _digits(sd: float) -> int:
+    """Decimals that show two digits of a standard deviation."""
+    return max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 4
+
+
+UNITS = {
+    "net vertical force": ("Net fy less\npredicted [N]", 1.0),
+    "finger distance": ("Distance less\npredicted [mm]", 1e3),
+}
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A recorded signal and what the model predicts of it, all (num_timesteps,) as shown.
+
+    `low` and `high` bound the central 90 % of a new sample, NaN where nothing is predicted.
+    """
+
+    label: str
+    observed: np.ndarray
+    low: np.ndarray
+    median: np.ndarray
+    high: np.ndarray
+
+    @property
+    def coverage(self) -> float:
+        """Share of the predicted samples that lie in their band; NaN where there is none."""
+        there = np.isfinite(self.observed) & np.isfinite(self.low)
+        inside = (self.observed >= self.low) & (self.observed <= self.high)
+        return float(inside[there].mean()) if there.any() else float("nan")
+
+
+def draw_predictive(
+    t: np.ndarray,
+    predictions: Sequence[Prediction],
+    path: Path | None = None,
+    segmentation: Segmentation | None = None,
+) -> list[Axes]:
+    """Recorded samples at t (num_timesteps,) [s] against predicted 90 % bands, a panel a signal.
+
+    Samples outside their band are marked; each panel says which share lies inside.
+    """
+    with canvas(path, height=1.5 + 1.25 * len(predictions)) as figure:
+        axes = list(np.atleast_1d(figure.subplots(len(predictions), 1, sharex=True)))
+        for ax, p in zip(axes, predictions, strict=True):
+            ax.plot(t, p.observed, ".", color=INK, ms=1.8)
+            ax.fill_between(t, p.low, p.high, color=BLUE, alpha=0.35, lw=0)
+            ax.plot(t, p.median, color=BLUE, lw=0.9)
+            outside = (p.observed < p.low) | (p.observed > p.high)
+            ax.plot(t[outside], p.observed[outside], "x", color=RED, ms=3.5, mew=0.8)
+            ax.set_ylabel(p.label)
+            ax.margins(y=0.15)
+            if np.isfinite(p.coverage):
+                ax.text(0.995, 0.95, f"{100 * p.coverage:.0f} % inside", transform=ax.transAxes, ha="right",
+                        va="top", fontsize=7)  # fmt: skip
+            if segmentation is not None:
+                shade_spans(ax, segmentation)
+        if segmentation is not None:
+            name_spans(axes[0], segmentation)
+        figure.align_ylabels(axes)
+        axes[-1].set_xlabel("Time [s]")
+        axes[-1].set_xlim(t[0], t[-1])
+        handles = [Line2D([], [], color=INK, marker=".", ls="", label="recorded"),
+                   Patch(color=BLUE, alpha=0.35, lw=0, label="predicted, 90 %"),
+                   Line2D([], [], color=RED, marker="x", ls="", label="outside")]  # fmt: skip
+        figure.legend(handles=handles, loc="outside lower center", ncols=3)
+        return axes
+
+
+def draw_check(found: Identification, trial: int, path: Path | None = None) -> list[Axes]:
+    """One trial's recorded signals less what the fitted model predicts, in its band."""
+    t, predicted = predicted_signals(found, trial)
+    shown = []
+    for p in predicted:
+        label, factor = UNITS[p.name]
+        around = (factor * (v - p.median) for v in (p.observed, p.low, p.median, p.high))
+        shown.append(Prediction(label, *around))
+    return draw_predictive(t, shown, path, found.segmentations[trial])

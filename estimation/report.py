@@ -1,0 +1,176 @@
+"""Properties in words, numbers and tables, and against what was measured apart from the trials."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from hmmseg.contact import decompose
+from hmmseg.errors import InputError, nearest
+from hmmseg.io.schema import read_toml
+from hmmseg.levels import CONTRADICTS
+
+INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
+
+
+def summary(draws: np.ndarray, unit: str) -> dict:
+    """Unit, mean, sd, median and intervals of posterior draws (num_draws,)."""
+    out = {"unit": unit, "mean": float(draws.mean()), "sd": float(draws.std(ddof=1))}
+    out |= {"median": float(np.median(draws))}
+    return out | {name: np.percentile(draws, q) for name, q in INTERVALS.items()}
+
+
+UNITS = decompose.UNITS | {"friction": "1"}
+Actual = dict[str, dict[str, tuple[float, float]]]
+
+# limit: SI units; no hand lifts, spans or slips on what lies beyond
+LIMITS = {"weight": (1e-4, 1e4), "width": (1e-5, 10.0), "height": (1e-5, 10.0), "friction": (1e-4, 1e3)}
+
+
+def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
+    """Measured (value, standard deviation) of every property given, by object and property.
+
+    N for a weight, m for width and height, "1" for friction. InputError for an object that is
+    not among `objects` (a task's), an unknown key, a wrong unit or a number that cannot be.
+    """
+    return parse_actual(read_toml(path), objects, str(path))
+
+
+def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "actual") -> Actual:
+    """The same from the table of an `actual.toml`."""
+    known, actual = list(objects), {}
+    for name, entries in table.items():
+        if name not in known:
+            raise InputError(f"{where}: key {name}", "is not an object of the task", nearest(name, known))
+        if not isinstance(entries, dict):
+            raise InputError(f"{where}: key {name}", f"found {entries!r}", f"tables [{name}.PROPERTY]")
+        actual[name] = {}
+        for key, entry in entries.items():
+            if key not in UNITS:
+                raise InputError(f"{where}: key {name}.{key}", "unknown property", nearest(key, UNITS))
+            actual[name][key] = _parse_entry(entry, key, f"{where}: key {name}.{key}")
+    return actual
+
+
+def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
+    """Identified `properties` (as in identify's JSON) beside measured values, by object and property.
+
+    Each with `relative_deviation`, `z` (in sds of both together), `inside_95` and `disagrees`: beyond
+    CONTRADICTS sds and beyond `smallest`, the relative deviation that matters. Of a friction that has a
+    lower bound alone it can only be said that the measured one lies below. Null where not identified.
+    """
+    out: dict[str, Any] = {}
+    for obj, entries in measured.items():
+        for prop, (value, sd) in entries.items():
+            row: dict[str, Any] = {"value": value, "sd": sd}
+            found = properties.get(obj, {}).get(prop)
+            if found is not None and found.get("mean") is not None:
+                low, high = found["interval_95"]
+                share = found["mean"] / value - 1
+                row["relative_deviation"] = share
+                row["z"] = (found["mean"] - value) / math.hypot(found["sd"], sd)
+                row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
+                row["disagrees"] = bool(abs(row["z"]) > CONTRADICTS and abs(share) > smallest)
+            elif found is not None and found.get("lower_bound") is not None:
+                short = 1 - value / found["lower_bound"]
+                row["disagrees"] = bool(short > smallest and value + CONTRADICTS * sd < found["lower_bound"])
+            out.setdefault(obj, {})[prop] = row
+    return out
+
+
+def disagreements(properties: dict[str, Any], compared: dict[str, Any]) -> list[str]:
+    """A line for each measured value that the recordings contradict."""
+    lines = []
+    for obj, entries in compared.items():
+        for prop, row in entries.items():
+            if not row.get("disagrees"):
+                continue
+            found, unit = properties[obj][prop], UNITS[prop]
+            value = _shown(row["value"], row["sd"], unit)
+            if "z" not in row:
+                bound = f"{found['lower_bound']:.3g}"
+                lines.append(f"{obj}.{prop}: measured as {value}, but it was held at {bound}")
+                continue
+            share, said = 100 * row["relative_deviation"], _shown(found["mean"], found["sd"], unit)
+            side = "above" if share > 0 else "below"
+            lines.append(
+                f"{obj}.{prop}: the recordings say {said}, {abs(share):.2g} % {side} what was measured "
+                f"({value}), {abs(row['z']):.0f} standard deviations away: one of the two is wrong"
+            )
+    return lines
+
+
+def _shown(value: float, sd: float, unit: str) -> str:
+    """As `0.4656 +- 0.0014 N`, lengths in mm, with the digits that the deviation leaves."""
+    factor, name = (1e3, " mm") if unit == "m" else (1.0, "" if unit == "1" else f" {unit}")
+    digits = 4 if sd <= 0 else min(max(1 - math.floor(math.log10(sd * factor)), 0), 6)
+    return f"{value * factor:.{digits}f} +- {sd * factor:.{digits}f}{name}"
+
+
+def _parse_entry(entry: Any, prop: str, where: str) -> tuple[float, float]:
+    unit = UNITS[prop]
+    if not isinstance(entry, dict):
+        raise InputError(where, f"found {entry!r}", "a table with unit, value and sd")
+    for key in entry:
+        if key not in ("unit", "value", "sd"):
+            raise InputError(f"{where}.{key}", "unknown key", nearest(key, ("unit", "value", "sd")))
+    if entry.get("unit") != unit:
+        raise InputError(f"{where}.unit", f"found {entry.get('unit')!r}", f'"{unit}"')
+    low, high = LIMITS[prop]
+    value = number(entry.get("value"), f"{where}.value", f"a number > 0, from {low:g} to {high:g}", low, high)
+    return value, number(entry.get("sd", 0.0), f"{where}.sd", "a number >= 0", 0.0, high)
+
+
+def number(value: Any, where: str, expected: str, low: float, high: float) -> float:
+    """The value as a float; InputError unless it is a number from `low` to `high`."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise InputError(where, f"found {value!r:.40}", expected)
+    return float(value)
+
+
+SHOWN = {"weight": (1.0, "N", 4), "width": (100.0, "cm", 4), "height": (100.0, "cm", 4)}
+
+
+def properties_table(body: dict[str, Any], measured=None) -> Table:
+    """The properties for people to read, lengths in cm as the paper has them."""
+    table = Table(title=f"properties ({body['method']})", title_justify="left")
+    for head in ("block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())):
+        table.add_column(head, no_wrap=head != "estimate")
+    for obj, entries in body["properties"].items():
+        for prop, entry in entries.items():
+            cells = [obj, prop, *_cells(prop, entry)]
+            if measured:
+                value = measured.get(obj, {}).get(prop)
+                factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
+                against = body.get("actual", {}).get(obj, {}).get(prop, {})
+                mark = "  disagrees" if against.get("disagrees") else ""
+                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}{mark}")
+            table.add_row(*cells)
+    return table
+
+
+def _cells(prop: str, entry: dict[str, Any] | None) -> tuple[str, str]:
+    if entry is None:
+        return "unknown", ""
+    factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
+    if entry.get("mean") is None:
+        return f">= {entry['lower_bound']:.{digits}f}", ""
+    low, high = (f"{v * factor:.{digits}f}" for v in entry["interval_95"])
+    return (
+        f"{entry['mean'] * factor:.{digits}f} +- {entry['sd'] * factor:.{digits}f} {unit}",
+        f"{low} to {high}",
+    )
+
+
+def inference_data(posterior: dict[str, np.ndarray]) -> Any:
+    """ArviZ's data of draws (chains, draws) by name: InferenceData, or from 1.0 on a DataTree."""
+    import arviz  # takes longer to import than an identification
+
+    if int(arviz.__version__.split(".")[0]) < 1:
+        return arviz.from_dict(posterior=posterior)
+    return arviz.from_dict({"posterior": posterior})

@@ -1,0 +1,392 @@
+"""Which readings of a hand are none: what a working sensor cannot have read is named and left out.
+
+One model of a sensor stands behind it. Its readings scatter, so that neighbours repeat each other to the
+last digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow;
+they stay within a few times the range of all others; a position moves no farther between two samples than its
+velocity carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of
+missing readings is a fault where its length has next to no chance under that model, so that coarse sensors,
+forces that are held for some samples and recordings without noise pass. What is left out is missing from
+there on, to the segmentation and to the properties alike.
+
+Forces in other units than N, which nothing in mechanics tells: load and inertia scale alike.
+
+What tells is what is known apart: the noise of the sensor where `rig.toml` states it, what grippers weigh.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmmseg.hand.tool import Tool
+from hmmseg.io.plausibility import Finding, all_changed, check_forces, position_pairs, scale_to_velocity
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
+from hmmseg.io.trial import Trial
+from hmmseg.io.units import UNITS
+from hmmseg.levels import SURE
+from hmmseg.robust import robust_sd, white_sd
+
+NEAR = 0.3  # limit: relative; noise is stated to within so much, and units differ by factors of 4 and more
+LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with what hangs below its sensor
+USUAL_TOOL = 1.0  # limit: [kg] of one
+WHITE = -0.5  # limit: -0.56 and less is white noise, -0.42 and more what filters leave that make it a tenth
+STRETCH = 25  # numerics: samples
+FORCES = ("mN", "gf", "kgf", "kN")
+
+
+def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
+    """Forces of fingertips whose noise is that of the rig times the size of another unit."""
+    names = [name for name in FORCE_CHANNELS if name in trial.channels]
+    if rig.noise.force is None or not names or check_forces(trial, rig):
+        return []
+    shown = noise_of([trial.channels[name] for name in names])
+    unit, off = _nearest(rig.noise.force / shown) if shown > 0 else ("", np.inf)
+    if off > NEAR or (UNITS[unit][1] > 1 and whiteness([trial.channels[name] for name in names]) > WHITE):
+        return []  # a filter makes noise smaller, too, but neighbours alike
+    stated = f"where [noise] force = {rig.noise.force:g} N in rig.toml"
+    problem = f"has noise of {shown:.2g} {stated}: it looks like {unit}"
+    return [Finding(names[0], problem, all_changed(names, rig, unit=unit), certain=False)]
+
+
+def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
+    """A line where the tool's inertia is none of a gripper's, or another unit's times the stated one."""
+    gripper = rig.gripper
+    assert gripper is not None
+    found = abs(tool.inertia)
+    stated = gripper.tool_mass
+    likely = LIGHTEST < found < HEAVIEST if stated is None else _nearest(stated / found)[1] > np.log(2)
+    if likely and tool.weighed and abs(tool.mass / tool.inertia - 1) > NEAR:
+        said = "is stated to weigh" if stated is not None else "weighs, as it turns,"
+        names = ", ".join(gripper.wrench[:3])
+        return (f"{trial.file}: columns {names}: the tool {said} {tool.mass:.3g} kg and moves like one of "
+                f"{tool.inertia:.3g} kg; expected one mass: gains, axes or tool_mass under [gripper] are "
+                "wrong",)  # fmt: skip
+    if likely:
+        return ()
+    unit, _ = _nearest((USUAL_TOOL if stated is None else stated) / found)
+    expected = f"{LIGHTEST:g} to {HEAVIEST:g} kg" if stated is None else f"{stated:g} kg in rig.toml"
+    names = gripper.wrench[:3]
+    finding = Finding(names[0], "", all_changed(names, rig, unit=unit))
+    text = f"move a tool of {found:.3g} kg ({expected}): they look like {unit}"
+    return (f"{trial.file}: columns {', '.join(names)} {text}; expected {finding.remedy}",)
+
+
+def _nearest(size: float) -> tuple[str, float]:
+    """The unit of force nearest to a size [N], and how far it is off (logarithm)."""
+    off = {unit: abs(float(np.log(size / UNITS[unit][1]))) for unit in FORCES}
+    unit = min(off, key=lambda name: off[name])
+    return unit, off[unit]
+
+
+def _quiet(channels: list[np.ndarray]) -> list[np.ndarray]:
+    """Second differences of the quietest quarter of stretches, as contacts are no noise."""
+    every = [v[np.isfinite(v)] for v in channels]
+    pieces = [
+        np.diff(p, 2) for v in every for p in np.array_split(v, max(1, v.size // STRETCH)) if p.size > 2
+    ]
+    pieces.sort(key=lambda piece: float(piece @ piece) / piece.size)
+    return pieces[: max(1, len(pieces) // 4)]
+
+
+def whiteness(channels: list[np.ndarray]) -> float:
+    """Correlation of neighbouring second differences of noise, -2/3 where it is white."""
+    pieces = _quiet(channels)
+    total = sum(float(piece @ piece) for piece in pieces)
+    return sum(float(piece[1:] @ piece[:-1]) for piece in pieces) / total if total > 0 else 0.0
+
+
+def noise_of(channels: list[np.ndarray]) -> float:
+    """Standard deviation of one sample's noise: that of the stretch at the end of the quiet quarter."""
+    pieces = _quiet(channels)
+    return float(np.sqrt(np.mean(pieces[-1] ** 2) / 6)) if pieces else 0.0
+
+
+CHANCE = 1e-4  # chosen: probability a channel below which a run of repeated or missing readings is a fault
+SCATTERS = (
+    -1 / 3
+)  # numerics: correlation of second differences: -2/3 of white noise, positive of smooth motion
+FAR = 5.0  # limit: ranges of all other readings that one may be off by; an impact is less
+FEW = 0.01  # limit: share of readings that are so far off: of more the others are no rule
+LEAP = 20.0  # limit: noise sds that a step exceeds
+FASTEST = 1.2  # limit: times what the fastest velocity around it covers; a sudden stop is off by half
+SWEPT = 0.1  # limit: share of a position's range that its velocity covers while it stands still
+MIN_ALIVE = 30  # numerics: readings that tell a channel's own noise
+ROUNDING = 1e-6  # numerics: of a channel's range: less noise is that of arithmetic
+MOST = 200  # numerics: longest runs of a channel that are looked at
+LISTED = 3  # look: stretches in a line
+STEPS = 3  # limit: of one encoder; of more it is the hand that moves so (backlash)
+SPARSE = 1 / 3  # limit: share of missing readings that is remarked on
+WHOLE = 0.1  # limit: share of rows that are whole, of which fewer are remarked on
+PAUSE, USUAL = 0.6, 5.0  # limit: s, in which a subtask may hide, and usual intervals: a jump of the clock
+DISAGREE = 1.5  # limit: factor by which displacements and velocities may differ in most joints
+CARTESIAN = ("x1", "y1", "x2", "y2")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that a channel shows and no working sensor does.
+
+    `spans`: stretches [s] whose readings are left out; none where it is only remarked on. `blames`: channels
+    whose readings are no measure of anything by it.
+    """
+
+    channel: str
+    problem: str
+    spans: tuple[tuple[float, float], ...] = ()
+    blames: tuple[str, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """What is wrong, and when."""
+        listed = [f"{a:.2f} to {b:.2f} s" for a, b in self.spans[:LISTED]]
+        more = f" and {len(self.spans) - LISTED} more times" if len(self.spans) > LISTED else ""
+        when = f" from {', '.join(listed)}{more}" if listed else ""
+        return f"{self.channel} {self.problem}{when}"
+
+
+def sensed(trial: Trial, rig: Rig) -> Trial:
+    """The trial without readings that are none, its faults named in `faults` and `warnings`."""
+    channels = {name: values.copy() for name, values in trial.channels.items()}
+    found = [*_missing(trial), *_clock(trial.t)]
+    kinds = _kinds(trial, rig)
+    for names, _ in kinds:
+        for name in names:
+            found += _far_off(name, trial.t, channels[name])
+    seen = {name: values.copy() for name, values in channels.items()}
+    rates = dict(position_pairs(trial))
+    for names, noise in kinds:
+        for name in names:
+            fault, stuck = _repeated(name, trial.t, seen, names, noise, rates.get(name))
+            channels[name][stuck] = np.nan
+            found += [] if fault is None else [fault]
+    still = [rate for rate in rates.values() if _reach(seen[rate]) == 0]
+    if still and len(still) == len(rates) and any(_lives(seen[name]) for name in rates):
+        found.append(Fault(", ".join(still), "stand still though positions move, and are left out"))
+        channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
+    found += _leaps(trial.t, channels, rates)
+    trial = replace(trial, channels=channels)
+    found += _disagreeing(trial)
+    lines = tuple(f"{trial.file}: {fault.line}" for fault in found)
+    return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
+
+
+def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
+    """Channels by what they measure, as each is judged by its fellows, and the noise that the rig states."""
+    noise = rig.noise
+    if rig.gripper is not None:
+        g = rig.gripper
+        kinds = [(g.wrench[:3], None), (g.wrench[3:], None), (tuple(g.position.values()), None),
+                 (tuple(g.opening), None)]  # fmt: skip
+    else:
+        places = JOINTS if rig.jointed else CARTESIAN
+        rates = tuple(("d" if rig.jointed else "v") + name for name in places)
+        kinds = [(FORCE_CHANNELS, noise.force), (places, noise.angle if rig.jointed else noise.position),
+                 (rates, noise.velocity)]  # fmt: skip
+    there = [([name for name in names if name in trial.channels], sd) for names, sd in kinds]
+    return [(names, sd) for names, sd in there if names]
+
+
+def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
+    """Few readings that lie far beyond the range of all others; they are set to NaN in `values`."""
+    there = np.flatnonzero(np.isfinite(values))
+    few = max(1, int(FEW * there.size))
+    if there.size < 4 * few:
+        return []
+    order = there[np.argsort(np.abs(values[there] - np.median(values[there])))]
+    reach = np.ptp(values[order[:-few]])
+    wild = order[-few:]
+    wild = np.sort(wild[np.abs(values[wild] - np.median(values[there])) > FAR * reach])
+    if not wild.size or reach == 0:
+        return []
+    worst = values[wild[np.argmax(np.abs(values[wild]))]]
+    values[wild] = np.nan
+    problem = f"reads {worst:.3g}, where its other readings span {reach:.3g}: left out"
+    return [Fault(name, problem, tuple((float(t[i]), float(t[i])) for i in wild))]
+
+
+def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
+              stated: float | None, rate: str | None) -> tuple[Fault | None, np.ndarray]:  # fmt: skip
+    """Runs of one value that a working sensor cannot have read, and which samples (num_timesteps,) they are.
+
+    `fellows`: channels of its kind, itself among them; `stated`: noise of one reading; `rate`: the channel of
+    its velocity.
+    """
+    values = seen[name]
+    there = np.flatnonzero(np.isfinite(values))
+    if there.size < MIN_ALIVE:
+        return None, np.zeros(values.size, bool)
+    shown = values[there]
+    same = np.diff(shown) == 0
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
+    stuck = np.zeros(values.size, bool)
+    standing: dict[float, list[tuple[float, float]]] = {}
+    for start, stop in runs[np.argsort(runs[:, 0] - runs[:, 1])][:MOST]:
+        value, at = float(shown[start]), there[start : stop + 1]
+        if stop - start < 2 or (value == 0 and _both_zero(name, at, seen)):
+            continue
+        chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
+        unlikely = np.log(shown.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
+        if unlikely or (rate is not None and _swept(at, t, values, seen[rate])):
+            stuck[at] = True
+            standing.setdefault(value, []).append((float(t[at[0]]), float(t[at[-1]])))
+    if not standing:
+        return None, stuck
+    value, spans = max(standing.items(), key=lambda entry: sum(b - a for a, b in entry[1]))
+    every = tuple(sorted(span for some in standing.values() for span in some))
+    if not (shown != value).any():
+        problem = f"reads {value:.4g} in every row"
+    elif len(spans) > 1 and abs(value) == np.abs(shown).max():
+        problem = f"goes no farther than {value:.4g}: it saturates"
+    else:
+        problem = f"repeats {value:.4g} to the last digit"
+    return Fault(name, f"{problem}, and is left out", every), stuck
+
+
+def _both_zero(name: str, at: np.ndarray, seen: dict[str, np.ndarray]) -> bool:
+    """Whether the other finger's force is exactly zero as well: sensors that hide what is small."""
+    other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
+    return other is not None and bool(np.mean(other[at] == 0) > 0.5)
+
+
+def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
+    """Whether a velocity that lives carries a position far while that repeats itself (samples `at`)."""
+    known = rate[at][np.isfinite(rate[at])]
+    if known.size < MIN_ALIVE // 3 or _rests(rate, at):
+        return False
+    v, steps = np.nan_to_num(rate[at]), np.diff(t[at])
+    way = float(np.ptp(np.cumsum(steps * (v[1:] + v[:-1]) / 2)))
+    by_noise = white_sd(known, 1) * float(np.median(steps)) * np.sqrt(steps.size)
+    return bool(way > max(SWEPT * _reach(values), SURE * by_noise))
+
+
+def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
+                      fellows: list[str], stated: float | None) -> float:  # fmt: skip
+    """How likely a reading repeats the one before: by the channel's resolution and noise, and its fellows'.
+
+    What the channel reads besides `value` counts, or where it reads nothing else, what its fellows do. 1
+    where readings do not scatter, as far as they and the rig show.
+    """
+    own = np.where(seen[name] == value, np.nan, seen[name])
+    others = [seen[fellow] for fellow in fellows if fellow != name]
+    alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if _lives(v)]
+    steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(v[np.isfinite(v)])) for v in alive)])
+    steps, together = steps[steps > 0], all(_rests(v, at) for v in others)
+    if not steps.size or (together and name not in FORCE_CHANNELS):  # a hand that waits
+        return 1.0
+    noise = noise_of(alive)
+    reach = max(_reach(v) for v in alive)
+    if noise <= ROUNDING * reach or whiteness(alive) > SCATTERS:
+        if stated is None or together:  # of no noise, or of motion above it
+            return 1.0
+        noise = stated
+    by_noise = float(steps.min()) / (2 * np.sqrt(np.pi) * noise)
+    differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
+    pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
+    return min(max(by_noise, (repeats + 1) / (pairs + 2)), 1.0)
+
+
+def _lives(values: np.ndarray) -> bool:
+    """Whether a channel does more than repeat itself."""
+    return not _rests(values)
+
+
+def _rests(values: np.ndarray, at: np.ndarray | slice = slice(None)) -> bool:
+    """Whether a stretch of a channel mostly repeats itself, but for rounding."""
+    stretch = values[at]
+    steps = np.diff(stretch[np.isfinite(stretch)])
+    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _reach(values)) > 0.5)
+
+
+def _reach(values: np.ndarray) -> float:
+    """How far a channel's readings go apart, 0 of none."""
+    there = values[np.isfinite(values)]
+    return float(np.ptp(there)) if there.size else 0.0
+
+
+def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
+    """A position that steps as its velocity does not, alone among them; what that leaves open is set to NaN.
+
+    Where several positions step, it is the hand that does (backlash).
+    """
+    stepping = {}
+    for name, rate in rates.items():
+        there = np.flatnonzero(np.isfinite(channels[name]) & np.isfinite(channels[rate]))
+        if there.size < MIN_ALIVE:
+            continue
+        q, v, times = channels[name][there], channels[rate][there], t[there]
+        more = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
+        near = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
+        covered = near * np.diff(times)
+        far = np.abs(more) > np.maximum(LEAP * robust_sd(more), FASTEST * covered)
+        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # what happened in a gap no velocity tells
+        if far.any():
+            stepping[name] = there, np.where(far, more, 0.0)
+    if len(stepping) != 1:
+        return []
+    name, (there, steps) = next(iter(stepping.items()))
+    at, offset = np.flatnonzero(steps), np.concatenate([[0.0], np.cumsum(steps)])
+    if at.size > STEPS:
+        return []
+    away = np.abs(offset) > np.abs(steps[at]).min() / 2
+    problem = f"jumps by {steps[at[0]]:.3g} at {t[there[at[0] + 1]]:.2f} s, as its velocity does not"
+    if away[-1]:  # it never comes back: either side may be the right one
+        channels[name][:] = np.nan
+        spans = ((float(t[0]), float(t[-1])),)
+        return [Fault(name, f"{problem}: which side is right nothing tells, so it is left out", spans)]
+    inside = there[away]
+    channels[name][inside[0] : inside[-1] + 1] = np.nan
+    return [Fault(name, f"{problem}, and is left out", ((float(t[inside[0]]), float(t[inside[-1]])),))]
+
+
+def _disagreeing(trial: Trial) -> list[Fault]:
+    """Positions that go farther or less far than their velocities carry them, most of them alike."""
+    pairs = position_pairs(trial)
+    slopes = np.array([scale_to_velocity(trial, *pair) for pair in pairs])
+    known = slopes[np.isfinite(slopes) & (slopes > 0)]
+    if known.size <= len(pairs) / 2 or abs(np.log(np.median(known))) < np.log(DISAGREE):
+        return []
+    places = tuple(position for position, _ in pairs)
+    problem = (
+        f"and the other positions go {1 / np.median(known):.2g} times as far as their velocities carry "
+        "them: one of the two scales is wrong"
+    )
+    return [Fault(places[0], problem, blames=places)]
+
+
+def _missing(trial: Trial) -> list[Fault]:
+    """Channels with few readings, or none for longer than elsewhere in them, and rows hardly ever whole."""
+    gone = {name: ~np.isfinite(values) for name, values in trial.channels.items()}
+    out = []
+    for name, lost in gone.items():
+        share = float(lost.mean())
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]]))).reshape(-1, 2)
+        long = []
+        for start, stop in edges:
+            chance = (lost.sum() - (stop - start) + 1) / (lost.size - (stop - start) + 2)
+            unlikely = np.log(lost.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
+            if unlikely and trial.t[stop - 1] - trial.t[start] > PAUSE:
+                long.append((float(trial.t[start]), float(trial.t[stop - 1])))
+        if long:
+            out.append(Fault(name, "has no readings", tuple(long)))
+        elif share > SPARSE:
+            out.append(Fault(name, f"lacks {share:.0%} of its readings"))
+    if len(out) == len(gone) and len({fault.problem + str(fault.spans) for fault in out}) == 1:
+        return [replace(out[0], channel="every channel")]
+    whole = float((~np.any(list(gone.values()), axis=0)).mean())
+    if not out and whole < WHOLE:
+        return [
+            Fault("every row" if whole == 0 else f"all but {whole:.0%} of the rows", "without some reading")
+        ]
+    return out
+
+
+def _clock(t: np.ndarray) -> list[Fault]:
+    """Jumps of the clock, or stretches without rows."""
+    steps = np.diff(t)
+    wide = np.flatnonzero(steps > max(PAUSE, USUAL * float(np.quantile(steps, 0.95))))
+    usual = float(np.median(steps))
+    return [
+        Fault("t", f"jumps by {steps[i]:.3g} s at {t[i]:.2f} s, where rows are {usual:.2g} s apart: rows are "
+              "missing, or the clock was set") for i in wide[:LISTED]
+    ]  # fmt: skip

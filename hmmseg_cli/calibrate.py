@@ -1,0 +1,110 @@
+"""`hmmseg calibrate`: what nobody measured of a robot's model, fitted to its logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hmmseg_cli.console import (
+    JsonOption,
+    Output,
+    QuietOption,
+    SeedOption,
+    TrialsArgument,
+    check_folder,
+    distinct_trials,
+)
+from hmmseg_cli.diagnose_robot import PatchOption
+
+ModelOption = Annotated[
+    Path, typer.Option("--model", "--mjcf", metavar="XML", help="The robot's model, as MuJoCo reads it.")
+]
+MapOption = Annotated[
+    Path, typer.Option("--map", metavar="MAP.toml", help="Which column of the logs is what of the model.")
+]
+
+
+def calibrate(
+    logs: TrialsArgument,
+    model: ModelOption,
+    map_file: MapOption,
+    patch: PatchOption = None,
+    json: JsonOption = None,
+    seed: SeedOption = 0,
+    quiet: QuietOption = False,
+) -> None:
+    """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these cannot tell."""
+    with Output("calibrate", json=json, seed=seed, quiet=quiet) as out:
+        if patch is not None:
+            check_folder("--patch", patch)
+        from simgap.progress import heard
+        from simgap.robot_effects import UNMEASURED, effects_of
+        from simgap.robots.calibrate import STAGES
+        from simgap.robots.calibrate import calibrate as fitted
+        from simgap.robots.patch import write_patch
+        from simgap.simulators.mjcf.load import load_mjcf
+
+        loaded = load_mjcf(model, map_file)
+        recordings = [loaded.read(path) for path in distinct_trials(logs)]
+        for warning in (*loaded.warnings, *(w for log in recordings for w in log.warnings)):
+            out.warn(warning)
+        more, wanted = loaded.effects(recordings), (*UNMEASURED, *loaded.map.sd)
+        effects = effects_of(loaded.simulator, recordings, more, wanted)
+        stage = "calibrating"
+        with out.progress(stage, total=STAGES) as advance:
+
+            def tell(text: str) -> None:
+                nonlocal stage
+                stage = text
+                advance(1, text)
+
+            with heard(lambda text: advance(0, f"{stage}: {text}")):
+                found = fitted(loaded.simulator, recordings, effects, length=loaded.map.length, tell=tell)
+        from simgap.simulators.mjcf.engine import warned
+
+        for line in warned():
+            out.warn(line)
+        document = found.body()
+        out.print(*tables(document))
+        for name, reason in document["reasons"].items():
+            out.print(f"{name}: {reason}")
+        if patch is not None:
+            changed = [n for n in found.point if not found.composed.numeric(n)]
+            given = found.composed, found.point, document, changed, model
+            write_patch(*given, lambda name: out.stage(patch / name))
+        out.finish(document)
+
+
+def tables(document: dict[str, Any]) -> list[Table]:
+    """Parameters, what is told of several together, the simulation's own numbers, and held-out logs."""
+    from hmmseg.numbers import estimate, interval, shown_as
+
+    values = Table(title="parameters", title_justify="left")
+    for head in ("parameter", "the model has", "calibrated", "90 % interval"):
+        values.add_column(head, no_wrap=True)
+    sums = [
+        {"name": " + ".join(n if c == 1 else f"{c:.3g} {n}" for n, c in one["of"].items()), **one}
+        for one in document["combinations"]
+    ]
+    named = [{"name": n, **p} for n, p in (document["parameters"] | document["numerics"]).items()]
+    for p in (*named, *sums):
+        shown = shown_as(p["unit"])
+        nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
+        if p["mean"] is None:
+            values.add_row(p["name"], nominal, "not told", "")
+        else:
+            told = (
+                estimate(p["mean"], p["sd"], shown),
+                interval(p["interval_90"][0], p["interval_90"][1], shown),
+            )
+            values.add_row(p["name"], nominal, *told)
+    rms = Table(title="free runs along held-out logs, rms", title_justify="left")
+    for head in ("channel", "as the model came", "calibrated"):
+        rms.add_column(head)
+    after = document["heldout"]["after"]
+    for name, before in document["heldout"]["before"].items():
+        rms.add_row(name, f"{before:.4g}", f"{after[name]:.4g}")
+    return [values, rms]

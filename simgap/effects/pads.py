@@ -1,0 +1,246 @@
+"""Effects where fingertips touch: their stiffness, creep, slip and impact."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from simgap.effects.base import (
+    CONTACT,
+    CREEPING,
+    SLIDING,
+    Effect,
+    Parameter,
+    Performance,
+    World,
+    flat,
+    with_force,
+    with_load,
+    with_mode,
+)
+
+# Pads that are stiffer or softer than nominal.
+
+FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
+
+
+def _correct_fingertip_compliance(world: World, values, on) -> World:
+    normal, shear = jnp.asarray(values["give_normal"], float), jnp.asarray(values["give_shear"], float)
+    each = jnp.stack([jnp.asarray(values[n], float) for n in FINGERS])
+    return world._replace(
+        give_normal=world.give_normal + normal[None] + each[:2],
+        give_shear=world.give_shear + shear[None] + each[2:],
+    )
+
+
+def _report_fingertip_compliance(draws, rig):
+    """True stiffnesses [N/m] from the additional compliances; a pad is never stiffer than 1e6 N/m."""
+    tip, out = rig.fingertip, {}
+    for name, give in draws.items():
+        kind, finger = name[5:].rstrip("12"), name[-1] if name[-1] in "12" else ""
+        nominal = getattr(tip, f"{kind}_stiffness")
+        out[f"{kind}_stiffness{finger}"] = 1 / np.maximum(1 / nominal + give, 1e-6), "N/m"
+    return out
+
+
+def _admitted_fingertip_compliance(rig):
+    """Deviations of pads' stiffness [1], as those of their compliances [m/N]."""
+    tip, sds = rig.fingertip, rig.systematic.pad_stiffness
+    give = {"normal": 1 / tip.normal_stiffness, "shear": 1 / tip.shear_stiffness}
+    return "fingertip_compliance/1", {f"give_{k}{i + 1}": give[k] * sds[i] for k in give for i in (0, 1)}
+
+
+def _phrase_fingertip_compliance(means, rig):
+    nominal, found = rig.get("normal_stiffness"), means.get("normal_stiffness")
+    if nominal is None or found is None:
+        return "other fingertips than the model's"
+    if nominal == float("inf"):
+        return "fingertips that yield, where the model has rigid ones"
+    return "softer fingertips" if found < nominal else "stiffer fingertips"
+
+
+def _patched_fingertip_compliance(document, found):
+    """The pads' own numbers, each with what it was and what rig.toml says of it."""
+    from simgap.patch.write import interval_comment, number, table
+
+    pads = table(document, "fingertip")
+    names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]
+    for name in names:
+        before, said = pads.get(name, float("inf")), ""
+        if name in pads:
+            said = pads[name].trivia.comment.lstrip("# ")
+        pads[name] = number(found[name]["mean"])
+        pads[name].comment(
+            f"was {float(before):g}; {interval_comment(found[name])}" + (f"; {said}" if said else "")
+        )
+    return {name: f"fingertip.{name}" for name in names}
+
+
+FINGERTIP_COMPLIANCE = Effect(
+    name="fingertip_compliance",
+    acts_on="contact",
+    says="pad stiffness differs from nominal (or is finite at all)",
+    shows="distance follows grip force",
+    mistaken_for=("width", "joint_offset", "force_gain"),
+    called="other fingertips than the model's",
+    check=(
+        "Press a fingertip against a scale with feeler gauges behind it and plot force over travel; look "
+        "for worn or replaced pads."
+    ),
+    phrase=_phrase_fingertip_compliance,
+    parameters=(
+        Parameter("give_normal", "m/N", 4e-4, low=-2.4e-4),
+        Parameter("give_shear", "m/N", 4e-4, low=-3.8e-4),
+        *(Parameter(n, "m/N", 4e-4, low=-2.4e-4 if "normal" in n else -3.8e-4) for n in FINGERS),
+    ),
+    forms=(("give_normal", "give_shear"), FINGERS),
+    stage=CONTACT,
+    correct=_correct_fingertip_compliance,
+    report=_report_fingertip_compliance,
+    admitted=_admitted_fingertip_compliance,
+    patched=_patched_fingertip_compliance,
+    scene=lambda v: {"normal_stiffness": v["normal_stiffness"], "shear_stiffness": v["shear_stiffness"]},
+    played={"normal_stiffness": 800.0, "shear_stiffness": 500.0},
+)
+
+
+# A viscoelastic arm on the pad: foam that goes on yielding while held (standard linear solid).
+#
+# Stiff at once by (1 + ratio) k and relaxing to k: with the arm's time constant T, displacement d and
+# force F obey F + T F' = k d + T (1 + ratio) k d'. Solved for d, a share ratio / (1 + ratio) of the
+# yielding follows the force late, through a low-pass of T (1 + ratio).
+
+
+def _correct_fingertip_creep(world: World, values, on) -> World:
+    ratio = values["ratio"]
+    return with_mode(world, CREEPING, on)._replace(
+        creep=world.creep + on * ratio / (1 + ratio), creep_time=values["time_constant"] * (1 + ratio)
+    )
+
+
+def _apply_fingertip_creep(performance: Performance, values, rng) -> Performance:
+    """Tips of an unchanged grip force go where such a pad lets them."""
+    from scipy.signal import lfilter  # slow to import
+
+    pad, ratio = performance.rig.fingertip, values["ratio"]
+    late = values["time_constant"] * (1 + ratio)
+    keep = np.exp(-float(np.median(np.diff(performance.t))) / late)
+    lagged = np.asarray(lfilter([1 - keep], [1, -keep], performance.force, axis=0))
+    more = ratio / (1 + ratio) * (lagged - performance.force)
+    give = np.array([1 / pad.normal_stiffness, 1 / pad.shear_stiffness])
+    return performance._replace(position=performance.position + more * give)
+
+
+FINGERTIP_CREEP = Effect(
+    name="fingertip_creep",
+    acts_on="contact",
+    says="a viscoelastic arm on the pad (standard linear solid)",
+    shows="distance relaxes while held; grip decays",
+    mistaken_for=("force_drift", "grip_slip"),
+    called="fingertips that keep yielding under load",
+    check="Grip a rigid block for ten seconds at constant force and watch the distance of the fingers.",
+    parameters=(
+        Parameter("ratio", "1", 0.7, starts=(0.3,), low=0.0, high=8.0),
+        Parameter(
+            "time_constant", "s", 0.8, neutral=0.6, starts=(0.25, 0.7, 1.8), low=0.05, high=8.0, log=True
+        ),
+    ),
+    stage=CONTACT,
+    correct=_correct_fingertip_creep,
+    apply=_apply_fingertip_creep,
+)
+
+
+# Pads that slide on the block when the shear exceeds mu times the normal force.
+#
+# A slide shows as a shift of the fingers against the block that grows only while the shear is at its
+# bound. How far it slides is free in every grip (marginalised with the grip's other constants); when
+# is told by mu.
+
+# chosen: N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
+LOADED = 0.4
+HANGING = 0.9  # chosen: share of a carry, at least, that pads do not slide in: or the block would fall
+
+
+def _correct_grip_slip(world: World, values, on) -> World:
+    force = world.force - world.load
+    shear = jnp.abs(force[..., jnp.asarray([1, 3])])
+    push = jnp.stack([force[..., 0], -force[..., 2]], -1)
+    ratio = shear / jnp.maximum(push, 0.5 * LOADED)
+    carried = (world.carry > 0) & (push.min(axis=-1) > LOADED)
+    unknown = jnp.where(carried.any(), jnp.nan, 0.0)
+    steady = jnp.nanquantile(jnp.where(carried, ratio.max(axis=-1), unknown), HANGING)
+    mu = jnp.maximum(values["mu"], 1.05 * steady)
+    sliding = jax.nn.sigmoid((ratio / mu - 1.02) / 0.02).max(axis=-1)
+    sliding = sliding * jax.nn.sigmoid((push.min(axis=-1) - LOADED) / 0.05)
+    return with_mode(world, SLIDING, on)._replace(
+        slip=world.slip + on * sliding * (world.ground + world.carry)
+    )
+
+
+GRIP_SLIP = Effect(
+    name="grip_slip",
+    acts_on="contact",
+    says="the pad slides on the block when shear exceeds mu N",
+    shows="height changes that do not come back, at impact",
+    mistaken_for=("fingertip_creep",),
+    called="blocks that slip in the grip",
+    check="Mark the block at the pad and lift it harder than usual; clean the pads, or grip more firmly.",
+    parameters=(
+        Parameter(
+            "mu",
+            "1",
+            0.6,
+            neutral=0.5,
+            starts=(0.2, 0.28, 0.36, 0.46, 0.6, 0.8),
+            low=0.08,
+            high=1.5,
+            log=True,
+        ),
+    ),
+    stage=CONTACT,
+    correct=_correct_grip_slip,
+    scene=lambda v: {"friction": v["mu"]},
+    grip=(1.2, 1.8),  # chosen: N: so lightly that pads of a low friction slide
+    played={"mu": 0.12},
+)
+
+
+# A short pulse of vertical force when a block touches down.
+
+LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known as an impulse only
+
+
+def _pulse(since, xp):
+    """A raised cosine of unit area [1/s] over LENGTH from the event."""
+    inside = (since >= 0) & (since < LENGTH)
+    return xp.where(inside, (1 - xp.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0)
+
+
+def _correct_contact_impact(world: World, values, on) -> World:
+    since = world.t[:, :, None] - world.events[:, None, 2::4]
+    pulse = _pulse(since, jnp).sum(-1)[..., None] * jnp.asarray([0.0, 0.5, 0.0, 0.5])[None, None, :]
+    return with_load(world, -values["impulse"] * pulse)
+
+
+def _apply_contact_impact(performance: Performance, values, rng) -> Performance:
+    pulse = _pulse(performance.t[:, None] - performance.events[None, 2::4], np).sum(1)
+    share = np.array([0.0, 0.5, 0.0, 0.5])
+    return with_force(performance, flat(performance) - values["impulse"] * pulse[:, None] * share)
+
+
+CONTACT_IMPACT = Effect(
+    name="contact_impact",
+    acts_on="dynamics",
+    says="a pulse of -impulse in net fy at touchdown",
+    shows="place, first samples",
+    mistaken_for=("structural_vibration",),
+    called="shocks as blocks touch down",
+    check="Set down more slowly, and see whether the gap is gone.",
+    parameters=(Parameter("impulse", "N s", 0.03, low=0.0),),
+    stage=CONTACT,
+    correct=_correct_contact_impact,
+    apply=_apply_contact_impact,
+    wrist=True,
+)

@@ -1,0 +1,153 @@
+"""Effects of blocks and table: inertia, centre of mass, measured properties that are wrong, tilt, give."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from simgap.effects.base import (
+    CONTACT,
+    HAND,
+    YIELDING,
+    Effect,
+    Parameter,
+    Performance,
+    World,
+    flat,
+    with_force,
+    with_mode,
+)
+
+# The carried block's inertia, where a quasistatic model is asked for.
+
+OBJECT_INERTIA = Effect(
+    name="object_inertia",
+    acts_on="dynamics",
+    says="m a of the carried block: 1 is the whole of it, 0 a quasistatic block",
+    shows="start and stop of a carry",
+    mistaken_for=("force_lag",),
+    called="inertia of the block that the model leaves out",
+    check="Use a dynamic model, or carry more slowly.",
+    parameters=(Parameter("scale", "1", 1.0, neutral=1.0, low=-1.0, high=4.0),),
+    stage=CONTACT,
+    correct=lambda w, v, on: w._replace(inertia=w.inertia + v["scale"] - 1.0),
+    chosen=False,
+    wrist=True,
+)
+
+
+# A block whose mass lies beside its middle: the fingers share its weight unequally.
+
+
+def _apply_offcentre_mass(performance: Performance, values, rng) -> Performance:
+    more = performance.carried * values["offset"] / performance.width
+    return with_force(performance, flat(performance) + more[:, None] * np.array([0.0, -1.0, 0.0, 1.0]))
+
+
+OFFCENTRE_MASS = Effect(
+    name="offcentre_mass",
+    acts_on="dynamics",
+    says="mass `offset` to the right of the block's middle",
+    shows="unequal shear of the two fingers while carried",
+    mistaken_for=("force_crosstalk", "force_bias"),
+    called="a block heavier on one side",
+    check="Balance the block on an edge under its middle.",
+    parameters=(Parameter("offset", "m", 0.003),),
+    stage=CONTACT,
+    correct=lambda w, v, on: w._replace(couple=w.couple + v["offset"]),
+    apply=_apply_offcentre_mass,
+)
+
+
+# A property that was measured apart from the trials, and is wrong.
+
+WRONG = 0.05  # prior: share by which a measured property may be off
+
+
+def _wrong_actual(given, push: np.ndarray) -> list:
+    """A candidate for each property that was measured apart."""
+    from simgap.attribution.problem import Candidate
+    from simgap.gap.tolerance import properties_tolerated
+
+    out, nothing, least = [], np.zeros(1), properties_tolerated(given)
+    for o, name in enumerate(given.frame.task.objects):
+        for k, kind in enumerate(("weight", "width", "height")):
+            column = push[:, 3 * o + k]
+            if given.measured[o, k]:
+                usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.sd[o, k])
+                out.append(Candidate(ACTUAL.name, (f"{name}.{kind}",), nothing, nothing, usual,
+                                     np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
+                                     np.full(1, np.inf), least=least[[3 * o + k]]))  # fmt: skip
+    return out
+
+
+ACTUAL = Effect(
+    name="actual",
+    acts_on="measurement",
+    says="a value of actual.toml is off by a share of itself: its name is the parameter's",
+    shows="what depends on that property alone",
+    mistaken_for=("force_gain", "fingertip_compliance"),
+    called="a measured block property that the recordings contradict",
+    check="Weigh and measure the block again, and check the unit in actual.toml.",
+    parameters=(Parameter("property", "1", WRONG),),
+    stage=HAND,
+    wrong=_wrong_actual,
+    wrist=True,
+)
+
+
+# A support inclined from the horizontal.
+#
+# A block of which one foot touches first turns in the grip until the other one does, and pads slide on it.
+
+TABLE_TILT = Effect(
+    name="table_tilt",
+    acts_on="contact",
+    says="support inclined by `angle`, rising to the right",
+    shows="heights differ with x",
+    mistaken_for=("joint_offset", "height"),
+    called="a table that is not level",
+    check="Lay a spirit level on the table, along the line between the fingers.",
+    parameters=(Parameter("angle", "rad", 0.025),),
+    stage=CONTACT,
+    correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),
+    scene=lambda v: {"tilt": v["angle"]},
+    wrist=True,
+    turns="angle",
+    played={"angle": 0.06},
+)
+
+
+# A support that yields under load, a little late.
+
+
+def _correct_table_compliance(world: World, values, on) -> World:
+    # What yields has mass and damping: it is late by some hundredths of a second.
+    return with_mode(world, YIELDING, on)._replace(
+        give_support=world.give_support + values["give"],
+        support_time=world.support_time + on * values["settling"],
+    )
+
+
+def _report_table_compliance(draws, rig):
+    return {"stiffness": (1 / draws["give"].clip(1e-7), "N/m")}
+
+
+TABLE_COMPLIANCE = Effect(
+    name="table_compliance",
+    acts_on="contact",
+    says="the support yields by load / stiffness",
+    shows="height falls with vertical force on the ground",
+    mistaken_for=("fingertip_compliance",),
+    called="a table that yields under load",
+    check="Press on the table with a known weight beside a dial gauge; look for foam, a mat or a loose foot.",
+    parameters=(
+        Parameter("give", "m/N", 4e-4, low=0.0),
+        Parameter("settling", "s", 0.8, neutral=0.02, low=1e-3, high=0.2, log=True, hidden=True),
+    ),
+    stage=CONTACT,
+    correct=_correct_table_compliance,
+    report=_report_table_compliance,
+    scene=lambda v: {"support_stiffness": v["stiffness"]},
+    wrist=True,
+    played={"stiffness": 1500.0},
+)

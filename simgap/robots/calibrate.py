@@ -1,0 +1,334 @@
+"""What nobody measured of a robot's model, fitted to its logs: all of it together, by whole logs run freely.
+
+Windows that are begun anew lead near, from wherever a data sheet starts; logs run from their first state to
+their last, as people judge a model, settle it. Squares are of each channel in units of what is left of it, by
+Levenberg and Marquardt within bounds. Which parameters the logs tell, and which only together, is read off
+the sensitivities there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hmmseg.errors import InputError
+from simgap.progress import Progress, silent
+from simgap.robot_effects.base import RobotEffect
+from simgap.robots.borne_out import folds_of
+from simgap.robots.fit import FINEST, Whiten, moved_to
+from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
+from simgap.robots.model import Composed, Point
+from simgap.robots.noise import noises
+from simgap.robots.whiten import covariances
+from simgap.robots.windows import LENGTH
+from simgap.simulators.protocol import Simulator
+from simgap.simulators.recording import Recording
+
+STAGES = 4  # look: what a progress bar counts
+LONGEST = 20.0  # numerics: s that a log is run freely
+STEPS, AGAIN = 30, 4  # numerics: of the fit, and of one that begins where it ended
+ROUNDS = 2  # numerics: fits, each in units of what the last one left
+UNTOLD = 0.5  # chosen: of a prior's sd; a parameter of which logs leave more is not told by them
+NOTHING = 0.05  # numerics: a correlation that is none
+COUPLED = 0.05  # numerics: of a direction that is not told, what a parameter must have in it to be of it
+NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The `point` of the best fit; of its parameters, in the order of `names`, the `covariance` (p, p), the
+    priors' `sd` (p,), and in these units the logs' `information` (p, p).
+
+    `before` and `after`: root mean squares by channel of free runs along logs that took no part. `composed`
+    has whole logs.
+    """
+
+    composed: Composed
+    point: Point
+    names: tuple[tuple[str, str], ...]
+    sd: np.ndarray
+    covariance: np.ndarray
+    information: np.ndarray
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+
+    @property
+    def told(self) -> np.ndarray:
+        """Whether logs tell each parameter by itself (p,)."""
+        return np.sqrt(np.diag(self._posterior)) <= UNTOLD
+
+    @property
+    def _posterior(self) -> np.ndarray:
+        """The covariance by information and prior alone, in units of the priors' sd."""
+        return np.linalg.inv(self.information + np.eye(self.sd.size))
+
+    def body(self) -> dict[str, Any]:
+        """The document: parameters, what is told only together, the simulation's numbers, held-out logs."""
+        every = range(len(self.names))
+        own = [k for k in every if not self.composed.numeric(self.names[k][0])]
+        untold = [k for k in own if not self.told[k]]
+        return {
+            "parameters": {self.label(k): self._entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
+            "reasons": {self.label(k): self._reason(k) for k in untold},
+            "combinations": self.combinations(),
+            "numerics": {self.label(k): self._entry(k) for k in every if k not in own},
+            "heldout": {"before": dict(self.before), "after": dict(self.after)},
+        }
+
+    def label(self, k: int) -> str:
+        """A parameter's name: its effect's, and its own where that has several."""
+        effect, short = self.names[k]
+        return effect if len(self.composed.effects[effect].parameters) == 1 else f"{effect}.{short}"
+
+    def value(self, k: int) -> float:
+        """A parameter where the fit ended."""
+        effect, short = self.names[k]
+        return float(self.point[effect][short])
+
+    def _entry(self, k: int) -> dict[str, Any]:
+        effect, short = self.names[k]
+        known = self.composed.effects[effect].parameters[short]
+        mean, sd = self.value(k), float(np.sqrt(self.covariance[k, k]))
+        low, high = max(mean - NORMAL_90 * sd, known.low), min(mean + NORMAL_90 * sd, known.high)
+        return {
+            "nominal": known.nominal,
+            "mean": mean,
+            "sd": sd,
+            "interval_90": [low, high],
+            "unit": known.unit,
+        }
+
+    def _reason(self, k: int) -> str:
+        others = [self.label(i) for i in self._group(k) if i != k]
+        if self.information[k, k] < 1 or not others:
+            return "these logs tell little more of it than was known beforehand"
+        return f"told only together with {', '.join(others)}"
+
+    def _group(self, k: int) -> list[int]:
+        """What shares with a parameter a direction that is not told."""
+        value, vector = np.linalg.eigh(self._posterior)
+        vague = vector[:, np.sqrt(value) > UNTOLD]
+        seen = (np.diag(self.information) >= 1) & (np.sum(vague**2, 1) > COUPLED)
+        tied = np.abs(vague @ vague.T) > COUPLED
+        found, new = {k}, [k]
+        while new:
+            at = new.pop()
+            more = [int(i) for i in np.flatnonzero(tied[at] & seen) if int(i) not in found]
+            found |= {*more}
+            new += more
+        return sorted(found)
+
+    def combinations(self) -> list[dict[str, Any]]:
+        """What is told of parameters that are only told together: sums, each with a pivot of its own."""
+        left, out = [int(k) for k in np.flatnonzero(~self.told & (np.diag(self.information) >= 1))], []
+        while left:
+            group = np.array(self._group(left[0]))
+            left = [k for k in left if k not in group]
+            value, vector = np.linalg.eigh(self._posterior[np.ix_(group, group)])
+            rows = vector[:, np.sqrt(value) <= UNTOLD].T / self.sd[group]
+            for row in _reduced(rows, self.sd[group]):
+                whole = np.zeros(len(self.names))
+                whole[group] = row
+                mean = sum(c * self.value(k) for k, c in enumerate(whole) if c)
+                sd = float(np.sqrt(whole @ self.covariance @ whole))
+                of = {self.label(k): float(c) for k, c in enumerate(whole) if c}
+                pivot = self.names[int(group[np.flatnonzero(row == 1.0)[0]])]
+                unit = self.composed.effects[pivot[0]].parameters[pivot[1]].unit
+                out.append({"of": of, "unit": unit, "mean": mean, "sd": sd,
+                            "interval_90": [mean - NORMAL_90 * sd, mean + NORMAL_90 * sd]})  # fmt: skip
+        return out
+
+
+_UNKNOWN = {"mean": None, "sd": None, "interval_90": None}
+
+
+def _reduced(rows: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
+    """Rows (k, g) in reduced echelon form, so that each has a pivot 1 that no other has; entries that move
+    nothing, at parameters' sizes (g,), are 0."""
+    out, free = rows.copy(), list(range(rows.shape[1]))
+    for k in range(len(out)):
+        pivot = max(free, key=lambda j, k=k: abs(out[k, j]) * size[j])
+        free.remove(pivot)
+        out[k] /= out[k, pivot]
+        for i in range(len(out)):
+            if i != k:
+                out[i] -= out[i, pivot] * out[k]
+    weight = np.abs(out) * size
+    return list(np.where(weight < COUPLED * weight.max(1, initial=0.0, keepdims=True), 0.0, out))
+
+
+def calibrate(
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    effects: Mapping[str, RobotEffect],
+    *,
+    length: float | None = None,
+    tell: Progress = silent,
+) -> Calibration:
+    """Fit all effects that are `fitted` to logs of a robot.
+
+    Args:
+        simulator: the robot's model.
+        recordings: its logs; with one or two, stretches of them are held out.
+        effects: by name; those that are not fitted along are left out.
+        length: s of windows that lead near.
+        tell: hears what is being done.
+
+    Raises:
+        InputError: nothing is uncertain, or the simulator diverges.
+    """
+    mine = {n: e for n, e in effects.items() if e.fitted}
+    if all(_numeric(simulator, e) for e in mine.values()):
+        raise InputError("calibrate", "nothing of the model is uncertain", "uncertain = [..] in the map")
+    noise = noises(simulator, recordings)
+    point: Point = {n: e.neutral() for n, e in mine.items()}
+    tell("windows")
+    windows = Composed.of(simulator, recordings, mine, noise, LENGTH if length is None else length)
+    linear = linearise(windows, point, [])
+    near = moved_to(windows, linear, covariances(windows, linear).whitener(), point, steps=STEPS).point
+    tell("whole logs")
+    whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
+    begin = min((near, point), key=lambda p: _cost(whole, p))
+    if not np.isfinite(_cost(whole, begin)):  # nothing follows a whole log freely: windows are all there is
+        whole, begin = windows, near
+    found, linear, whiten = _least_squares(whole.moved(begin), begin, STEPS)
+    tell("what the logs tell")
+    names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten)
+    tell("held-out logs")
+    before, after = _held_out(whole.moved(found), point, found)
+    return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
+
+
+def _numeric(simulator: Simulator, effect: RobotEffect) -> bool:
+    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
+
+
+def _stretches(recordings: Sequence[Recording]) -> list[Recording]:
+    """The logs, or where there is only one its halves, so that one can be held out."""
+    if len(recordings) > 1:
+        return list(recordings)
+    (log,) = recordings
+    return [log.window(0, len(log) // 2), log.window(len(log) // 2, len(log))]
+
+
+def _scales(composed: Composed, residual: np.ndarray) -> np.ndarray:
+    """Root mean square (N,) of each row's channel, the noise's at least, times the root of
+    how many neighbouring rows say the same."""
+    rows = composed.rows
+    out = np.zeros(rows.log.size)
+    for c in range(len(rows.channels)):
+        mine = rows.channel == c
+        parts = [residual[mine & (rows.window == w)] for w in np.unique(rows.window[mine])]
+        seen = [np.nan_to_num(part) for part in parts if part.size]
+        out[mine] = np.sqrt(np.mean(np.concatenate(seen) ** 2) * _repeated(seen)) if seen else 0.0
+    return np.maximum(out, np.sqrt(rows.variance))
+
+
+def _repeated(parts: Sequence[np.ndarray]) -> float:
+    """How many neighbours say the same: 1 + 2 (rho_1 + rho_2 + ..), as long as these are of the noise's sign
+    (Geyer, Statistical Science 7, 1992)."""
+    total, out = sum(float(p @ p) for p in parts), 1.0
+    for lag in range(1, max(p.size for p in parts)):
+        rho = sum(float(p[lag:] @ p[:-lag]) for p in parts) / max(total, 1e-300)
+        if rho <= NOTHING:
+            break
+        out += 2 * rho
+    return out
+
+
+def _cost(composed: Composed, point: Point) -> float:
+    """How far free runs are from the logs, in units of the channels' spread; infinite where one diverges."""
+    left = composed.rows.observed - base_at(composed, point).rows
+    if not np.isfinite(left).all():
+        return np.inf
+    cost = float(np.mean((left / _spread(composed)) ** 2))
+    return cost if cost < len(composed.rows.channels) else np.inf
+
+
+def _spread(composed: Composed) -> np.ndarray:
+    """Standard deviation (N,) of each row's channel over all logs."""
+    channel, seen = composed.rows.channel, composed.rows.observed
+    count = np.maximum(np.bincount(channel), 1)
+    away = seen - (np.bincount(channel, seen) / count)[channel]
+    return np.sqrt(np.maximum((np.bincount(channel, away**2) / count)[channel], composed.rows.variance))
+
+
+def _whitener(composed: Composed, linear: Linear) -> Whiten:
+    """Rows in units of what is left of their channel, what their log's uncertain start makes of them taken
+    off: (1 + U U')^(-1/2) by the singular values of U."""
+    scale, parts = _scales(composed, linear.residual), []
+    for window, rows in zip(composed.windows, linear.rows.of, strict=True):
+        doubt = [linear.starts[n][rows] * d for n, d in window.doubt.items()]
+        if doubt:
+            left, value, _ = np.linalg.svd(np.array(doubt).T / scale[rows, None], full_matrices=False)
+            parts.append((rows, left, 1 - 1 / np.sqrt(1 + value**2)))
+
+    def whiten(values: np.ndarray) -> np.ndarray:
+        out = values / (scale if values.ndim == 1 else scale[:, None])
+        for rows, left, less in parts:
+            inner = (left.T @ out[rows]).T * less
+            out[rows] = out[rows] - (left @ inner.T)
+        return out
+
+    return whiten
+
+
+def _least_squares(composed: Composed, point: Point, steps: int) -> tuple[Point, Linear, Whiten]:
+    """Where squares are least, from a point, the gap there and how rows are whitened."""
+    linear = linearise(composed, point, [])
+    for _ in range(ROUNDS if steps == STEPS else 1):
+        point = moved_to(composed, linear, _whitener(composed, linear), point, steps=steps).point
+        linear = linearise(composed, point, [], linear.starts)
+    return point, linear, _whitener(composed, linear)
+
+
+def _told(
+    composed: Composed, point: Point, linear: Linear, whiten: Whiten
+) -> tuple[tuple[tuple[str, str], ...], np.ndarray, np.ndarray, np.ndarray]:
+    """Names and priors' sd (p,) of all parameters, the logs' information of them in these units, and their
+    covariance."""
+    names = tuple((e, p) for e in point for p in composed.effects[e].parameters)
+    sd = np.array([composed.effects[e].parameters[p].sd for e, p in names])
+    base, columns = base_at(composed, point), np.zeros((linear.residual.size, len(names)))
+    for effect in point:
+        mine, step = np.array([e == effect for e, _ in names]), None
+        for _ in range(2):  # by a usual step, and by one as fine as the parameter is told
+            one = vary(composed, base, linear.starts, effect, step=step, shifted=False)
+            if one is None:
+                break
+            columns[:, mine] = whiten(np.nan_to_num(one.jacobian)) * sd[mine]
+            step = np.clip(1 / np.sqrt(1 + np.sum(columns[:, mine] ** 2, 0)), FINEST, STEP)
+    information = columns.T @ columns
+    return names, sd, information, np.linalg.inv(information + np.eye(sd.size)) * np.outer(sd, sd)
+
+
+def _held_out(composed: Composed, nominal: Point, found: Point) -> tuple[dict[str, float], dict[str, float]]:
+    """Root mean squares by channel of free runs along logs that a fit did not see."""
+    rows = composed.rows
+    before = rows.observed - base_at(composed, nominal).rows
+    after, fold = np.full(rows.log.size, np.nan), folds_of_logs(composed)
+    for number in np.unique(fold):
+        mine = fold == number
+        seen = composed.along(np.unique(rows.log[~mine]).tolist())
+        point, _, _ = _least_squares(seen, found, AGAIN)
+        part = composed.along(np.unique(rows.log[mine]).tolist())
+        after[mine] = rows.observed[mine] - base_at(part, point).rows
+    return _rms(composed, before), _rms(composed, after)
+
+
+def folds_of_logs(composed: Composed) -> np.ndarray:
+    """The fold (N,) of each row: whole logs."""
+    return folds_of(
+        linearise(composed, {}, [], {}), len(composed.recordings), range(len(composed.recordings))
+    )
+
+
+def _rms(composed: Composed, left: np.ndarray) -> dict[str, float]:
+    out = {}
+    for c, name in enumerate(composed.rows.channels):
+        mine = left[composed.rows.channel == c]
+        out[name] = float(np.sqrt(np.mean(mine**2))) if np.isfinite(mine).all() else np.nan
+    return out

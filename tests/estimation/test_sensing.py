@@ -1,0 +1,178 @@
+"""A number that is printed with confidence is no nonsense: recordings altered as sensors and rigs go wrong.
+
+Each row says how a healthy recording is altered, what a warning must name, and which properties hang on it:
+they are null with a reason that names it as well, or their intervals hold the truth. All others stay right.
+"""
+
+import re
+import tomllib
+
+import numpy as np
+import pandas as pd
+import pytest
+from fault_scene import FOLDER
+
+from estimation import identify
+from hmmseg.hand.sensing import sensed
+from hmmseg.io.formats import read_table
+from hmmseg.io.rig import read_rig
+from hmmseg.io.trial import read_trial, trial_of
+
+FORCES = ("fx1", "fy1", "fx2", "fy2")
+RATES = ("dq11", "dq12", "dq21", "dq22")
+PROPERTIES = ("weight", "width", "height")
+TRUTH = {  # recordings/labels.json
+    "block1": {"weight": 0.57789, "width": 0.018795, "height": 0.017266},
+    "block2": {"weight": 0.52560, "width": 0.027978, "height": 0.012562},
+}
+TABLE = {name: v.to_numpy(float) for name, v in pd.read_csv(FOLDER / "trial_01.csv").items()}
+
+
+def at(share):
+    return int(share * TABLE["t"].size)
+
+
+def frozen(*names, start=0.55, stop=1.0, value=None):
+    def alter(c):
+        for name in names:
+            c[name][at(start) : at(stop)] = c[name][at(start)] if value is None else value
+
+    return alter
+
+
+def scaled(factor, *names):
+    def alter(c):
+        for name in names:
+            c[name] *= factor
+
+    return alter
+
+
+def cell(name, share, value):
+    def alter(c):
+        c[name][at(share)] = value
+
+    return alter
+
+
+def clipped(most, *names):
+    def alter(c):
+        for name in names:
+            c[name][:] = np.clip(c[name], -most, most)
+
+    return alter
+
+
+def later(share, size, name="t"):
+    def alter(c):
+        c[name][at(share) :] += size
+
+    return alter
+
+
+def emptied(c):
+    for name in c.keys() - {"t"}:
+        c[name][::2] = np.nan
+
+
+def holed(c):
+    names = [name for name in c if name != "t"]
+    for i in range(c["t"].size):
+        c[names[i % len(names)]][i] = np.nan
+
+
+ALTERED = {
+    "frozen force": (frozen("fx1"), "fx1 repeats -0.00762 .* from 5.50 to 9.95 s"),
+    "frozen in a grip": (frozen("fx1", start=0.3), "fx1 repeats 2.49"),
+    "both fingers": (frozen("fx1", "fx2"), "fx2 repeats"),
+    "a while": (frozen("fy2", start=0.35, stop=0.45), "fy2 repeats .* from 3.50 to 4.45 s"),
+    "dead at zero": (frozen("fx1", value=0.0), "fx1 repeats 0 "),
+    "constant": (frozen("fy1", start=0.0), "fy1 reads 0.00.* in every row"),
+    "frozen encoder": (frozen("q11"), "q11 repeats"),
+    "frozen joint": (frozen("q22", "dq22"), "q22 repeats"),
+    "no velocities": (frozen(*RATES, start=0.0, value=0.0), "dq11, dq12, dq21, dq22 stand still"),
+    "wild cell": (cell("fx1", 0.5, 1e9), "fx1 reads 1e.09"),
+    "wild angle": (cell("q21", 0.3, 1e6), "q21 (reads 1e.06|jumps by)"),
+    "saturated": (clipped(2.0, *FORCES), "fx1 goes no farther than 2: it saturates"),
+    "lost counts": (later(0.7, 0.2, "q21"), "q21 jumps by 0.19.* at 7.00 s"),
+    "moved zero": (later(0.5, 1.0, "fx2"), "the zero of fx2 moves"),
+    "twice": (scaled(2.0, *FORCES), "forces are read 1.8 times too large"),
+    "ten times": (scaled(10.0, *FORCES), "forces are read 8.* times too large"),
+    "half": (scaled(0.5, *FORCES), "forces are read 2 times too small"),
+    "one finger": (scaled(2.0, "fx2", "fy2"), "fx1 and -fx2 press what is carried"),
+    "velocities": (scaled(2.0, *RATES), "0.5 times as far as their velocities"),
+    "every other row": (emptied, "every channel lacks 50% of its readings"),
+    "holes": (holed, "every row without some reading"),
+    "clock": (later(0.5, 1.0), "t jumps by 1.05 s at 4.95 s"),
+}  # fmt: skip
+
+
+QUICK = (
+    "frozen force",
+    "constant",
+    "frozen encoder",
+    "wild cell",
+    "saturated",
+    "twice",
+    "one finger",
+    "clock",
+)
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in ALTERED]
+)
+def test_what_a_sensor_cannot_have_read_is_named_and_no_number_hangs_on_it(name):
+    alter, named = ALTERED[name]
+    columns = {key: values.copy() for key, values in TABLE.items()}
+    alter(columns)
+    found = identify(columns, FOLDER / "task.toml", FOLDER / "rig.toml")
+    said = [*found.aligned.trials[0].trial.warnings, *found.warnings]
+    assert any(re.search(named, line) for line in said), said
+    for obj, props in TRUTH.items():
+        for prop in PROPERTIES:
+            if (obj, prop) in found.names:
+                low, high = np.quantile(found.of(obj, prop), [5e-4, 1 - 5e-4])
+                assert low <= props[prop] <= high, (obj, prop, low, high)
+            else:
+                assert found.reasons[f"{obj}.{prop}"]
+
+
+def test_a_width_below_nothing_is_none_and_the_weights_stay():
+    rig = tomllib.loads((FOLDER / "rig.toml").read_text())
+    rig["fingers"]["2"]["base"][0] -= 0.05
+    found = identify(TABLE, FOLDER / "task.toml", rig)
+    assert "comes out at -0.0312 m" in found.reasons["block1.width"]
+    assert found.of("block1", "weight").mean() == pytest.approx(0.578, rel=0.02)
+
+
+def test_healthy_recordings_show_no_fault():
+    for path in sorted(FOLDER.parent.glob("*/trial_*.csv")):
+        rig = read_rig(path.parent / "rig.toml")
+        assert sensed(trial_of(read_table(path), rig, None), rig).faults == ()
+
+
+@pytest.mark.parametrize("step", [0.02, 0.05, 0.2])
+def test_coarse_forces_and_forces_held_for_some_samples_are_none(step):
+    rig = read_rig(FOLDER / "rig.toml")
+    coarse = TABLE | {name: np.round(TABLE[name] / step) * step for name in FORCES}
+    held = TABLE | {name: TABLE[name][(np.arange(TABLE["t"].size) // 4) * 4] for name in FORCES}
+    silent = TABLE | {name: np.where(np.abs(TABLE[name]) < step, 0.0, TABLE[name]) for name in FORCES}
+    for columns in (coarse, held, silent):
+        assert read_trial(columns, rig).faults == ()
+
+
+def test_a_recording_without_noise_may_stand_still():
+    """A hand of a noise-free simulation that waits: every position repeats itself, and none is at fault."""
+    rig = read_rig(FOLDER / "rig.toml")
+    t = TABLE["t"]
+    way = np.interp(t, [0.0, 2.0, 4.0, 6.0, 10.0], [0.0, 0.0, 1.0, 1.0, 0.3])
+    smooth = {"t": t} | {
+        name: -1.0 + 0.1 * (i + 1) * way for i, name in enumerate(("q11", "q12", "q21", "q22"))
+    }
+    smooth |= {f"d{name}": np.gradient(values, t) for name, values in smooth.items() if name != "t"}
+    smooth |= {
+        name: sign * np.clip(way - 0.5, 0.0, 1.0)
+        for name, sign in zip(FORCES, (1, 0.1, -1, 0.1), strict=True)
+    }
+    assert read_trial(smooth, rig).faults == ()

@@ -1,0 +1,146 @@
+"""A cache is a convenience: what is damaged, foreign or nowhere to be written counts as nothing."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmmseg import cache
+from hmmseg.cache import CacheWarning, cache_folder, keep_value, kept_value
+from simgap.attribution.problem import Rows
+from simgap.phases import Phase
+
+VALUE = {
+    ("a", 1): [1.5, np.float64(0.1), None, True, float("inf")],
+    "rows": Rows(*([np.arange(3)] * 3), np.linspace(0, 1, 3), ("t",), ("c",), ("p",)),
+    "phase": Phase.CARRY,
+    "sets": (frozenset({"x"}), {2}, slice(1, None, 2), ()),
+}
+
+
+@pytest.fixture(autouse=True)
+def unsaid(monkeypatch):
+    monkeypatch.setattr(cache, "_said", set())
+
+
+def test_values_come_back_as_they_were(tmp_path):
+    keep_value(tmp_path / "new/one.npz", VALUE)
+    found = kept_value(tmp_path / "new/one.npz")
+    assert found.keys() == VALUE.keys() and found["phase"] is Phase.CARRY and found["sets"] == VALUE["sets"]
+    assert found["a", 1] == VALUE["a", 1] and type(found["a", 1][1]) is np.float64
+    rows = found["rows"]
+    assert isinstance(rows, Rows) and rows.trial is rows.channel and rows.time[1] == 0.5
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["one.npz"]
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "garbled", "foreign", "pickle", "folder", "swapped"])
+def test_a_damaged_file_is_said_once_and_made_anew(damage, tmp_path):
+    path, other = tmp_path / "one.npz", tmp_path / "other.npz"
+    for each in (path, other):
+        keep_value(each, [1, 2])
+        content = bytearray(each.read_bytes())
+        middle = len(content) // 2
+        content[middle] ^= 0x10
+        each.unlink()
+        if damage == "folder":
+            each.mkdir()
+            continue
+        each.write_bytes({
+            "empty": b"", "cut": bytes(content[:middle]), "garbled": bytes(content), "foreign": b"\xff" * 99,
+            "pickle": pickle.dumps([1, 2]), "swapped": cache.MAGIC + bytes(32),
+        }[damage])  # fmt: skip
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert kept_value(path) is None and kept_value(other) is None
+    assert [w.category for w in said] == ([] if damage == "folder" else [CacheWarning])
+    keep_value(path, [3])
+    assert kept_value(path) == (None if damage == "folder" else [3])
+
+
+def test_nothing_but_this_project_s_own_types_is_made(tmp_path):
+    """A whole file with a right digest, written by somebody else: no code of theirs runs."""
+    for tree in (
+        '{"made": "subprocess:Popen", "fields": {}}',
+        '{"named": "builtins:exec", "values": ["1"]}',
+        '{"made": "hmmseg.cache:os.system", "fields": {}}',
+        '{"made": "hmmseg.api:align", "fields": {}}',
+        '{"made": "simgap.attribution.problem:Rows", "fields": {"trial": 1}}',
+        "[" * 10**5,
+        "{}",
+    ):
+        file = io.BytesIO()
+        np.savez(file, tree=np.frombuffer(tree.encode(), np.uint8))
+        cache.keep(tmp_path / "one.npz", file.getvalue())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert kept_value(tmp_path / "one.npz") is None, tree
+    with pytest.raises(TypeError, match="cannot be kept"):
+        keep_value(tmp_path / "one.npz", [Path])
+
+    @dataclass
+    class Foreign:
+        x: int = 1
+
+    with pytest.raises(TypeError, match="cannot be kept"):
+        keep_value(tmp_path / "one.npz", Foreign())
+
+
+@pytest.mark.parametrize("where", ["/proc/nowhere", "a file", "relative", ""])
+def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monkeypatch):
+    (tmp_path / "a file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / where) if where == "a file" else where)
+    monkeypatch.setenv("HOME", "/proc/nowhere")
+    folder = cache_folder()
+    assert folder is not None
+    keep_value(folder / "one.npz", 1)
+    assert kept_value(folder / "one.npz") is None
+    assert os.listdir(tmp_path) == ["a file"]
+
+
+PROGRAM = """
+import sys
+from hmmseg.jaxconfig import configure, double_precision
+configure()
+import jax, jax.numpy as jnp
+jax.monitoring.register_event_listener(lambda event, **_: print(event) if "cache_" in event else None)
+print(double_precision(lambda: jax.jit(lambda x: (x * x).sum())(jnp.arange(5.0)))())
+"""
+
+
+@pytest.mark.parametrize("damage", ["none", "garbled", "nowhere"])
+def test_compiled_programs_that_are_damaged_are_compiled_anew(damage, tmp_path):
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
+    if damage == "nowhere":
+        (tmp_path / "hmmseg").write_text("")
+
+    def run():
+        return subprocess.run(
+            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True
+        )
+
+    first = run()
+    assert first.stdout.endswith("30.0\n") and first.stderr == ""
+    if damage == "nowhere":
+        return
+    programs = list((tmp_path / "hmmseg/programs").iterdir())
+    assert programs and "cache_hits" not in first.stdout
+    if damage == "garbled":
+        for program in programs:
+            content = bytearray(program.read_bytes())
+            content[len(content) // 2] ^= 0xFF
+            program.write_bytes(content)
+        second = run()
+        assert second.stdout.endswith("30.0\n") and "cache_hits" not in second.stdout
+        assert second.stderr.count("not as it was written") == 1
+    third = run()
+    assert third.stderr == "" and "cache_hits" in third.stdout and third.stdout.endswith("30.0\n")

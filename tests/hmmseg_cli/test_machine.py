@@ -1,0 +1,311 @@
+"""What a machine may do to a command: refuse a file, lose a reader, fill a disk, kill a process.
+
+Always one line and exit 2, or the whole result; never a traceback or half a file.
+"""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from hmmseg.example import example_folder
+from hmmseg_cli import console
+from hmmseg_cli.main import main
+
+STACK = Path(__file__).parents[1] / "data/stack"
+HAND = ["--task", "task.toml", "--rig", "rig.toml"]
+COMMANDS = {
+    "decompose": ["decompose", "task.toml", "--json", "out.json"],
+    "effects": ["effects", "--json", "out.json"],
+    "inspect": ["inspect", "trial.csv", "--json", "out.json"],
+    "new": ["new", "lab"],
+    "segment": ["segment", "trial.csv", *HAND, "--method", "qualitative", "--json", "out.json"],
+    "identify": ["identify", "trial.csv", *HAND, "--method", "paper", "--json", "out.json", "--report",
+                 "page.html"],
+    "fit": ["fit", "trial.csv", "--task", "order.toml", "--model", "model.npz", "--json", "out.json"],
+    "simulate": ["simulate", *HAND, "--trials", "1", "--output", "made", "--json", "out.json"],
+}  # fmt: skip
+QUICK = ("decompose", "new", "segment")
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "order.toml").write_text('sequence = ["reach", "grip", "leave"]\nchannels = ["fx1", "fy1"]\n')
+    shutil.copyfile(example_folder() / "task.toml", tmp_path / "task.toml")
+    shutil.copyfile(STACK / "rig.toml", tmp_path / "rig.toml")
+    shutil.copyfile(STACK / "trial_01.csv", tmp_path / "trial.csv")
+    return tmp_path
+
+
+def files(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def restore(folder, before):
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and str(path.relative_to(folder)) not in before:
+            path.unlink()
+        elif path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+    for name, content in before.items():
+        if (folder / name).read_bytes() != content:
+            (folder / name).write_bytes(content)
+
+
+class Refusing:
+    """Counts calls of a function of the system, and refuses the one of this number."""
+
+    def __init__(self, real, error, at=-1, counted=lambda *_: True):
+        self.real, self.error, self.at, self.counted, self.calls = real, error, at, counted, 0
+
+    def __call__(self, *arguments, **more):
+        if self.counted(*arguments):
+            self.calls += 1
+            if self.calls - 1 == self.at:
+                raise self.error
+        return self.real(*arguments, **more)
+
+
+def own(path, *_):
+    """Whether a path is data, and no code of a package that is still being imported."""
+    name = os.fspath(path) if isinstance(path, str | os.PathLike) else ""
+    return (
+        not str(name).endswith((".py", ".pyc", ".so", ".afm", ".ttf", ".mplstyle"))
+        and "site-packages" not in name
+    )
+
+
+FULL = OSError(28, "No space left on device")
+CALLS = {
+    "open": (builtins, "open", PermissionError(13, "Permission denied"), own),
+    "io.open": (io, "open", OSError(24, "Too many open files"), own),
+    "rename": (os, "replace", FULL, lambda *_: True),
+    "copy": (shutil, "copyfile", FULL, lambda *_: True),
+    "folder": (os, "mkdir", FULL, lambda *_: True),
+    "memory": (json, "dumps", MemoryError(), lambda *_: True),
+}
+
+
+def tortured(lab, name, kind, monkeypatch, capsys, most):
+    """Refuse each call of a kind in turn; the number of calls that a command makes."""
+    module, attribute, error, counted = CALLS[kind]
+    real, before = getattr(module, attribute), files(lab)
+    assert main(COMMANDS[name]) == 0  # everything is imported, and kept that is kept
+    whole = files(lab)
+    count = Refusing(real, error, counted=counted)
+    with monkeypatch.context() as patched:
+        patched.setattr(module, attribute, count)
+        restore(lab, before)
+        assert main(COMMANDS[name]) == 0
+    for at in range(0, count.calls, max(1, count.calls // most)):
+        restore(lab, before)
+        capsys.readouterr()
+        with monkeypatch.context() as patched:
+            patched.setattr(module, attribute, Refusing(real, error, at, counted))
+            code = main(COMMANDS[name])
+        err = capsys.readouterr().err
+        found = files(lab)
+        assert code in (0, 2), (at, err)
+        assert found.keys() in (before.keys(), whole.keys()), (at, found.keys() ^ before.keys())
+        assert code == 0 or (found == before and err.count("\n") >= 1), (at, err)
+        assert "Traceback" not in err
+        assert not [n for n in found if ".hmmseg" in n]
+    return count.calls
+
+
+@pytest.mark.parametrize("kind", CALLS)
+@pytest.mark.parametrize("name", QUICK)
+def test_whatever_call_is_refused(name, kind, lab, monkeypatch, capsys):
+    tortured(lab, name, kind, monkeypatch, capsys, 6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CALLS)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_whichever_call_is_refused(name, kind, lab, monkeypatch, capsys):
+    """Every call of every command."""
+    tortured(lab, name, kind, monkeypatch, capsys, 10_000)
+
+
+def test_a_rename_that_is_refused_leaves_results_of_before(lab, monkeypatch, capsys):
+    assert main(COMMANDS["fit"]) == 0
+    before = files(lab)
+    real = os.replace
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "replace", Refusing(real, FULL, 1, lambda new, to: ".old" not in str(new)))
+        assert main([*COMMANDS["fit"], "--seed", "3"]) == 2
+    assert files(lab) == before
+    assert "cannot be written (No space left on device)" in capsys.readouterr().err
+
+
+PROCESS = [sys.executable, "-m", "hmmseg_cli.main"]
+
+
+@pytest.mark.parametrize("stdout", ["closed", "full", "gone"])
+def test_without_a_reader_the_work_is_kept_and_said(stdout, lab):
+    command = " ".join([*PROCESS, *COMMANDS["decompose"]])
+    end = {"closed": ">&-", "full": "> /dev/full", "gone": "| true"}[stdout]
+    run = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {{ sleep 0; {command}; }} {end}"], capture_output=True, text=True
+    )
+    assert (lab / "out.json").exists()
+    assert "Traceback" not in run.stderr and "Exception ignored" not in run.stderr
+    if stdout != "gone" or run.stderr:  # `true` may have read nothing yet when all was written
+        assert run.returncode == 2 and run.stderr.count("\n") == 1
+        assert run.stderr.startswith("standard output: cannot be written to") and "out.json" in run.stderr
+
+
+def test_names_may_hold_what_a_file_system_allows(lab, capsys):
+    odd = os.fsdecode(b"caf\xe9\x1b[31m.csv")
+    shutil.copyfile("trial.csv", odd)
+    assert main(["segment", odd, *HAND, "--method", "qualitative", "--json", "out.json"]) == 0
+    assert os.fsencode(json.loads(Path("out.json").read_text())["trials"][0]["file"]) == os.fsencode(odd)
+    assert "\x1b" not in capsys.readouterr().out
+    assert main(["segment", odd.replace("31", "32"), *HAND]) == 2
+    assert "\x1b" not in capsys.readouterr().err
+    longest = "a" * 250 + ".json"
+    assert main(["decompose", "task.toml", "--json", longest]) == 0 and Path(longest).exists()
+    for name in ("a" * 251 + ".json", "\0.json"):
+        assert main(["decompose", "task.toml", "--json", name]) == 2
+    assert main(["segment", "b" * 252 + ".csv", *HAND]) == 2
+
+
+def test_what_a_killed_run_left_is_swept_by_the_next(lab, monkeypatch, tmp_path):
+    where = tmp_path / "tmp"
+    where.mkdir()
+    environment = {**os.environ, "TMPDIR": str(where)}
+    program = "from hmmseg_cli.console import scratch\nwith scratch() as f: print(f, flush=True); input()"
+    alive, dead = (
+        subprocess.Popen([sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE,
+                         stdout=subprocess.PIPE, text=True) for _ in range(2)
+    )  # fmt: skip
+    folders = [Path(p.stdout.readline().strip()) for p in (alive, dead)]
+    dead.kill()
+    dead.communicate()
+    (where / "hmmseg-notes").mkdir()
+    for path in where.iterdir():
+        os.utime(path, (time.time() - 3600,) * 2)
+    monkeypatch.setattr(tempfile, "tempdir", str(where))
+    alive2 = folders[0].exists()
+    with console.scratch() as mine:
+        assert mine.exists() and not folders[1].exists()
+    assert alive2 and folders[0].exists()
+    alive.communicate("\n", timeout=60)
+    assert sorted(p.name for p in where.iterdir()) == []
+
+
+def test_without_a_temporary_folder_a_line_says_so(lab, monkeypatch, capsys):
+    monkeypatch.setattr(tempfile, "tempdir", str(lab / "nowhere"))
+    assert main(COMMANDS["decompose"]) == 2
+    assert "temporary files: cannot be used" in capsys.readouterr().err
+
+
+def test_nothing_is_written_into_the_package_and_no_home_is_needed(lab, monkeypatch):
+    packages = [Path(sys.modules[n].__file__).parent for n in ("hmmseg", "hmmseg_cli")]
+
+    def content():
+        return {
+            p: p.stat().st_mtime_ns for f in packages for p in f.rglob("*") if "__pycache__" not in str(p)
+        }
+
+    before = content()
+    monkeypatch.setenv("HOME", "/proc/nowhere")
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    for name in ("segment", "new"):
+        assert main(COMMANDS[name]) == 0
+    assert content() == before
+
+
+def test_a_page_watched_in_the_terminal_leaves_standard_output_alone(lab):
+    rows = Path("trial.csv").read_bytes().splitlines(keepends=True)[:40]
+    script = f"exec {' '.join(PROCESS)} watch --plot {' '.join(HAND)} > answers.jsonl"
+    import pty
+
+    main_end, terminal = pty.openpty()  # standard error is a terminal, as a user has it
+    run = subprocess.Popen(["bash", "-c", script], stdin=subprocess.PIPE, stderr=terminal)
+    os.close(terminal)
+    assert run.stdin is not None
+    run.stdin.write(b"".join(rows))
+    run.stdin.close()
+    with contextlib.suppress(OSError):
+        while os.read(main_end, 65536):
+            pass
+    os.close(main_end)
+    assert run.wait(120) == 0
+    lines = [json.loads(line) for line in Path("answers.jsonl").read_text().splitlines()]
+    assert len(lines) == len(rows) and lines[-1]["final"]
+
+
+def test_signals_are_left_as_they_were():
+    assert signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)
+
+
+MOVES = 'objects = {a = {on = "ground"}}\nmoves = [' + '{object = "a", to = "ground"},' * 20_000 + "]"
+STATES = "sequence = [" + ", ".join(f'"s{i}"' for i in range(9000)) + "]"
+COLUMNS = "t" + "".join(f",c{i}" for i in range(300_000)) + "\n0\n"
+LIMITS = [
+    ("task.toml", MOVES, "moves: 20000 moves, repeat 1; expected 2000 moves in all at most"),
+    ("task.toml", STATES, "sequence: 9000 states; expected 2000 at most"),
+    ("trial.csv", COLUMNS, "has 300001 columns; expected 20000"),
+    ("trial.csv", "t," + "x" * 10_000_000, "row 1: is longer than 10000000 bytes"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "line"), LIMITS)
+def test_what_nobody_means_is_refused_before_anything_is_made_of_it(name, text, line, lab, capsys):
+    (lab / name).write_text(text)
+    began = time.process_time()
+    assert main(["segment", "trial.csv", *HAND]) == 2
+    assert line in capsys.readouterr().err and time.process_time() - began < 5
+
+
+@pytest.mark.parametrize("value", ["1e-300", "1e9", "1" + "0" * 400, "inf", "nan", "-1", "true"])
+@pytest.mark.parametrize("key", ["weight", "width"])
+def test_properties_that_nothing_has_are_refused(value, key, lab, capsys):
+    values = {"weight": "0.4", "width": "0.02", "height": "0.02"} | {key: value}
+    units = {"weight": "N", "width": "m", "height": "m"}
+    text = "".join(
+        f"[{b}]\n" + "".join(f'{k} = {{unit = "{units[k]}", value = {v}}}\n' for k, v in values.items())
+        for b in ("block1", "block2")
+    )
+    (lab / "actual.toml").write_text(text)
+    assert main(["simulate", *HAND, "--properties", "actual.toml", "--output", "made"]) == 2
+    err = capsys.readouterr().err
+    assert f"block1.{key}" in err and "a number > 0" in err and len(err) < 300
+    table = {b: {k: json.loads(v.replace("inf", "Infinity").replace("nan", "NaN")) for k, v in values.items()}
+             for b in ("block1", "block2")}  # fmt: skip
+    (lab / "found.json").write_text(json.dumps({"properties": table}))
+    assert main(["simulate", *HAND, "--properties", "found.json", "--output", "made"]) == 2
+    assert f"block1.{key}" in capsys.readouterr().err
+
+
+def test_an_archive_that_unpacks_to_a_gigabyte_of_nothing_is_refused(lab, capsys):
+    import zipfile
+
+    import numpy as np
+
+    with zipfile.ZipFile("trial.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("t.npy", "w", force_zip64=True) as member:
+            header = io.BytesIO()
+            np.lib.format.write_array_header_1_0(
+                header, {"descr": "<f8", "fortran_order": False, "shape": (2**25 + 2**20,)}
+            )
+            member.write(header.getvalue())
+            for _ in range(2**8 + 2**3):
+                member.write(bytes(2**20))
+        archive.writestr("x1.npy", b"")
+    assert main(["segment", "trial.npz", *HAND]) == 2
+    assert "unpacks from" in capsys.readouterr().err
