@@ -10,13 +10,19 @@ help:  ## show this list
 
 setup: $(INSTALLED)  ## make .venv with the project and its tools in it
 
-$(INSTALLED): pyproject.toml
+# The demo needs the package alone, not the tools of its developers.
+PACKAGE := .venv/.package
+$(PACKAGE): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "Python >= 3.11 is needed")'
-	$(PYTHON) -m venv .venv
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	test -e $(INSTALLED) || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(INSTALLED): $(PACKAGE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
-demo: $(INSTALLED)  ## identify and diagnose the recording that comes along; figures in demo/
+demo: $(PACKAGE)  ## identify and diagnose the recording that comes along; figures in demo/
 	$(BIN)/hmmseg demo --figures demo
 
 test: lint typecheck tests  ## all checks: style, types, tests

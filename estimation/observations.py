@@ -34,6 +34,7 @@ from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.emissions import acceleration, thin
 from hmmseg.segmentation.posteriors import tilts
+from hmmseg.tables import Brief
 
 FARTHEST_LAG = 11  # numerics: samples; autocorrelations beyond are noise
 MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
@@ -149,8 +150,8 @@ APART = 0.1  # chosen: s by which one finger touches or lets go after the other,
 MIN_FREE = 8  # numerics: samples of free motion that tell the scale of the forces there
 
 
-@dataclass(frozen=True)
-class Weights:
+@dataclass(frozen=True, repr=False)
+class Weights(Brief):
     """Sample weights (num_alignments, num_timesteps) of each grip's means in one trial.
 
     `grips[m]` maps "force", "distance", "pickup" and "place" to weights that sum to 1 over the
@@ -237,8 +238,8 @@ def robust_weights(
     return np.where(np.isfinite(values), weights, 0.0), residual, centre
 
 
-@dataclass(frozen=True)
-class WeighedTrial:
+@dataclass(frozen=True, repr=False)
+class WeighedTrial(Brief):
     """One trial thinned for estimation: signals, drawn alignments' masks and mean weights."""
 
     signals: Signals

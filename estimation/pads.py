@@ -21,6 +21,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import TAIL
 from hmmseg.robust import robust_sd, white_sd
+from hmmseg.tables import Brief
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
 UNSTATED = 0.8  # prior: sd of their give, in these shares: 2e-4 m/N, as in hmmseg.segmentation.pads
@@ -35,8 +36,8 @@ MIN_SAMPLES = 6  # numerics: of a grip: fewer give a slope no interval of its ow
 SLOPE_SD = 0.1
 
 
-@dataclass(frozen=True)
-class Slope:
+@dataclass(frozen=True, repr=False)
+class Slope(Brief):
     """Weights (num_timesteps,) whose sum with readings is their slope over the give, and its variance.
 
     `alike`: what all slopes of a hand may be off by together, for one reason (part of `variance`).

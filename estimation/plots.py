@@ -112,7 +112,7 @@ def draw_corner(
             if truth is not None and line is None:
                 axes[i, i].set_title(f"measured {truth:.4g}", color=RED, fontsize=7)
         if any(line is not None for line in lines):
-            figure.text(1 - RIGHT / size, 0.99, "red: measured", color=RED, ha="right", va="top", fontsize=8)
+            figure.text(1 - RIGHT / size, 0.99, "lines: measured", color=RED, ha="right", va="top")
         return axes
 
 

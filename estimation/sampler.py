@@ -27,6 +27,7 @@ from estimation.design import DISTANCE, RISE, Design, PadDoubt, build
 from estimation.observations import Noise, WeighedTrial
 from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode, posterior
 from hmmseg.segmentation.align import AlignedTrials
+from hmmseg.tables import Brief
 
 if TYPE_CHECKING:
     import emcee
@@ -108,8 +109,8 @@ MIN_EFFICIENCY = 0.05  # numerics: of them, for a check, and to stand in where t
 MAX_APART = 0.25  # numerics: of a posterior sd, between the chain's means of the scales and those draws'
 
 
-@dataclass(frozen=True)
-class Draws:
+@dataclass(frozen=True, repr=False)
+class Draws(Brief):
     """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
 
     `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest

@@ -1,28 +1,38 @@
-"""Packages whose public names are imported when they are first asked for, so that importing them is quick."""
+"""Packages whose public names are imported when they are first asked for, so that importing them is quick.
+
+What is public, and where it lives, is said once: in the package's stub, which type checkers and editors read.
+"""
 
 from __future__ import annotations
 
+import ast
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
-def lazily(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package, from the module where each public name lives.
+def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package, from the imports of the stub beside its `file`.
 
-    A home that ends in the name itself is a module. The name is kept in the package once it was asked for.
+    A name is kept in the package once it was asked for.
     """
+    stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    homes = {alias.name: node.module or "" for node in imports for alias in node.names}
+    public: list[str] = sorted(homes.keys() | ({"__version__"} & vars(sys.modules[package]).keys()))
 
     def attribute(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = importlib.import_module(homes[name])
-        found = module if homes[name] == f"{package}.{name}" else getattr(module, name)
+        inside = homes[name] == package  # a module of the package itself
+        module = importlib.import_module(f"{package}.{name}" if inside else homes[name])
+        found = module if inside else getattr(module, name)
         setattr(sys.modules[package], name, found)
         return found
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *homes})
+        return sorted({*public, *(name for name in vars(sys.modules[package]) if name.startswith("__"))})
 
-    return attribute, names
+    return attribute, names, public

@@ -25,8 +25,12 @@ class InputError(ValueError):
         return type(self), (self.where, self.problem, self.expected)
 
 
+ALSO_CALLED = {"mass": "weight", "breadth": "width", "thickness": "width", "length": "width", "size": "width"}
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Phrase naming the known word nearest to `word`, for error messages."""
+    """Phrase naming the known word nearest to `word` in meaning or spelling, for error messages."""
     known = sorted(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.0)
+    meant = ALSO_CALLED.get(word.lower())
+    close = [meant] if meant in known else difflib.get_close_matches(word, known, n=1, cutoff=0.0)
     return f"one of {', '.join(known)}" + (f" (did you mean {close[0]}?)" if close else "")

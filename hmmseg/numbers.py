@@ -38,6 +38,11 @@ def plain(value: float, digits: int = 3) -> str:
     return f"{value:.{places}f}"
 
 
+def fixed(value: float, places: int, sign: str = "") -> str:
+    """With so many decimals; what rounds to nothing is 0 and not -0. `sign` "+" shows it of both."""
+    return f"{0.0 if round(value, places) == 0 else value:{sign}.{places}f}"
+
+
 def _places(error: float) -> int:
     """Decimals that show two significant digits of an error; none where it is ten or more."""
     return min(MOST, max(0, 1 - math.floor(math.log10(error))))
@@ -51,7 +56,7 @@ def estimate(mean: float, sd: float, shown: tuple[float, str] = (1.0, "")) -> st
         return f"{plain(value)} {name}".rstrip()
     places = _places(error)
     rounded = error if places else float(f"{error:.2g}")
-    return f"{value:.{places}f} ± {rounded:.{places}f} {name}".rstrip()
+    return f"{fixed(value, places)} ± {rounded:.{places}f} {name}".rstrip()
 
 
 def interval(low: float, high: float, shown: tuple[float, str] = (1.0, ""), sds: float = 3.3) -> str:
@@ -64,7 +69,7 @@ def interval(low: float, high: float, shown: tuple[float, str] = (1.0, ""), sds:
     if not (math.isfinite(a) and math.isfinite(b)) or a == b:
         return f"{plain(a)} to {plain(b)} {name}".rstrip()
     places = _places(abs(b - a) / sds)
-    return f"{a:.{places}f} to {b:.{places}f} {name}".rstrip()
+    return f"{fixed(a, places)} to {fixed(b, places)} {name}".rstrip()
 
 
 def percent(share: float) -> str:
@@ -74,7 +79,7 @@ def percent(share: float) -> str:
         return "under 1 %"
     if 99.5 <= value < 100:
         return "over 99 %"
-    return f"{value:.0f} %"
+    return f"{fixed(value, 0)} %"
 
 
 def between(low: float | None, high: float | None) -> str:

@@ -5,12 +5,31 @@ from __future__ import annotations
 import html
 import io
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # rich is loaded when something is shown
     from rich.table import Table
 
 WIDTH = 120  # look: characters of a `repr`
+
+
+class Brief:
+    """A dataclass of many arrays whose `repr` is short: it names shapes and types of what is inside."""
+
+    def __repr__(self) -> str:
+        inside = (f"{f.name}={_brief(getattr(self, f.name))}" for f in fields(self))  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(inside)})"
+
+
+def _brief(value: Any) -> str:
+    if hasattr(value, "shape"):
+        return f"array {tuple(value.shape)}" if value.size > 1 else f"{float(value.sum()):.6g}"
+    if is_dataclass(value):
+        return type(value).__name__
+    if isinstance(value, list | tuple | dict) and value:
+        return f"{type(value).__name__} of {len(value)}"
+    return repr(value)
 
 
 class Tabled(ABC):
@@ -37,7 +56,9 @@ def as_text(table: Table) -> str:
     from rich.console import Console
 
     out = io.StringIO()
-    Console(file=out, width=WIDTH, color_system=None).print(table, highlight=False, markup=False)
+    # In a notebook rich would display the table itself, and leave nothing to return.
+    console = Console(file=out, width=WIDTH, color_system=None, force_jupyter=False)
+    console.print(table, highlight=False, markup=False)
     return out.getvalue()
 
 

@@ -17,6 +17,7 @@ import shutil
 import sys
 import tempfile
 import time
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.segment import Segment
+from typer.core import TyperCommand, TyperGroup
 
 import hmmseg
 from hmmseg.cache import CacheWarning
@@ -36,6 +38,11 @@ TrialsArgument = Annotated[list[Path], typer.Argument(
 TaskArgument = Annotated[Path, typer.Argument(metavar="TASK", help="Task description (TOML).")]
 TaskOption = Annotated[Path, typer.Option("--task", metavar="T", help="Task description (TOML).")]
 RigOption = Annotated[Path, typer.Option("--rig", metavar="R", help="Nominal hand (TOML).")]
+TaskBeside = Annotated[Path | None, typer.Option(
+    "--task", metavar="T", help="Task description (TOML); task.toml beside the trials if left out."
+)]  # fmt: skip
+RigBeside = Annotated[Path | None, typer.Option(
+    "--rig", metavar="R", help="Nominal hand (TOML); rig.toml beside the trials if left out.")]  # fmt: skip
 ActualOption = Annotated[Path | None, typer.Option(
     "--actual", metavar="A", help="Properties measured apart from the trials (TOML).")]  # fmt: skip
 JsonOption = Annotated[str | None, typer.Option(
@@ -45,6 +52,7 @@ FiguresOption = Annotated[Path | None, typer.Option(
 ReportOption = Annotated[Path | None, typer.Option(
     "--report", metavar="FILE.html", help="Write one self-contained page.")]  # fmt: skip
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")]
+UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, min=0)]  # taken, where nothing is random
 QuietOption = Annotated[bool, typer.Option(
     "--quiet", help="Print nothing but errors; warnings stand in the JSON.")]  # fmt: skip
 
@@ -52,6 +60,45 @@ STANDARD_OUTPUT = "-"
 SCRATCH = "hmmseg-"  # how folders for temporary files begin
 YOUNG = 60.0  # numerics: s; a run that begins locks its folder long before
 INPUT_SUFFIXES = (*KINDS, ".toml")
+
+
+class Grouped(TyperCommand):
+    """A command whose help lists its options by what they are for, and ends with examples."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Options in groups, as their declarations name them."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for option in self.get_params(ctx):
+            shown = option.get_help_record(ctx)
+            if shown is not None:
+                kind = "Arguments" if option.param_type_name == "argument" else "Options"
+                groups.setdefault(getattr(option, "rich_help_panel", None) or kind, []).append(shown)
+        _write_groups(formatter, groups)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Examples, as they are typed."""
+        if self.epilog:
+            with formatter.section("Example" if "\n" not in self.epilog else "Examples"):
+                formatter.write("".join(f"  {line}\n" for line in self.epilog.splitlines()))
+
+
+class Hmmseg(TyperGroup):
+    """The command whose help lists its subcommands by what they are for."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Commands in groups, as `main` names them."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for name in self.list_commands(ctx):
+            command: Any = self.get_command(ctx, name)
+            row = (name, command.get_short_help_str(formatter.width))
+            groups.setdefault(command.rich_help_panel or "Commands", []).append(row)
+        _write_groups(formatter, groups)
+
+
+def _write_groups(formatter: Any, groups: dict[str, list[tuple[str, str]]]) -> None:
+    for title, rows in groups.items():
+        with formatter.section(title):
+            formatter.write_dl(rows)
 
 
 class Output:
@@ -220,6 +267,50 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+TASK_KEYS = {"objects", "moves", "sequence"}  # without any of which there is no task
+
+
+def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
+    """Task and rig of these trials: as given, else task.toml and rig.toml beside the first of them.
+
+    InputError where there is no task, or where each is given as the other.
+    """
+    folder = split_part(trials[0])[0].parent
+    found = [folder / name if given is None and (folder / name).is_file() else given
+             for given, name in ((task, "task.toml"), (rig, "rig.toml"))]  # fmt: skip
+    if found[0] is None:
+        raise InputError("--task", "missing", f"the task's description, or a task.toml in {folder}")
+    as_task, as_rig = (_keys(path) for path in found)
+    if "sequence" in as_task:  # needs no hand, and another task's may lie beside its trials
+        found[1] = rig
+    if as_task and not as_task & TASK_KEYS and (task is not None or as_rig & TASK_KEYS):
+        swapped = f"; are --task and --rig {found[1]} swapped?" if as_rig & TASK_KEYS else ""
+        raise InputError(
+            f"--task {found[0]}", "describes no task", f"objects and moves, or a sequence{swapped}"
+        )
+    if as_rig & TASK_KEYS:
+        raise InputError(f"--rig {found[1]}", "describes a task", "the description of a hand")
+    return found[0], found[1]
+
+
+def needed(rig: Path | None, trials: Sequence[Path]) -> Path:
+    """The rig of a task of blocks; InputError where there is none."""
+    if rig is None:
+        folder = split_part(trials[0])[0].parent
+        raise InputError(
+            "--rig", "missing", f"the nominal hand of a task of blocks, or a rig.toml in {folder}"
+        )
+    return rig
+
+
+def _keys(path: Path | None) -> set[str]:
+    """Keys at the top of a TOML file; none where it cannot be read, which its reader tells."""
+    try:
+        return set() if path is None else set(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        return set()
+
+
 def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any = None) -> list[Any]:
     """The trials of a command; what is unlikely about them is warned of."""
     from hmmseg.io.trial import read_trial
@@ -269,10 +360,9 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
         raise InputError(where, "would be written over, and its name is that of an input", "a .json file")
     if path.is_dir():
         raise InputError(where, "is a folder", "a file")
-    if not path.absolute().parent.is_dir():
-        raise InputError(where, f"no folder {path.parent}", "a file in a folder that exists")
-    writable = os.access(path, os.W_OK) if path.exists() else os.access(path.absolute().parent, os.W_OK)
-    if not writable:
+    if not path.exists():
+        check_folder(option, path.parent)
+    elif not os.access(path, os.W_OK):
         raise InputError(where, "cannot be written", "a writable file")
 
 

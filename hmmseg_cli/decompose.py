@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, TaskArgument
+from hmmseg_cli.console import JsonOption, Output, QuietOption, TaskArgument, UnusedSeed
 
 RigFile = Annotated[Path | None, typer.Option(
     "--rig", metavar="R", help="The hand: what it cannot reveal is left out, with the reason.")]  # fmt: skip
 
 
-def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, seed: SeedOption = 0,
+def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, seed: UnusedSeed = 0,
               quiet: QuietOption = False) -> None:  # fmt: skip
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task
@@ -27,7 +27,20 @@ def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, 
             from hmmseg.io.rig import read_rig
 
             found = revealed_by(found, read_rig(rig))
-        out.print(decomposition_table(found), equation(found))
+        out.print(*in_words(found), decomposition_table(found), equation(found))
         for note in (*found.notes, *(f"{key}: {reason}" for key, reason in reasons(found).items())):
             out.print(note)
         out.finish({"task": str(task), **found.to_json()})
+
+
+def in_words(found: Any) -> list[str]:
+    """Of every object, which subtasks reveal what."""
+    lines = []
+    for name, known in found.properties.items():
+        parts = []
+        for prop, entry in known.items():
+            seen = dict.fromkeys(found.subtasks[k].label for one in entry.evidence[:1] for k in one.subtasks)
+            if seen:
+                parts.append(f"{prop.replace('_', ' ')} in {' and '.join(seen)}")
+        lines.append(f"{name}: {'; '.join(parts) or 'nothing can be told of it'}.")
+    return lines

@@ -11,17 +11,22 @@ import typer
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, read_task
+from hmmseg.numbers import percent
 from hmmseg_cli.console import (
-    ActualOption,
     FiguresOption,
+    Grouped,
     JsonOption,
     Output,
     QuietOption,
     ReportOption,
+    RigBeside,
     SeedOption,
+    TaskBeside,
     TrialsArgument,
     check_folder,
+    described,
     distinct_trials,
+    needed,
     read_trials,
 )
 from hmmseg_cli.diagnose_robot import (
@@ -33,85 +38,65 @@ from hmmseg_cli.diagnose_robot import (
     SimulatorOption,
     diagnose_robot,
 )
-from simgap.report.finding import sentence
-from simgap.report.tables import tables
+from simgap.report.finding import plain_name, sentence, settles, tables
 
 if TYPE_CHECKING:
     from simgap.gap.diagnose import Diagnosis
 
-EffectOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
-    ),
-]
-RigFile = Annotated[
-    Path | None,
-    typer.Option("--rig", metavar="R", help="Nominal hand (TOML); a plain ordered task needs none."),
-]
-AgainstOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--against",
-        metavar="SIM",
-        help="Simulated trials to compare with instead of the virtual model, up to the next option. "
-        "A plain ordered task needs them.",
-    ),
-]
-ModelFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--model",
-        metavar="M",
-        help="A robot's own model, as MuJoCo reads it (it needs --map), or the emissions (.npz) of a plain "
-        "ordered task, from hmmseg fit.",
-    ),
-]
-HealthyOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--healthy",
-        metavar="TRIAL",
-        help="Recordings known to be healthy, the best null there is, up to the next option; "
-        "healthy twins are simulated otherwise.",
-    ),
-]
-TaskFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--task", metavar="T", help="Task description (TOML); not needed with --simulator or --mjcf."
-    ),
-]
+BLOCKS = "Blocks against the virtual model (what --task and --rig describe)"
+GIVEN = "Recordings against simulated trials of your own"
+EXAMPLES = """hmmseg diagnose trial_*.csv --report gap.html
+hmmseg diagnose log_*.csv --mjcf robot.xml --map map.toml --report gap.html --patch corrected/
+hmmseg diagnose trial_*.csv --against simulated/trial_*.csv"""
+
+ActualOption = Annotated[Path | None, typer.Option(
+    "--actual", metavar="A", rich_help_panel=BLOCKS,
+    help="Properties measured apart from the trials (TOML).")]  # fmt: skip
+HealthyOption = Annotated[list[Path] | None, typer.Option(
+    "--healthy", metavar="TRIAL...", rich_help_panel=BLOCKS,
+    help="Recordings known to be healthy, the best null there is; healthy twins are simulated otherwise.",
+)]  # fmt: skip
+AgainstOption = Annotated[list[Path] | None, typer.Option(
+    "--against", metavar="SIM...", rich_help_panel=GIVEN,
+    help="Simulated trials to compare with; a plain ordered task needs them.")]  # fmt: skip
+ModelFile = Annotated[Path | None, typer.Option(
+    "--model", metavar="M", rich_help_panel=GIVEN,
+    help="Emissions (.npz) of a plain ordered task, by hmmseg fit; or as --mjcf.")]  # fmt: skip
+EffectOption = Annotated[list[str] | None, typer.Option(
+    "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
+)]  # fmt: skip
 LISTS = ("--against", "--healthy")  # options that take several files
 
 
-def with_options_repeated(args: list[str]) -> list[str]:
-    """Arguments with `--against A B` written `--against A --against B`, as the parser takes one a time; the
-    same of `--healthy`."""
-    out: list[str] = []
-    taking = ""
-    for arg in args:
-        if arg.startswith("-"):
-            taking = arg if arg in LISTS else ""
-        elif taking and out[-1] != taking:
-            out.append(taking)
-        out.append(arg)
-    return out
+class Diagnose(Grouped):
+    """The command, whose `--against A B` stands for `--against A --against B`; so does `--healthy`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Every file after such an option gets an option of its own, as the parser wants it."""
+        out: list[str] = []
+        taking = ""
+        for arg in args:
+            if arg.startswith("-"):
+                taking = arg if arg in LISTS else ""
+            elif taking and out[-1] != taking:
+                out.append(taking)
+            out.append(arg)
+        return super().parse_args(ctx, out)
 
 
 def diagnose(
     trials: TrialsArgument,
-    task: TaskFile = None,
-    rig: RigFile = None,
+    task: TaskBeside = None,
+    rig: RigBeside = None,
     actual: ActualOption = None,
-    effect: EffectOption = None,
-    against: AgainstOption = None,
-    model: ModelFile = None,
     healthy: HealthyOption = None,
     simulator: SimulatorOption = None,
     mjcf: MjcfOption = None,
     map_file: MapOption = None,
     candidate: CandidateOption = None,
+    against: AgainstOption = None,
+    model: ModelFile = None,
+    effect: EffectOption = None,
     patch: PatchOption = None,
     json: JsonOption = None,
     figures: FiguresOption = None,
@@ -119,7 +104,10 @@ def diagnose(
     seed: SeedOption = 0,
     quiet: QuietOption = False,
 ) -> None:
-    """The sim-to-real gap: where it lies, which unmodelled effect causes it, how far it shrinks."""
+    """The gap between recordings and a simulation: where it lies, what causes it, how far it shrinks.
+
+    Three models may be on the other side: the virtual blocks, your own model of a robot, or simulated trials.
+    """
     with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
         if model is not None and mjcf is None and model.suffix.lower() != ".npz":
@@ -129,24 +117,18 @@ def diagnose(
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
             diagnose_robot(out, paths, own, task, effect or [])
             return
-        if task is None:
-            raise InputError("--task", "missing", "the task's description, or --simulator or --mjcf")
+        task, rig = described(paths, task, rig)
         description = read_task(task)
-        if against and patch is not None:
-            raise InputError("--patch", "does not go with --against: no rig.toml is diagnosed")
         if against:
-            if healthy:
-                raise InputError("--healthy", "does not go with --against: those are the null")
-            _against(out, paths, against, description, rig, actual, effect or [], model)
+            refuse("does not go with --against", {"--patch": patch, "--healthy": healthy, "--actual": actual})
+            _against(out, paths, against, description, rig, effect or [], model)
             return
         if not isinstance(description, BlockTask):
             raise InputError(str(task), "a plain ordered task has no virtual model", "--against SIM")
-        if model is not None:
-            raise InputError(f"--model {model}", "goes only with a plain ordered task")
-        if rig is None:
-            raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
+        refuse("goes only with a plain ordered task", {"--model": model})
         from hmmseg.io.rig import read_rig
 
+        rig = needed(rig, paths)
         hand = read_rig(rig)
         if patch is not None:
             check_folder("--patch", patch)
@@ -156,25 +138,38 @@ def diagnose(
         out.finish(found.body)
 
 
+diagnose.cls = Diagnose  # type: ignore[attr-defined]
+
+
+def refuse(problem: str, given: dict[str, Any]) -> None:
+    """InputError for the first option that was given."""
+    for option, value in given.items():
+        if value:
+            raise InputError(option, problem)
+
+
 def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
-    """Write the corrected model; a warning where there is no cause to correct, or where it predicts worse."""
-    from simgap.patch import files, reproduced
+    """Write the corrected model; a warning where there is no cause to correct, or where it leaves as much of
+    trials that took no part."""
+    from simgap.patch import files
 
     if (folder / "rig.toml").resolve() == rig.resolve():
         raise InputError(f"--patch {folder}", f"would replace the input {rig}", "another folder")
-    frame = found.problem.frame
     written = files(rig.read_text(encoding="utf-8"), found.body)
     if not written:
         out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
         return
-    nominal, corrected = reproduced(written, found.body, found.search.trials, frame.task, frame.rig)
-    text = f"forces differ from the recorded ones by {corrected:.3g} N with it, {nominal:.3g} N without"
-    if not corrected < nominal:
-        out.warn(f"--patch {folder}: the corrected model is no better ({text}); nothing is written")
+    gone = (found.body["shrinkage"] or {}).get("fraction")
+    if gone is not None and gone <= 0:
+        out.warn(f"--patch {folder}: the cause takes nothing off held-out trials; nothing is written")
         return
     for name, text in written.items():
         out.stage(folder / name).write_text(text, encoding="utf-8")
-    out.print(f"the corrected model is in {folder}: {', '.join(written)}; {text}")
+    share = "" if gone is None else f"; with it the gap shrinks by {percent(gone)} on held-out trials"
+    out.print(
+        f"{' and '.join(map(plain_name, found.body['causes']))}: put into {folder / 'rig.toml'}{share}. "
+        f"hmmseg simulate takes it with --rig, and the ranges for training are in ranges.json"
+    )
 
 
 def run(
@@ -204,31 +199,27 @@ def run(
     for warning in found.warnings:
         out.warn(warning)
     pads = rig.fingertip.model_dump()
-    out.print(sentence(found.body, pads), *tables(found.body))
+    more = settles(found.body, measured is not None)
+    out.print(sentence(found.body, pads), *filter(None, [more]), *tables(found.body))
     _draw(out, found, recordings, task, rig, measured)
     return found
 
 
 def _against(
-    out: Output, paths, against, task, rig_file, actual, effect: list[str], model_file: Path | None
+    out: Output, paths, against, task, rig_file: Path | None, effect: list[str], model_file: Path | None
 ) -> None:
     """The generic diagnosis, against given simulated trials."""
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.diagnose import diagnose_blocks
 
-    if actual is not None:
-        raise InputError(f"--actual {actual}", "does not go with --against: no properties are fitted")
     every = distinct_trials([*paths, *against])
     with out.progress("diagnosing", total=4) as advance:
         tell = lambda text: advance(1)  # noqa: E731
         if isinstance(task, BlockTask):
             from hmmseg.io.rig import read_rig
 
-            if rig_file is None:
-                raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
-            if model_file is not None:
-                raise InputError(f"--model {model_file}", "goes only with a plain ordered task")
-            hand = read_rig(rig_file)
+            refuse("goes only with a plain ordered task", {"--model": model_file})
+            hand = read_rig(needed(rig_file, paths))
             read = read_trials(out, every, hand)
             real, sim = read[: len(paths)], read[len(paths) :]
             found = diagnose_blocks(real, sim, task, hand, effect, out.seed, tell)
@@ -249,18 +240,18 @@ def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
     """Figures and page of a diagnosis against given simulated trials."""
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.figures.gap_generic import draw_signal
+    from hmmseg_cli.gap_figures import draw_generic
     from simgap.generic.effects import EFFECTS
 
     shows = {name: candidate.shows for name, candidate in EFFECTS.items()}
-    _show(out, found.body, files, task, lambda path: draw_signal(found, path), shows=shows)
+    _show(out, found.body, files, task, lambda path: draw_generic(found, path), shows=shows)
 
 
 def _draw(out: Output, found, recordings, task: BlockTask, rig: Rig, measured) -> None:
     """Figures and page of a diagnosis against the virtual model."""
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.figures.gap_signal import draw_signal
+    from hmmseg_cli.gap_figures import draw_signal
     from simgap.effects import catalogue
 
     shows = {name: effect.shows for name, effect in catalogue().items()}
@@ -281,7 +272,7 @@ def _show(
 ) -> None:
     """Figures where asked for, and the page, from the body alone; `signal` draws the recorded one."""
     from hmmseg.contact.decompose import subtasks
-    from hmmseg_cli.gap_report import Setting, page
+    from hmmseg_cli.pages import Setting, page
     from simgap.report.figures import draw_all, draw_how_far
 
     names = list(dict.fromkeys(s.label for s in subtasks(task)))

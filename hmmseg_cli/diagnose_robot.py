@@ -17,19 +17,31 @@ from simgap.report.finding import sentence
 if TYPE_CHECKING:
     from simgap.robots.diagnose import RobotDiagnosis
 
+ROBOT = "A robot against your own model of it"
 SimulatorOption = Annotated[
     str | None,
-    typer.Option("--simulator", metavar="FILE.py:NAME", help="Your own model instead of the virtual blocks."),
+    typer.Option(
+        "--simulator",
+        metavar="FILE.py:NAME",
+        rich_help_panel="A robot against your own model of it",
+        help="Your own model instead of the virtual blocks.",
+    ),
 ]
 MjcfOption = Annotated[
     Path | None,
-    typer.Option("--mjcf", metavar="XML", help="Your own model, as MuJoCo reads it; it needs --map."),
+    typer.Option(
+        "--mjcf",
+        metavar="XML",
+        rich_help_panel="A robot against your own model of it",
+        help="Your own model, as MuJoCo reads it; it needs --map.",
+    ),
 ]
 MapOption = Annotated[
     Path | None,
     typer.Option(
         "--map",
         metavar="MAP.toml",
+        rich_help_panel="A robot against your own model of it",
         help="Which column of the logs is which joint, actuator, sensor "
         "or body of the MJCF model, in what unit.",
     ),
@@ -39,6 +51,7 @@ CandidateOption = Annotated[
     typer.Option(
         "--candidate",
         metavar="NAME",
+        rich_help_panel="A robot against your own model of it",
         help="Offer one more thing the MJCF model can set as a cause, such as joint:elbow.frictionloss.",
     ),
 ]
@@ -183,13 +196,19 @@ def diagnose_robot(
         folder = own.patch
         given = found.composed, found.linear.point, document, document["causes"], own.mjcf
         write_patch(*given, lambda name: out.stage(folder / name))
+        import json
+
+        ranges, model = own.patch / "ranges.json", "" if own.mjcf is None else f" and {own.mjcf.name}"
+        out.print(f"what was found is in {ranges}{model}")
+        for line in json.loads(out.stage(ranges).read_text(encoding="utf-8")).get("not_in_xml", ()):
+            out.warn(f"--patch: an MJCF has no place for {line}; correct the driver by ranges.json")
     out.finish(document)
     kept.forget()
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
-    from simgap.report.tables import tables as usual
+    from simgap.report.finding import tables as usual
 
     out = []
     unseen = document["identifiability"]["unseen"]
@@ -220,13 +239,13 @@ def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
 
 def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any]) -> None:
     """Figures where asked for, and the page with the same figures inside."""
-    from hmmseg_cli.figures.gap_robot import Drawn, draw_all, draw_page
+    from hmmseg_cli.gap_figures import Drawn, draw_robot, draw_robot_page
 
     drawn = Drawn(found, document, found.warnings)
     if out.figures is not None:
-        draw_all(drawn, out.figure)
+        draw_robot(drawn, out.figure)
     if out.report is not None:
-        from hmmseg_cli.gap_report import Setting, page
+        from hmmseg_cli.pages import Setting, page
 
         setting = Setting(
             files=[r.name for r in found.composed.recordings],
@@ -234,5 +253,5 @@ def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any]) -> None:
             shows={n: e.says for n, e in found.composed.effects.items()},
             warnings=out.warnings,
         )
-        text = page(document, setting, lambda path: draw_page(drawn, path))
+        text = page(document, setting, lambda path: draw_robot_page(drawn, path))
         out.stage(out.report).write_text(text, encoding="utf-8")

@@ -6,10 +6,10 @@ from typing import Any
 
 from rich.table import Table
 
-from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption
+from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed
 
 
-def effects(json: JsonOption = None, seed: SeedOption = 0, quiet: QuietOption = False) -> None:
+def effects(json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False) -> None:
     """The candidate effects, their parameters, priors and signatures."""
     with Output("effects", json=json, seed=seed, quiet=quiet) as out:
         from simgap.effects import catalogue

@@ -13,10 +13,12 @@ from hmmseg_cli.console import (
     JsonOption,
     Output,
     QuietOption,
-    SeedOption,
-    TaskOption,
+    RigBeside,
+    TaskBeside,
     TrialsArgument,
+    UnusedSeed,
     check_file,
+    described,
     distinct_trials,
     read_trials,
 )
@@ -26,18 +28,17 @@ LabelsOption = Annotated[Path | None, typer.Option(
     "--labels", metavar="FILE|DIR",
     help="What is known of some boundaries: a folder with NAME.json, or a .csv or .json file.")]  # fmt: skip
 ModelOption = Annotated[Path, typer.Option("--model", metavar="M.npz", help="Where the model is written.")]
-RigFile = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Its [columns] or [topics], if the trials need them.")]  # fmt: skip
 
 
 def fit(
-    trials: TrialsArgument, task: TaskOption, model: ModelOption, rig: RigFile = None,
-    labels: LabelsOption = None, json: JsonOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+    trials: TrialsArgument, model: ModelOption, task: TaskBeside = None, rig: RigBeside = None,
+    labels: LabelsOption = None, json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Learn emissions and durations of a plain ordered task, with or without labels."""
     with Output("fit", json=json, seed=seed, quiet=quiet) as out:
         check_file("--model", model, suffixes=(".npz",))
         paths = distinct_trials(trials)
+        task, rig = described(paths, task, rig)
         description = read_task(task)
         if not isinstance(description, SequenceTask):
             raise InputError(str(task), "a task of blocks needs no fitting: its emissions are physics",

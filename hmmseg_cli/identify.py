@@ -19,11 +19,13 @@ from hmmseg_cli.console import (
     Output,
     QuietOption,
     ReportOption,
-    RigOption,
+    RigBeside,
     SeedOption,
-    TaskOption,
+    TaskBeside,
     TrialsArgument,
+    described,
     distinct_trials,
+    needed,
     read_trials,
 )
 from hmmseg_cli.segment import warn_of_misfit
@@ -40,13 +42,15 @@ MethodOption = Annotated[Method, typer.Option(help="Bayesian, or the paper's thr
 
 
 def identify(
-    trials: TrialsArgument, task: TaskOption, rig: RigOption, method: MethodOption = Method.BAYES,
-    actual: ActualOption = None, json: JsonOption = None, figures: FiguresOption = None,
-    report: ReportOption = None, seed: SeedOption = 0, quiet: QuietOption = False,
+    trials: TrialsArgument, task: TaskBeside = None, rig: RigBeside = None,
+    method: MethodOption = Method.BAYES, actual: ActualOption = None, json: JsonOption = None,
+    figures: FiguresOption = None, report: ReportOption = None, seed: SeedOption = 0,
+    quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
-        out.finish(run(out, trials, task, rig, method, actual))
+        found, hand = described(trials, task, rig)
+        out.finish(run(out, trials, found, needed(hand, trials), method, actual))
 
 
 def run(
@@ -82,11 +86,9 @@ def run(
     for note in body.get("notes", ()):
         out.print(note)
     if out.figures is not None:
-        from hmmseg_cli.figures.identification import draw_all
-
-        draw_all(out, signals, recordings, segmentations, body, found, measured)
+        _draw(out, signals, recordings, segmentations, body, found, measured)
     if out.report is not None:
-        from hmmseg_cli.report import identification_page
+        from hmmseg_cli.pages import identification_page
 
         page = identification_page(signals, recordings, segmentations, body, found, measured, out.warnings)
         out.stage(out.report).write_text(page, encoding="utf-8")
@@ -123,3 +125,21 @@ def _bayes(out: Output, recordings, task: BlockTask, hand):
     for warning in found.warnings:
         out.warn(warning)
     return found
+
+
+def _draw(
+    out: Output, signals: Sequence[Any], trials: Sequence[Any], segmentations: Sequence[Any],
+    body: dict[str, Any], found: Any, actual: Any,
+) -> None:  # fmt: skip
+    """Signals with subtasks a trial, estimates, and of a Bayesian result corner and predictive check."""
+    from estimation.plots import draw_check, draw_corner, draw_estimates
+    from hmmseg.plot.signals import draw_signals
+
+    for i, (s, trial, segmentation) in enumerate(zip(signals, trials, segmentations, strict=True)):
+        stem = Path(trial.name).stem
+        draw_signals(s, segmentation, out.figure(f"{stem}_segments.png"))
+        if found is not None:
+            draw_check(found, i, out.figure(f"{stem}_predictive.png"))
+    draw_estimates(body["properties"], actual, out.figure("estimates.png"))
+    if found is not None and found.names:
+        draw_corner(found.draws, found.names, out.figure("corner.png"), actual)

@@ -12,7 +12,7 @@ from rich.table import Table
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.schema import parse_toml
-from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption, check_file
+from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed, check_file
 
 FilesArgument = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of any kind.")]
 RigFile = Annotated[Path | None, typer.Option(
@@ -26,7 +26,7 @@ LAID_OUT = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
 
 def inspect(
     files: FilesArgument, rig: RigFile = None, write: WriteOption = None, json: JsonOption = None,
-    seed: SeedOption = 0, quiet: QuietOption = False,
+    seed: UnusedSeed = 0, quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """What is in a recording, and the [columns] or [topics] that would read it."""
     from hmmseg.io.inspect import inspect as look
@@ -39,11 +39,11 @@ def inspect(
         for each in found:
             _show(out, each)
         if write is not None:
-            out.stage(write).write_text(_extended(write, found), encoding="utf-8")
+            out.stage(write).write_text(extended(write, found), encoding="utf-8")
         out.finish({"files": [_document(each) for each in found]})
 
 
-def _extended(rig_file: Path, found: list[Any]) -> str:
+def extended(rig_file: Path, found: list[Any]) -> str:
     """The rig's text with the mapping added; InputError where there is one, or none to add."""
     proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
     if not proposed:

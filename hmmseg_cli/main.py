@@ -34,7 +34,7 @@ from hmmseg_cli import (
     simulate,
     watch,
 )
-from hmmseg_cli.console import discard, visible
+from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
 from hmmseg_cli.interrupts import heard
 from hmmseg_cli.memory import keep_freed_memory
 
@@ -45,27 +45,42 @@ COLLECTED = 10_000
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 # Plain help: markup would swallow what stands in square brackets.
-app = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
+app = typer.Typer(cls=Hmmseg, rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
 
-# In the order of `hmmseg --help`. Modules import what is heavy (jax, matplotlib, pandas) inside
-# their command, so that help and light commands start at once.
-for _command in (
-    decompose.decompose,
-    fit.fit,
-    segment.segment,
-    identify.identify,
-    watch.watch,
-    simulate.simulate,
-    calibrate.calibrate,
-    diagnose.diagnose,
-    inspect.inspect,
-    new.new,
-    play.play,
-    effects.effects,
-    demo.demo,
-    doctor.doctor,
-):
-    app.command(short_help=(_command.__doc__ or "").strip())(_command)  # in full, not cut short
+# In the order of `hmmseg --help`, each with an example. Modules import what is heavy (jax, matplotlib,
+# pandas) inside their command, so that help and light commands start at once.
+COMMANDS = {
+    "Begin": {
+        demo.demo: "hmmseg demo",
+        new.new: "hmmseg new my_hand --from trial_01.csv",
+        inspect.inspect: "hmmseg inspect trial_01.csv",
+        decompose.decompose: "hmmseg decompose task.toml",
+        doctor.doctor: "hmmseg doctor",
+    },
+    "When and what": {
+        segment.segment: "hmmseg segment trial_*.csv --figures figures/",
+        identify.identify: "hmmseg identify trial_*.csv --report report.html",
+        watch.watch: "robot --csv | hmmseg watch --task task.toml --rig rig.toml",
+        fit.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
+    },
+    "Why simulation and recording differ": {
+        calibrate.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
+        diagnose.diagnose: diagnose.EXAMPLES,
+        effects.effects: "hmmseg effects",
+    },
+    "The virtual blocks": {
+        simulate.simulate: "hmmseg simulate --task task.toml --rig rig.toml --properties result.json",
+        play.play: "hmmseg play result.json",
+    },
+}
+for _group, _commands in COMMANDS.items():
+    for _command, _example in _commands.items():
+        app.command(
+            cls=getattr(_command, "cls", Grouped),
+            short_help=(_command.__doc__ or "").strip().partition("\n\n")[0],  # in full, not cut short
+            epilog=_example,
+            rich_help_panel=_group,
+        )(_command)
 
 
 def _show_version(wanted: bool) -> None:
@@ -90,7 +105,6 @@ def main(args: Sequence[str] | None = None) -> int:
     configure()
     _open_streams()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
-    args = diagnose.with_options_repeated(args)
     command = typer.main.get_command(app)
     try:
         with heard():

@@ -1,14 +1,37 @@
-"""What the pages share: templates, and figures inside."""
+"""Pages of `--report`: one self-contained HTML file each, figures inside, for who must act on it."""
 
 from __future__ import annotations
 
 import base64
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 import hmmseg
+from estimation.identification import Identification
+from estimation.plots import draw_check, draw_corner, draw_estimates
+from estimation.report import Actual
+from hmmseg.hand.signals import Signals
+from hmmseg.io.trial import Trial
+from hmmseg.numbers import (
+    SHOWN,
+    between,
+    estimate,
+    fixed,
+    interval,
+    percent,
+    plain,
+    property_shown_as,
+    shown_as,
+)
+from hmmseg.plot.signals import draw_signals
+from hmmseg.segmentation.spans import Segmentation
+from simgap.report import finding
+from simgap.report.finding import plain_name
 
 
 def rendered(template: str, **values: Any) -> str:
@@ -23,3 +46,274 @@ def rendered(template: str, **values: Any) -> str:
 def embedded(path: Path) -> str:
     """A PNG as a data URL."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def identification_page(
+    signals: Sequence[Signals], trials: Sequence[Trial], segmentations: Sequence[Segmentation],
+    body: dict[str, Any], found: Identification | None, measured: Actual | None, warnings: Sequence[str],
+) -> str:  # fmt: skip
+    """HTML of one identification."""
+    figures = [
+        picture(
+            lambda p: draw_estimates(body["properties"], measured, p), "Estimates with 68 and 95 % intervals"
+        )
+    ]
+    if found is not None and found.names:
+        draws, names = found.draws, found.names
+        figures.append(
+            picture(lambda p: draw_corner(draws, names, p, measured), "Posterior of all properties")
+        )
+    return rendered(
+        "identify.html.j2", method=body["method"], objects=list(body["properties"]),
+        verdict=[_verdict(obj, entry) for obj, entry in body["properties"].items()],
+        warnings=warnings, measured=measured is not None, rows=_rows(body, measured), figures=figures,
+        trials=[_trial(i, s, t, g, found)
+                for i, (s, t, g) in enumerate(zip(signals, trials, segmentations, strict=True))],
+        sampler=body["sampler"], predictive=_checks(body.get("predictive")), notes=body.get("notes", ()),
+    )  # fmt: skip
+
+
+def picture(draw: Callable[[Path], Any], caption: str) -> dict[str, str]:
+    """A figure as base64 PNG with its caption."""
+    with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
+        path = Path(folder) / "figure.png"
+        draw(path)
+        return {"data": embedded(path), "caption": caption}
+
+
+def _trial(i: int, signals: Signals, trial: Trial, segmentation: Segmentation,
+           found: Identification | None) -> dict[str, Any]:  # fmt: skip
+    pictures = [
+        picture(lambda p: draw_signals(signals, segmentation, p), "Signals with subtasks and boundaries")
+    ]
+    if found is not None:
+        identified = found
+        pictures.append(
+            picture(lambda p: draw_check(identified, i, p), "Recorded samples in their predicted bands")
+        )
+    evidence = segmentation.log_evidence
+    return {
+        "name": trial.name, "rate": f"{segmentation.rate:.4g}", "complete": segmentation.complete,
+        "log_evidence": "none" if evidence is None else f"{evidence:.1f}", "figures": pictures,
+        "spans": [
+            (s.label, s.state, f"{s.start:.3f}",
+             f"{s.start_90[0]:.3f} to {s.start_90[1]:.3f}" if s.start_sd else "", f"{s.end:.3f}")
+            for s in segmentation.spans
+        ],
+    }  # fmt: skip
+
+
+def _checks(predictive: dict[str, Any] | None) -> list[tuple[str, str, str]]:
+    """Posterior-predictive checks as rows."""
+    return [
+        (name, plain(check["p_value"], 2),
+         estimate(check["scatter_between_grips"], 0, shown_as("N" if name == "force" else "m")))
+        for name, check in (predictive or {}).items()
+    ]  # fmt: skip
+
+
+def _verdict(obj: str, entry: dict[str, Any]) -> str:
+    parts = []
+    for prop, verb in (("weight", "weighs"), ("width", "is"), ("height", "is")):
+        if entry.get(prop):
+            value = estimate(entry[prop]["mean"], entry[prop]["sd"], SHOWN[prop])
+            parts.append(f"{verb} {value}" + {"weight": "", "width": " wide", "height": " high"}[prop])
+    friction = entry.get("friction")
+    if friction and friction.get("mean") is not None:
+        parts.append(f"has a friction coefficient of {estimate(friction['mean'], friction['sd'])}")
+    elif friction:
+        parts.append(f"has a friction coefficient of at least {plain(friction['lower_bound'])}")
+    return f"{obj} {', '.join(parts)}." if parts else f"Nothing could be determined of {obj}."
+
+
+def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]]:
+    """Block, property, estimate, intervals, what was measured and the deviation from it, source."""
+    rows = []
+    for obj, entries in body["properties"].items():
+        for prop, entry in entries.items():
+            value = (measured or {}).get(obj, {}).get(prop)
+            source, shown = body["reasons"].get(f"{obj}.{prop}", ""), SHOWN[prop]
+            text, inner, outer, deviation = "unknown", "", "", ""
+            if entry is not None:
+                source = ", ".join(entry.get("subtasks", ()))
+                text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
+                if entry.get("mean") is not None:
+                    text = estimate(entry["mean"], entry["sd"], shown)
+                    inner = interval(entry["interval_68"][0], entry["interval_68"][1], shown, sds=2.0)
+                    outer = interval(entry["interval_95"][0], entry["interval_95"][1], shown, sds=3.9)
+                    if value is not None:
+                        deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
+                        if body.get("actual", {}).get(obj, {}).get(prop, {}).get("disagrees"):
+                            deviation += ", disagrees"
+            apart = (
+                (estimate(value[0], value[1], shown) if value is not None else "", deviation)
+                if measured
+                else ()
+            )
+            rows.append((obj, prop, text, inner, outer, *apart, source))
+    return rows
+
+
+Body = Mapping[str, Any]
+MOST = 8  # look: rows of a table
+SHARES = (
+    "gain",
+    "scale",
+    "finger1",
+    "finger2",
+    "fx1",
+    "fy1",
+    "fx2",
+    "fy2",
+)  # shown in per cent if in no unit
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a page tells beside the body: recordings, subtasks in order, the rig's pads, what was measured,
+    and how each effect would show.
+    """
+
+    files: Sequence[str]
+    subtasks: Sequence[str]
+    rig: Mapping[str, Any] = field(default_factory=dict)
+    measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
+    shows: Mapping[str, str] = field(default_factory=dict)
+    warnings: Sequence[str] = ()
+
+
+def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
+    """The page as text; `draw(path)` draws figures at path(name.png), which are embedded."""
+    with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
+        draw(lambda name: Path(folder) / name)
+        images = {p.stem: embedded(p) for p in sorted(Path(folder).iterdir())}
+    effect = body["effects"].get("+".join(body["causes"]))
+    cells = finding.by_place(body)
+    return rendered(
+        "diagnose.html.j2",
+        headline=finding.headline(body, setting.rig),
+        lines=finding.sentences(body),
+        to_do=_to_do(body, setting) if body["verdict"] != "none" else [],
+        remains=finding.remains(body),
+        parameters=_parameters(effect, body["causes"]) if effect and body["causes"] else [],
+        subtasks=setting.subtasks,
+        heat=_heat(cells, setting.subtasks) if cells else [],
+        where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
+        more_cells=max(len(cells) - MOST, 0),
+        images=images | {n: None for n in ("gap_signal", "gap_before_after") if n not in images},
+        suspects=_suspects(body, setting),
+        attributed=bool(body.get("attribution")),
+        properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
+        measured=setting.measured is not None,
+        detection=_detection(body),
+        far=_far(body),
+        warnings=setting.warnings,
+        files=setting.files,
+    )
+
+
+def _to_do(body: Body, setting: Setting) -> list[str]:
+    return [*finding.to_do(body), *filter(None, [finding.settles(body, setting.measured is not None)])]
+
+
+def _heat(cells: Mapping[tuple[str, str], Sequence], subtasks: Sequence[str]) -> list[dict[str, Any]]:
+    channels = [c for c in finding.CHANNELS if any(k[0] == c for k in cells)]
+    channels += sorted({k[0] for k in cells} - set(channels))
+    top = max(finding.share_of(found) for found in cells.values())
+    out = []
+    for channel in channels:
+        row: list[dict[str, str] | None] = []
+        for subtask in subtasks:
+            found = cells.get((channel, subtask))
+            row.append(_coloured(finding.share_of(found), top) if found else None)
+        out.append({"name": channel, "cells": row})
+    return out
+
+
+def _coloured(share: float, top: float) -> dict[str, str]:
+    depth = (share / top) ** 0.5 if top > 0 else 0.0
+    light = 94 - 50 * depth
+    text = "<1" if share < 0.005 else f"{100 * share:.0f}"
+    return {"colour": f"hsl(24 90% {light:.0f}%)", "ink": "#fff" if light < 58 else "#3a1d00", "text": text}
+
+
+def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    lows, highs = [c["band"][0] for c in cells], [c["band"][1] for c in cells]
+    band = f"{min(lows):g} to {max(highs):g}" if None not in highs else ""
+    scores = [c["z"] for c in cells if c["z"] is not None]
+    trials = str(len({c["trial"] for c in cells}))
+    return (
+        key[0],
+        key[1],
+        percent(finding.share_of(cells)),
+        f"{max(scores):.0f}" if scores else "",
+        trials,
+        band,
+    )
+
+
+def _parameters(effect: Mapping[str, Any], causes: Sequence[str]) -> list[tuple[str, ...]]:
+    """Parameter, the model's value where it is known, what was found, interval."""
+    rows = []
+    for name, p in effect["parameters"].items():
+        cause = next((c for c in causes if name.startswith(f"{c}.")), causes[0])
+        last = name.rpartition(".")[2]
+        shown = SHOWN[last] if last in SHOWN else shown_as(p["unit"], share=last in SHARES)
+        low, high = p["interval_90"]
+        ends = "" if None in (low, high) else interval(low, high, shown)
+        words, nominal = last.replace("_", " "), p.get("nominal")
+        if nominal is not None:
+            words = plain_name(cause) + (f", {words}" if not cause.endswith(f".{last}") else "")
+        model = "" if nominal is None else estimate(nominal, 0.0, shown)
+        rows.append((words, model, estimate(p["mean"], p["sd"] or 0.0, shown), ends))
+    return rows
+
+
+def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
+    """Every effect that was looked at: how probably it acts, what it explains and where it would show."""
+    attribution = body.get("attribution") or {}
+    rows = []
+    for name, chance in sorted(finding.chances(body).items(), key=lambda row: -row[1])[:MOST]:
+        own, share = attribution.get(name), ""
+        if own and own.get("share") is not None and own["probability"] >= 0.01:
+            ends = between(*(own.get("interval_90") or (None, None)))
+            share = percent(own["share"]) + (f" ({ends})" if ends else "")
+        shows = "; ".join(setting.shows[n] for n in name.split("+") if n in setting.shows)
+        rows.append((plain_name(name), percent(chance), share, shows, name))
+    return rows
+
+
+def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tuple[str, ...]]:
+    rows = []
+    for name, shift in (effect.get("property_shift") or {}).items():
+        block, _, prop = name.rpartition(".")
+        factor, unit = property_shown_as(name, shift["unit"])
+        cells = [f"{shift[k] * factor:.4f} {unit}".rstrip() for k in ("before", "after")]
+        if measured is not None:
+            value = measured.get(block, {}).get(prop)
+            cells.append("" if value is None else estimate(value[0], value[1], (factor, unit)))
+        rows.append((name, *cells))
+    return rows
+
+
+def _detection(body: Body) -> str:
+    p, fineness = body["detection"]["p_value"], body["detection"].get("resolution")
+    text = f"A healthy recording of this rig and task differs from the model as much with {finding.p_text(p)}"
+    if not fineness:
+        return f"{text}."
+    fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"
+    return f"{text}; {fewer}, and what is below follows from the sensors' noise."
+
+
+def _far(body: Body) -> str:
+    s = body.get("shrinkage")
+    if not s or s.get("fraction") is None or s.get("before") is None:
+        return ""
+    fall = f"from {plain(s['before'])} to {plain(s['after'])}"
+    text = (
+        f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
+        f"healthy recordings leave {plain(s['noise_floor'])}."
+    )
+    if s.get("flexible_ceiling") is not None:
+        text += f" A description free of any physics would take {percent(s['flexible_ceiling'])} of the gap."
+    return text

@@ -19,10 +19,13 @@ from hmmseg_cli.console import (
     JsonOption,
     Output,
     QuietOption,
-    SeedOption,
-    TaskOption,
+    RigBeside,
+    TaskBeside,
     TrialsArgument,
+    UnusedSeed,
+    described,
     distinct_trials,
+    needed,
     read_trials,
 )
 from hmmseg_cli.labels import WriteOption, check_destination, write_labels
@@ -41,8 +44,6 @@ class Method(StrEnum):
     QUALITATIVE = "qualitative"
 
 
-RigFile = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Nominal hand (TOML); a plain task needs only its [columns].")]  # fmt: skip
 ModelFile = Annotated[Path | None, typer.Option(
     "--model", metavar="M.npz", help="Emissions of a plain ordered task, from hmmseg fit.")]  # fmt: skip
 ForceThreshold = Annotated[float, typer.Option(
@@ -52,10 +53,10 @@ VelocityThreshold = Annotated[float, typer.Option(
 
 
 def segment(
-    trials: TrialsArgument, task: TaskOption, rig: RigFile = None, model: ModelFile = None,
+    trials: TrialsArgument, task: TaskBeside = None, rig: RigBeside = None, model: ModelFile = None,
     method: Annotated[Method, typer.Option(help="hmm, or the paper's thresholds.")] = Method.HMM,
     force_threshold: ForceThreshold = 0.05, velocity_threshold: VelocityThreshold = 0.05,
-    write: WriteOption = None, json: JsonOption = None, figures: FiguresOption = None, seed: SeedOption = 0,
+    write: WriteOption = None, json: JsonOption = None, figures: FiguresOption = None, seed: UnusedSeed = 0,
     quiet: QuietOption = False, workers: WorkersOption = None, scheduler: SchedulerOption = None,
 ) -> None:  # fmt: skip
     """Segment recordings into the task's subtasks, with the uncertainty of every boundary.
@@ -67,14 +68,14 @@ def segment(
         apart = workers is not None or scheduler is not None
         paths = distinct_trials(recordings_in(trials) if apart else trials)
         check_destination(write, paths)
+        task, rig = described(paths, task, rig)
         description = read_task(task)
         if isinstance(description, SequenceTask):
             if apart:
                 raise InputError("--workers, --scheduler", "go with tasks of blocks alone")
             recordings, found = _segment_sequence(out, paths, description, rig, model, method)
         else:
-            if rig is None:
-                raise InputError("--rig", "missing", "the nominal hand of a task of blocks")
+            rig = needed(rig, paths)
             if model is not None:
                 raise InputError(f"--model {model}", "goes only with a plain ordered task")
             if apart:

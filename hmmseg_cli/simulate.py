@@ -164,9 +164,7 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
         summary = residual_summary(result, boundaries, [s.state for s in subtasks(task)])
         out.print(_residual_table(summary))
     if out.figures is not None:
-        from hmmseg_cli.figures.replay import draw_replay
-
-        draw_replay(result, segmentation, out.figure(f"{path.stem}_replay.png"))
+        _draw_replay(result, segmentation, out.figure(f"{path.stem}_replay.png"))
     signals, model = result.signals, result.predicted
     traces = [Trace(f"{label} [N]", [("recording", signals.t, getattr(signals, key)),
                                      ("virtual model", signals.t, model[key])])
@@ -193,3 +191,26 @@ def _spare_inputs(folder: Path, names, inputs) -> None:
     for path in inputs:
         if path is not None and Path(path).resolve() in targets:
             raise InputError(f"--output {folder}", f"would replace the input {path}", "another folder")
+
+
+def _draw_replay(result, segmentation, path: Path) -> None:
+    """Grip, net and shear forces measured and predicted, over coloured subtasks."""
+    from hmmseg.plot.spans import Panel, stacked_panels
+    from hmmseg.plot.style import BLUE, canvas
+
+    signals, predicted = result.signals, result.predicted
+    panels = [
+        Panel("Distance\n[cm]", 100 * signals.distance),
+        Panel("Grip\n[N]", signals.grip),
+        Panel("Net $f_x$\n[N]", signals.fx),
+        Panel("Net $f_y$\n[N]", signals.fy),
+        Panel("Shear\n[N]", signals.shear),
+    ]
+    with canvas(path, height=6.4) as figure:
+        axes = stacked_panels(figure, signals.t, panels, segmentation)
+        curves = (predicted["grip"], predicted["fx"], predicted["fy"], predicted["shear"])
+        for ax, values in zip(axes[1:], curves, strict=True):
+            ax.plot(signals.t, values, color=BLUE, lw=0.9, label="virtual model")
+        axes[1].lines[0].set_label("recording")
+        axes[1].set_ylim(top=1.4 * axes[1].get_ylim()[1])  # room for the legend
+        axes[1].legend(handles=[axes[1].lines[0], axes[1].lines[-1]], loc="upper right", ncols=2)

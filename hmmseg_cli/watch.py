@@ -12,7 +12,7 @@ import typer
 
 import hmmseg
 from hmmseg.errors import InputError
-from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, SeedOption, TaskOption
+from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, TaskOption, UnusedSeed
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
@@ -34,7 +34,7 @@ SAID = {
 
 def watch(
     task: TaskOption, rig: RigOption, lag: LagOption = 1.0, plot: PlotOption = False,
-    skip_bad_rows: SkipOption = False, json: JsonOption = None, seed: SeedOption = 0,
+    skip_bad_rows: SkipOption = False, json: JsonOption = None, seed: UnusedSeed = 0,
     quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """Follow a task while it runs: a CSV header then rows on standard input, one JSON line out per row."""

@@ -16,7 +16,17 @@ PRODUCT = tuple(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"
 OURS = {*PRODUCT, "experiments", "paper_figs", "tests"}
 # Import names that differ from the name that is installed.
 DISTRIBUTIONS = {"PIL": "pillow", "mcap_ros2": "mcap-ros2-support", "sklearn": "scikit-learn"}
-TOOLS = {"build", "furo", "myst-parser", "pre-commit", "pyright", "pytest-xdist", "ruff", "sphinx"}
+TOOLS = {
+    "ipykernel",
+    "build",
+    "furo",
+    "myst-parser",
+    "pre-commit",
+    "pyright",
+    "pytest-xdist",
+    "ruff",
+    "sphinx",
+}
 
 
 def requirement(text: str) -> str:

@@ -1,5 +1,6 @@
 """What `import hmmseg, estimation, simgap` offers, used as a stranger would."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +16,8 @@ from hmmseg import InputError, Rig, Task, Trial, align, segment
 
 STACK = Path(__file__).parents[1] / "recordings" / "none_1"
 PUBLIC = {
-    hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose example_folder "
-    "fit segment",
+    hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose diagnose "
+    "example_folder fit identify segment simulate",
     estimation: "Identification identify read_actual",
     simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate",
 }
@@ -28,6 +29,7 @@ def test_what_is_public_is_listed_and_there(package):
     for name in package.__all__:
         assert getattr(package, name) is not None
         assert name in dir(package)
+    assert {name for name in dir(package) if not name.startswith("__")} <= set(package.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = package.nothing
 
@@ -110,6 +112,55 @@ def found():
     return estimation.identify(aligned)
 
 
+CELLS = (
+    "import hmmseg\nfolder = hmmseg.example_folder()\n"
+    "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
+    "found[0]",
+    "print(f'{found[0]}')",
+    "found[0].plot()",
+)
+
+
+def test_a_notebook_shows_every_result_once_and_every_plot():
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("ipykernel")
+    from nbclient import NotebookClient
+
+    cells = [nbformat.v4.new_code_cell(source) for source in CELLS]
+    NotebookClient(nbformat.v4.new_notebook(cells=cells), timeout=300).execute()
+    shown = [[o for o in cell.outputs if o.get("name") != "stderr"] for cell in cells]
+    several, one, printed, plot = shown
+    assert len(several) == len(one) == len(printed) == 1
+    assert "pickup block1" in several[0].data["text/plain"] and "<table>" in one[0].data["text/html"]
+    assert "pickup block1" in printed[0].text
+    assert any("image/png" in output.data for output in plot)
+
+
+def test_results_are_text_though_rich_would_show_them_itself(found, monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    assert "block1" in f"{found}" and "pickup block1" in repr(found.segmentations)
+
+
+def inside(value, seen):
+    """All dataclasses that can be reached from a result."""
+    if id(value) in seen:
+        return
+    if dataclasses.is_dataclass(value):
+        seen[id(value)] = value
+        for field in dataclasses.fields(value):
+            inside(getattr(value, field.name), seen)
+    elif isinstance(value, list | tuple | dict):
+        for each in value.values() if isinstance(value, dict) else value:
+            inside(each, seen)
+
+
+def test_no_part_of_a_result_fills_the_screen(found):
+    seen = {}
+    inside(found, seen)
+    assert len(seen) > 50
+    assert max(len(repr(value)) for value in seen.values()) < 2500  # characters
+
+
 def test_results_read_like_the_terminals_table(found):
     text = repr(found)
     assert "block1" in text and "weight" in text and "95 % interval" in text
@@ -146,6 +197,8 @@ def test_a_wrong_name_names_the_nearest(found):
         found.of("blok1", "weight")
     with pytest.raises(KeyError, match=r"wieght.*weight"):
         found.of("block1", "wieght")
+    with pytest.raises(KeyError, match=r"did you mean weight"):
+        found.of("block1", "mass")
 
 
 def test_plots_return_axes_and_save_where_asked(found, tmp_path):

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.real.hiro_gap import rounded
 from experiments.saving import save
-from hmmseg_cli.figures.gap_robot import Drawn, draw_before_after, draw_signal
+from hmmseg_cli.gap_figures import Drawn, draw_before_after, draw_windows
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.recording import Recording, read_recording
@@ -97,7 +97,7 @@ def published(found: RobotDiagnosis, name: str, output: Path | None, figures: Pa
     save(output or RESULTS / f"{name}.json", summary(found))
     if figures is not None:
         drawn = Drawn(found, body(found), found.warnings)
-        draw_signal(drawn, figures / f"{name}_signal.png")
+        draw_windows(drawn, figures / f"{name}_signal.png")
         draw_before_after(drawn, figures / f"{name}_before_after.png")
 
 

@@ -25,6 +25,7 @@ from hmmseg.io.plausibility import position_pairs
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.robust import bridged
+from hmmseg.tables import Brief
 
 
 def group_size(rate: float, max_rate: float) -> int:
@@ -47,8 +48,8 @@ def grouped(values: np.ndarray, group: int, width: int | None = None) -> tuple[n
     return np.where(count > 0, mean, np.nan), count
 
 
-@dataclass(frozen=True)
-class Signals:
+@dataclass(frozen=True, repr=False)
+class Signals(Brief):
     """Fingertip signals of one trial, arrays (num_timesteps,), NaN where missing.
 
     Positions [m], velocities [m/s] and forces [N]; `sd_*` are the standard deviations of one

@@ -9,52 +9,6 @@
 docs/hmm.md shows all of it. Nothing heavy is imported before it is used.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from hmmseg._lazy import lazily
 
-if TYPE_CHECKING:
-    from hmmseg.hmm.chain import Chain, InfeasibleAlignment, left_to_right
-    from hmmseg.hmm.durations import DurationChain, lasting
-    from hmmseg.hmm.inference import filter, k_best, log_evidence, sample, smooth, viterbi
-    from hmmseg.hmm.learn import Durations, Emission, em
-    from hmmseg.hmm.results import Alignment, Alignments, Filtered, Posterior
-    from hmmseg.hmm.streaming import Step, StreamingFilter, Window
-
-_MODULES = {
-    "chain": ("Chain", "InfeasibleAlignment", "left_to_right"),
-    "durations": ("DurationChain", "lasting"),
-    "inference": ("filter", "k_best", "log_evidence", "sample", "smooth", "viterbi"),
-    "learn": ("Durations", "Emission", "em"),
-    "results": ("Alignment", "Alignments", "Filtered", "Posterior"),
-    "streaming": ("Step", "StreamingFilter", "Window"),
-}
-_HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
-
-__all__ = [
-    "Alignment",
-    "Alignments",
-    "Chain",
-    "DurationChain",
-    "Durations",
-    "Emission",
-    "Filtered",
-    "InfeasibleAlignment",
-    "Posterior",
-    "Step",
-    "StreamingFilter",
-    "Window",
-    "em",
-    "filter",
-    "k_best",
-    "lasting",
-    "left_to_right",
-    "log_evidence",
-    "sample",
-    "smooth",
-    "viterbi",
-]
-
-__getattr__, __dir__ = lazily(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazily(__name__, __file__)

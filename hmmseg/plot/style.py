@@ -42,11 +42,12 @@ def canvas(
     """An empty figure of this size [in]; saved to `path` (kind by its suffix) when the block ends.
 
     No pyplot: nothing is left open and no display is asked for. Without a path the figure is the
-    caller's to show: pyplot's where a notebook or script has loaded it.
+    caller's to show: pyplot's in a notebook, which shows it below the cell, and where a script has loaded it.
     """
     with matplotlib.rc_context(STYLE):
-        pyplot = sys.modules.get("matplotlib.pyplot") if path is None else None
-        if pyplot is not None:
+        if path is None and not sys.modules.keys().isdisjoint(("matplotlib.pyplot", "ipykernel")):
+            from matplotlib import pyplot
+
             figure = pyplot.figure(figsize=(width, height), layout=layout)
         else:
             figure = Figure(figsize=(width, height), layout=layout)

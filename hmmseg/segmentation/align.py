@@ -50,7 +50,7 @@ from hmmseg.segmentation.rounds import (
     slices,
 )
 from hmmseg.segmentation.spans import Failure, Segmentation, Span, trials_table
-from hmmseg.tables import Tabled
+from hmmseg.tables import Brief, Tabled
 
 Spans = Sequence[tuple[float, float]]
 LOCAL_RATE = 100.0  # chosen: Hz; contacts are located at up to this rate, at which readings share no noise
@@ -323,8 +323,8 @@ def _fit_shown(f: Features, shown: Plan, verdict: Conformity) -> tuple[Fit | Non
     return own, float(own.posteriors[0].log_evidence)
 
 
-@dataclass(frozen=True)
-class TrialAlignment:
+@dataclass(frozen=True, repr=False)
+class TrialAlignment(Brief):
     """What later stages need of one aligned trial: the trial, its signals and boundary posteriors.
 
     `signals` are the recording's, `thinned` and `features` those that the emissions score. `present`

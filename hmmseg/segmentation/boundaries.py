@@ -23,6 +23,8 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from hmmseg.tables import Brief
+
 POINTS = 41  # numerics: nodes per sample interval
 BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
 UNSEEN = 0.15  # prior: the same, as a share of the way that the velocities at both ends do not account for
@@ -242,8 +244,8 @@ ONSET = 0.001  # prior: s; a pad's force leads its compression by its viscosity,
 UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, against what g leaves out
 
 
-@dataclass(frozen=True)
-class BoundaryPosterior:
+@dataclass(frozen=True, repr=False)
+class BoundaryPosterior(Brief):
     """Posterior of one boundary: probabilities (M,) at times (M,) [s], increasing."""
 
     times: np.ndarray

@@ -32,6 +32,7 @@ from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.robust import white_sd
+from hmmseg.tables import Brief
 
 SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
@@ -42,8 +43,8 @@ ONE_FINGER = 0.02  # prior: share of free samples at which one finger alone touc
 RUNG = 0.01  # prior: share of free samples at which forces still ring from a contact
 
 
-@dataclass(frozen=True)
-class Features:
+@dataclass(frozen=True, repr=False)
+class Features(Brief):
     """What the emissions score, arrays (num_timesteps,), NaN where missing.
 
     `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N]; vx, vy, ay: mean velocity and vertical

@@ -18,10 +18,11 @@ from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import TAIL
 from hmmseg.robust import NORMAL, weighted_median
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
+from hmmseg.tables import Brief
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, repr=False)
+class Fit(Brief):
     """Fitted emissions with the alignment posterior of every trial."""
 
     parameters: Parameters

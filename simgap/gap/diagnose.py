@@ -33,8 +33,7 @@ from simgap.gap.tolerance import properties_tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.gap.wrist_gap import check_forced, of_wrist
 from simgap.progress import Progress, silent
-from simgap.report.finding import sentence
-from simgap.report.tables import tables
+from simgap.report.finding import sentence, tables
 
 STAGES = 12  # look: that `progress` is told of, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none

@@ -5,8 +5,7 @@ virtual model with a corrected rig, whose `[effects]` they apply; `reproduced` s
 better.
 """
 
-from simgap.patch.check import reproduced
-from simgap.patch.model import performed, replayed
+from simgap.patch.model import performed, replayed, reproduced
 from simgap.patch.write import files
 
 __all__ = ["files", "performed", "replayed", "reproduced"]

@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hmmseg.plot.style import BLUE, GREY, RED, canvas
-from simgap.report.causes import plain_name
-from simgap.report.finding import CHANNELS, by_place, share_of
+from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
 
 Body = Mapping[str, Any]
 
@@ -56,8 +55,9 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
     """Whether each suspect acts, and the share of the gap that it explains; else the probabilities."""
     effects = body.get("attribution")
     if effects:
-        rows = sorted(effects.items(), key=lambda item: -item[1]["probability"])[:8][::-1]
-        values = [v["probability"] for _, v in rows]
+        known = chances(body)
+        rows = sorted(effects.items(), key=lambda item: -known[item[0]])[:8][::-1]
+        values = [known[name] for name, _ in rows]
     else:
         rows = sorted(body["probabilities"].items(), key=lambda item: -item[1])[:8][::-1]
         values = [v for _, v in rows]
@@ -75,7 +75,7 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
                 )
         axes.set_yticks(at, [plain_name(name) for name, _ in rows])
         axes.set(xlim=(0, 1.02))
-        axes.legend(loc="lower right")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return axes
 
 
@@ -90,4 +90,4 @@ def draw_how_far(body: Body, path: Path) -> None:
         if s["before"] > 20 * max(s["after"], 1e-9):
             axes.set_xscale("log")
         axes.set_xlabel(f"mean squared residual on {s['evaluated_on']} [noise variances]")
-        axes.legend(loc="upper right")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))  # above the bars, which reach the edge

@@ -1,12 +1,93 @@
-"""A diagnosis in words, from its JSON alone: what it is, how sure, what remains, what to do."""
+"""A diagnosis in words and tables, from its JSON alone: what it is, how sure, what remains, what to do."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hmmseg.numbers import between, estimate, percent, plain, shown_as
-from simgap.report.causes import checks, plain_name
+from rich.table import Table
+
+from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
+
+if TYPE_CHECKING:
+    from simgap.effects.base import Effect
+
+
+def plain_name(
+    effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
+) -> str:
+    """An effect, or several joined by +, in plain words; `means`: its parameters, `rig`: the model's pads."""
+    return " and ".join(_one(name, means or {}, rig or {}) for name in effect.split("+"))
+
+
+def _one(name: str, means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
+    called, _, effect = _words(name)
+    own = {k.removeprefix(f"{name}."): v for k, v in means.items()}
+    return effect.phrase(own, rig) if own and effect is not None and effect.phrase is not None else called
+
+
+def checks(effects: Sequence[str]) -> list[str]:
+    """What to look at on the rig, one line an effect."""
+    return [check for _, check, _ in map(_words, effects) if check]
+
+
+# What a part of a model has, and what to check of it: {0} is the part's name.
+PARTS = {
+    "joint.frictionloss": ("dry friction", "Turn {0} by hand, unpowered."),
+    "joint.damping": ("viscous friction", "Swing {0} unpowered and watch how fast it comes to rest."),
+    "joint.armature": ("rotor inertia", "Look up the rotor's inertia of {0}, times its gear ratio squared."),
+    "joint.stiffness": ("a spring or a cable", "Move {0} by hand, unpowered: do cables pull it back?"),
+    "joint.springref": ("a spring's rest", "Find where {0} comes to rest, unpowered."),
+    "joint.stribeck": ("friction that falls with speed", "Turn {0} slowly, then fast; note the torques."),
+    "joint.quadratic_drag": ("drag by the speed squared", "Run {0} at several speeds; note the torques."),
+    "joint.direction_friction": ("friction larger one way", "Turn {0} slowly both ways; note the torques."),
+    "joint.load_friction": ("friction by the load", "Turn {0} with a load and without; note the torques."),
+    "body.mass": ("mass", "Weigh {0}."),
+    "body.com": ("centre of mass", "Balance {0} on an edge and measure where it rests."),
+    "body.payload": ("a load", "See what is mounted on {0} that the model lacks, cables too."),
+    "body.length": ("length of the link before it", "Measure from the joint before {0} to {0}."),
+    "geom.friction": ("friction", "Pull a weight across {0} with a spring balance."),
+    "geom.stiffness": ("softness of its contact", "Press {0} with a known weight and measure its give."),
+    "geom.size": ("size", "Measure {0} with a calliper."),
+    "actuator.gain": ("strength", "Command a known torque of {0}, or hold a known weight, and measure."),
+    "actuator.damping": ("velocity gain", "Look up the velocity gain in the drive of {0}."),
+    "actuator.limit": ("largest force", "Look up the current limit in the drive of {0}."),
+    "option.timestep": ("the simulator's time step", "Simulate with a tenth of the step: is the gap gone?"),
+    "option.iterations": ("the solver's iterations", "Simulate with more iterations: is the gap gone?"),
+    "option.hold": ("how commands hold between samples", "Log commands at the rate of the controller."),
+    "option.rk4": ("the simulator's integrator", "Simulate with the integrator RK4: is the gap gone?"),
+    "option.implicit": ("the simulator's integrator", "Simulate implicitly: is the gap gone?"),
+    "gravity.direction": ("a base that is tilted", "Put a level on the robot's base."),
+}
+
+
+def _part(name: str) -> tuple[str, str] | None:
+    """The same of a part of a model, such as `joint:elbow.frictionloss`; None of any other name."""
+    kind, of, rest = name.partition(":")
+    where, _, what = rest.rpartition(".")
+    if not of:  # of the whole model
+        return PARTS.get(name)
+    if kind not in {part.partition(".")[0] for part in PARTS} or not where:
+        return None
+    fallback = (what.replace("_", " "), "Measure it of {0}, and set it in the model.")
+    called, check = PARTS.get(f"{kind}.{what}", fallback)
+    return f"{where}: {called}", check.format(where)
+
+
+def _words(name: str) -> tuple[str, str, Effect | None]:
+    """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
+    from simgap.robot_effects import words
+
+    robots = words(name) or _part(name)
+    if robots is not None:
+        return *robots, None
+    from simgap.effects import catalogue  # slow to import
+
+    known = catalogue().get(name)
+    if known is None:
+        return name.replace("_", " "), "", None
+    return known.called or name.replace("_", " "), known.check, known
+
 
 Body = Mapping[str, Any]
 CHANNELS = {
@@ -32,6 +113,7 @@ WHEN = {
 SAID = 3  # look: places of a gap that a sentence has
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
+ALPHA = 0.05  # chosen: p-value below which what remains is more than noise
 TINY = 1e-16  # numerics: what double precision tells from zero beside one
 
 
@@ -54,9 +136,19 @@ def sureness(p: float) -> str:
 def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The causes in plain words."""
     name = "+".join(body["causes"])
-    entry = body["effects"].get(name, {"parameters": {}})
-    means = {k: p["mean"] for k, p in entry["parameters"].items() if p["mean"] is not None}
-    return plain_name(name, means, rig)
+    found = body["effects"].get(name, {"parameters": {}})["parameters"]
+    means = {k: p["mean"] for k, p in found.items() if p["mean"] is not None}
+    if not any(p.get("nominal") is not None for p in found.values()):
+        return plain_name(name, means, rig)
+    texts = []
+    for cause in body["causes"]:
+        own = [p for k, p in found.items() if len(body["causes"]) == 1 or k.startswith(f"{cause}.")]
+        text = plain_name(cause)
+        if len(own) == 1 and _part(cause) is not None and own[0]["unit"] not in ("", "1"):
+            value = estimate(own[0]["mean"], 0.0, (1.0, own[0]["unit"]))
+            text += f" {value} (model: {plain(own[0]['nominal']) if own[0]['nominal'] else 0})"
+        texts.append(text)
+    return " and ".join(texts)
 
 
 def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
@@ -67,8 +159,9 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     if verdict == "unknown":
         return "A gap that no known cause explains"
     text = named(body, rig)
-    rest = (body.get("remainder") or {}).get("share")
-    more = ", and a larger gap that no known cause explains" if rest is not None and rest > 1 - rest else ""
+    rest = body.get("remainder") or {}
+    larger = rest.get("share") is not None and rest["share"] > 0.5 and not _noise(rest)
+    more = ", and a larger gap that no known cause explains" if larger else ""
     return text[0].upper() + text[1:] + more
 
 
@@ -138,12 +231,41 @@ def remains(body: Body) -> list[str]:
         return [f"{percent(rest['share'])} of the gap is left when every likely cause has had its part."]
     p = rest.get("p_value")
     sure = "" if p is None else f" ({p_text(p)})"
-    if rest["share"] < 0.01 or not (rest.get("where") or (p is not None and p < 0.05)):
-        return [f"Nothing that stands out of the noise remains: {percent(rest['share'])} of the gap{sure}."]
+    if rest["share"] < 0.01 or _noise(rest):
+        return [f"What remains, {percent(rest['share'])} of the gap, does not stand out of the noise{sure}."]
     return [
         f"{percent(rest['share'])} of the gap remains{sure}.",
         *moving({"where": rest.get("where") or []}, of="what remains"),
     ]
+
+
+def _noise(rest: Mapping[str, Any]) -> bool:
+    """Whether what remains is no more than noise leaves."""
+    p = rest.get("p_value")
+    return not rest.get("where") if p is None else p >= ALPHA
+
+
+def settles(body: Body, weighed: bool) -> str:
+    """What would tell more of blocks whose properties were fitted; "" where nothing is open, or they were
+    measured (`weighed`)."""
+    rest = body.get("remainder") or {}
+    unsure = body["verdict"] in ("set", "unknown") or (
+        body["verdict"] == "named" and (probability(body) < SURE[1][0] or (rest.get("share") or 0.0) > 0.5)
+    )
+    if weighed or not unsure or not any(e.get("property_shift") for e in body["effects"].values()):
+        return ""
+    return (
+        "Weigh and measure the blocks and pass them with --actual: an error of the sensors can hide in a "
+        "weight or a size that is fitted along."
+    )
+
+
+def chances(body: Body) -> dict[str, float]:
+    """One probability of each suspect that it acts: of what the verdict names, the verdict's."""
+    known = {n: a["probability"] for n, a in (body.get("attribution") or {}).items()}
+    known |= {n: body["probabilities"].get(n, 0.0) for n in body["effects"] if n not in known}
+    whole = probability(body)
+    return known | {n: whole for n in (*body["causes"], "+".join(body["causes"])) if n in known}
 
 
 def moving(body: Body, of: str = "the gap") -> list[str]:
@@ -199,3 +321,45 @@ def by_place(body: Body) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
 def share_of(cells: Sequence[Mapping[str, Any]]) -> float:
     """Their share of the gap together."""
     return float(sum(c["share"] for c in cells))
+
+
+def tables(body: Mapping[str, Any]) -> list[Table]:
+    """Probabilities, parameters of the cause and the largest cells, for people to read."""
+    likely = Table(title="probabilities", title_justify="left")
+    likely.add_column("candidate", no_wrap=True)
+    likely.add_column("probability", justify="right")
+    for name, value in sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]:
+        likely.add_row(name, f"{value:.3f}")
+    out = [likely]
+    if body["causes"]:
+        values = Table(title="parameters", title_justify="left")
+        for head in ("parameter", "estimate", "90 % interval"):
+            values.add_column(head, no_wrap=True)
+        for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
+            low, high = p["interval_90"]
+            shown = shown_as(p["unit"])
+            values.add_row(name, estimate(p["mean"], p["sd"], shown), interval(low, high, shown))
+        out.append(values)
+    if body["next_experiment"] is not None:
+        following = Table(title="next experiment", title_justify="left", show_header=False)
+        asked = body["next_experiment"]
+        gain = f"by {asked['expected_gain_nats']:.0f} nats at least"
+        following.add_row(asked["do"])
+        following.add_row(f"expected to tell {', '.join(asked['separates'])} apart, {gain}")
+        out.append(following)
+    if body["where"]:
+        cells = Table(title="where the gap is largest", title_justify="left")
+        for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
+            cells.add_column(head, no_wrap=True)
+        for row in body["where"][:8]:
+            low, high = row["band"]
+            cells.add_row(
+                row["trial"],
+                row["channel"],
+                row["subtask"],
+                f"{low:g}-{high:g}",
+                f"{100 * row['share']:.0f} %",
+                f"{row['z']:.1f}",
+            )
+        out.append(cells)
+    return out

@@ -53,10 +53,11 @@ def parameters(
         mean, sd = c.neutral + c.scale * model.x[mine], c.scale * np.sqrt(variance[mine])
         for k, short in enumerate(c.parameters):
             key = short if len(effects) == 1 else f"{c.name}.{short}"
-            unit = found.composed.effects[c.name].parameters[short].unit
+            own = found.composed.effects[c.name].parameters[short]
             m, s = float(mean[k]), float(sd[k])
             low, high = max(m - 1.645 * s, float(c.low[k])), min(m + 1.645 * s, float(c.high[k]))
-            out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": unit}
+            out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": own.unit}
+            out[key]["nominal"] = own.nominal
     return out
 
 

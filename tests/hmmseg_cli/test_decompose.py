@@ -38,7 +38,8 @@ def test_equation_1_of_the_paper(decomposed):
     ]
     assert document["equation"].endswith("Release 2 = (free-motion, {∅}) }")
     assert document["equation"] in printed
-    (row,) = (line for line in printed.splitlines() if "carry block1" in line)
+    assert "block1: weight in carry block1; " in printed.partition("┏")[0]  # in words first
+    (row,) = (line for line in printed.splitlines() if "│ carry block1" in line)
     cells = [cell.strip() for cell in row.split("│")]
     assert cells[3:7] == ["hold-above-ground", "vertical", "horizontal", ""]
 

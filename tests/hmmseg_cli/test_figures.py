@@ -111,7 +111,7 @@ def test_corner_shows_cm_and_measured_values(tmp_path, texts):
     actual = {"block1": {"weight": (0.5, 0.001), "width": (0.0159, 0.0001)}}
     draw_corner(draws, NAMES, tmp_path / "corner.png", actual)
     check_picture(tmp_path / "corner.png")
-    assert {"block1\nwidth [cm]", "block1\nweight [N]", "red: measured"} <= set(texts)
+    assert {"block1\nwidth [cm]", "block1\nweight [N]", "lines: measured"} <= set(texts)
     assert "measured 0.5" in texts  # too far off to be a line
     draw_corner(draws[:, :1], NAMES[:1], tmp_path / "one.png")
     check_picture(tmp_path / "one.png")

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import pytest
 
-from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
-from hmmseg_cli.gap_report import Setting, page
+from hmmseg.numbers import between, estimate, fixed, interval, percent, plain, shown_as
+from hmmseg_cli.pages import Setting, page
 from simgap.effects import catalogue
-from simgap.report.causes import checks, plain_name
-from simgap.report.finding import headline, moving, remains, sentences, to_do
+from simgap.report.finding import (
+    chances,
+    checks,
+    headline,
+    moving,
+    plain_name,
+    remains,
+    sentences,
+    settles,
+    to_do,
+)
 from simgap.robot_effects import families
+from simgap.simulators.mjcf.settable import KNOWN
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
 
@@ -94,6 +104,43 @@ def test_a_named_cause_is_told_with_what_it_leaves():
 def test_a_cause_of_the_smaller_part_is_said_to_be_that():
     found = body("named", ["table_tilt"], remainder={"share": 0.9, "p_value": 0.0, "where": []})
     assert headline(found) == "A table that is not level, and a larger gap that no known cause explains"
+
+
+def test_no_more_is_said_of_noise_and_one_probability_of_a_cause():
+    left = {"share": 0.62, "p_value": 1.0, "where": [cell("vy", "carry block1", 0.3)]}
+    own = {"force_gain": {"probability": 0.8, "share": 0.38, "interval_90": [0.3, 0.4]}}
+    found = body("named", ["force_gain"], remainder=left, attribution=own)
+    assert "larger gap" not in headline(found)
+    assert remains(found) == ["What remains, 62 % of the gap, does not stand out of the noise (p = 1.0)."]
+    assert chances(found) == {"force_gain": 0.93}
+    assert "--actual" in settles(found, weighed=False) and settles(found, weighed=True) == ""
+
+
+def test_a_part_of_a_robot_is_told_in_words_with_the_models_own_value():
+    parameters = {"frictionloss": {"mean": 0.12, "sd": 0.01, "interval_90": [0.1, 0.14], "unit": "N m",
+                                   "nominal": 0.0}}  # fmt: skip
+    cause = "joint:elbow.frictionloss"
+    found = body("named", [cause]) | {"effects": {cause: {"parameters": parameters, "log_evidence": 3.0}}}
+    assert headline(found) == "Elbow: dry friction 0.120 N m (model: 0)"
+    assert to_do(found) == ["Turn elbow by hand, unpowered."]
+    text = page(found, Setting(["a.csv"], SUBTASKS), lambda path: None)
+    assert ">elbow: dry friction<" in text and ">0 N m<" in text and ">0.120 ± 0.010 N m<" in text
+
+
+def test_every_part_of_a_model_that_is_offered_has_words_and_a_check():
+    kinds = [
+        f"{kind}.{what}" for kind, known in KNOWN.items() for what in known if kind in ("joint", "actuator")
+    ]
+    for kind in (*kinds, "joint.stribeck", "body.mass", "body.com", "body.payload", "geom.friction"):
+        head, _, what = kind.partition(".")
+        name = f"{head}:elbow.{what}"
+        assert plain_name(name).startswith("elbow: ") and "elbow" in checks([name])[0]
+        assert "Measure it of" not in checks([name])[0]
+
+
+def test_what_rounds_to_nothing_has_no_sign():
+    assert fixed(-0.001, 2, "+") == "+0.00" and fixed(-0.001, 2) == "0.00" and fixed(-0.006, 2) == "-0.01"
+    assert percent(-0.001) == "0 %"
 
 
 def test_an_unknown_gap_says_what_moves():

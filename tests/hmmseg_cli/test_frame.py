@@ -14,7 +14,7 @@ import pytest
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg_cli import main as frame
-from hmmseg_cli.console import Output, distinct_trials, strict_json
+from hmmseg_cli.console import Output, described, distinct_trials, needed, strict_json
 
 HMMSEG = Path(sys.executable).with_name("hmmseg")
 TASK = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
@@ -86,6 +86,39 @@ def test_usage_at_fault(capsys, args, line):
     assert err.startswith(line)
 
 
+def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
+    trial, rig = tmp_path / "trial.csv", tmp_path / "rig.toml"
+    trial.write_text("t\n")
+    assert described([trial], None, None) == (task, None)
+    rig.write_text("rate = 50.0\n")
+    assert described([trial], None, None) == (task, rig)
+    other = tmp_path / "other.toml"
+    other.write_text('sequence = ["approach", "press"]\n')
+    assert described([trial], other, None) == (other, None)  # a plain task needs no hand
+    with pytest.raises(InputError, match=r"--task .*rig.toml: describes no task; .*swapped\?"):
+        described([trial], rig, task)
+    with pytest.raises(InputError, match=r"--rig .*other.toml: describes a task"):
+        described([trial], task, other)
+    task.unlink()
+    with pytest.raises(InputError, match=r"--task: missing; expected .*or a task.toml in"):
+        described([trial], None, None)
+    with pytest.raises(InputError, match="--rig: missing"):
+        needed(None, [trial])
+
+
+def test_help_groups_commands_and_gives_examples(capsys):
+    assert frame.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"{group}:" in out for group in frame.COMMANDS) and "Commands:" not in out
+    for group in frame.COMMANDS.values():
+        for command, example in group.items():
+            assert frame.main([command.__name__, "--help"]) == 0
+            shown = capsys.readouterr().out
+            assert example.splitlines()[-1] in shown
+            random = command.__name__ in ("identify", "simulate", "diagnose", "play", "demo")
+            assert ("--seed" in shown) == random
+
+
 def test_any_other_exception_is_a_bug(monkeypatch, task):
     def broken(found):
         raise ZeroDivisionError
@@ -115,8 +148,8 @@ def test_a_process_with_a_bug_shows_its_traceback(task):
         ({"json": "{}/trial.csv"}, "--json .*trial.csv: would be written over, .*; expected a .json file"),
         ({"json": "{}"}, "--json .*: is a folder; expected a file"),
         (
-            {"json": "{}/absent/a.json"},
-            "--json .*a.json: no folder .*absent; expected a file in a folder that",
+            {"json": "{}/file/a.json"},
+            "--json .*file is not a folder; expected a folder",
         ),
         ({"report": "{}/a.json"}, "--report .*a.json: unknown kind of file; expected .html or .htm"),
         ({"figures": "{}/file"}, "--figures .*file is not a folder; expected a folder"),

@@ -235,3 +235,35 @@ def test_a_course_between_the_largest_numbers_is_drawn():
     from hmmseg_cli.inspect import sparkline
 
     assert len(sparkline((-1e308, 0.0, float("nan"), 1e308))) == 4
+
+
+def test_new_fills_in_a_rig_from_a_recording(tmp_path, capsys):
+    table = pd.read_csv(NONE / "trial_01.csv")
+    table.to_csv(tmp_path / "jointed.csv", index=False)
+    assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 0
+    text = (tmp_path / "one/rig.toml").read_text()
+    assert "rate = 20.0" in text and "[fingers.1]" in text
+    assert "hmmseg segment" in capsys.readouterr().out
+    assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 2
+
+
+def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
+    from simgap.simulators.mjcf.map import read_map
+
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size=".1"/></body></worldbody>'
+        '<actuator><motor name="elbow" joint="elbow"/></actuator></mujoco>'
+    )
+    (tmp_path / "log.csv").write_text(
+        "stamp,elbow_deg,elbow_vel,elbow_cmd,room\n" + "".join(f"{k / 100},1,2,3,4\n" for k in range(20))
+    )
+    given = ["--mjcf", str(tmp_path / "robot.xml"), "--from", str(tmp_path / "log.csv")]
+    assert main(["new", str(tmp_path), *given]) == 0
+    assert "columns left to you: room" in " ".join(capsys.readouterr().out.split())
+    found = read_map(tmp_path / "map.toml")
+    assert {n: (m.thing, m.kind) for n, m in found.columns.items()} == {
+        "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
+        "elbow_cmd": ("actuator", "command"),
+    }  # fmt: skip
+    assert found.time == "stamp"
+    assert main(["new", str(tmp_path / "other"), "--mjcf", str(tmp_path / "robot.xml")]) == 2

@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 from experiments.generic_ensembles import ensemble
-from hmmseg_cli.diagnose import with_options_repeated
 from hmmseg_cli.main import main
 
 
@@ -32,13 +31,19 @@ def arguments(folder, *more, count=5):
     return ["diagnose", *trials["real"], *task, "--against", *trials["sim"], *more]
 
 
-def test_values_of_against_reach_up_to_the_next_option():
-    given = ["diagnose", "a", "--against", "b", "c", "--task", "d", "e"]
-    assert with_options_repeated(given) == [
-        "diagnose", "a", "--against", "b", "--against", "c", "--task", "d", "e",
-    ]  # fmt: skip
-    again = ["diagnose", "--against", "b", "--against", "c"]
-    assert with_options_repeated(again) == again
+def test_values_of_against_reach_up_to_the_next_option(folder, monkeypatch):
+    taken = {}
+
+    def against(out, paths, sims, *rest):
+        taken["real"], taken["sim"] = [p.name for p in paths], [p.name for p in sims]
+
+    monkeypatch.setattr("hmmseg_cli.diagnose._against", against)
+    given = arguments(folder, "--seed", "1")
+    assert main(given) == 0
+    once = taken | {}
+    again = [a for n in given[given.index("--against") + 1 : -2] for a in ("--against", n)]
+    assert main([*given[: given.index("--against")], *again]) == 0
+    assert once == taken and len(once["sim"]) == len(once["real"]) == 5
 
 
 def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):

@@ -29,7 +29,7 @@ SAYS = {
     "damping": "viscous friction",
     "frictionloss": "Coulomb friction",
     "armature": "rotor inertia",
-    "stiffness": "a spring (cable) on",
+    "stiffness": "stiffness of a spring or cable",
 }
 
 

@@ -8,8 +8,10 @@ noise = 0.01            # sd of a sample, in that unit; learned from the log whe
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -174,3 +176,42 @@ def _number(entry: Mapping[str, Any], key: str, where: str, default: Any = None)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
         raise InputError(f"{where}.{key}", f"{value!r:.40}", "a number")
     return float(value)
+
+
+SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}
+COMMANDS = {"cmd", "command", "u", "ctrl", "target", "des"}
+
+
+def proposed_map(xml: Path, columns: Sequence[tuple[str, str | None]]) -> tuple[str, list[str]]:
+    """A map's text for a model and a log's columns (name, unit), and the columns that no name decides.
+
+    A column is the joint, actuator or sensor whose name it holds, the longest such name: of a joint the speed
+    where the column says so, of an actuator where it speaks of a command.
+    """
+    from simgap.simulators.mjcf.engine import mujoco
+    from simgap.simulators.mjcf.setting import names_of
+
+    try:
+        model = mujoco.MjModel.from_xml_path(str(xml))
+    except (ValueError, OSError) as error:
+        raise InputError(str(xml), f"cannot be read: {error}", "a MuJoCo model") from None
+    kinds = ("actuator", "joint", "sensor")
+    known = {kind: sorted(names_of(model, kind), key=len, reverse=True) for kind in kinds}
+    lines, left = [f"# Which column is which part of {xml.name}; SI where no unit is given."], []
+    for name, unit in columns:
+        said = set(re.split(r"[^a-z0-9]+", name.lower()))
+        order = ("actuator", "joint", "sensor") if said & COMMANDS else ("joint", "sensor", "actuator")
+        part = next(((kind, n) for kind in order for n in known[kind] if n.lower() in name.lower()), None)
+        if name == "t" or (part is None and said & {"t", "time", "stamp", "timestamp"}):
+            lines += [] if name == "t" else [f'time = "{name}"']
+            continue
+        if part is None:
+            left.append(name)
+            joints = ", ".join(known["joint"])
+            lines += [f"# [columns.{json.dumps(name)}]", f'# joint = "..."  # one of {joints}']
+            continue
+        lines += [f"[columns.{json.dumps(name)}]", f'{part[0]} = "{part[1]}"']
+        lines += ['kind = "velocity"'] if part[0] == "joint" and said & SPEEDS else []
+        lines += [f'unit = "{unit}"'] if unit else []
+    tops = [line for line in lines if line.startswith("time")]
+    return "\n".join([lines[0], *tops, *(x for x in lines[1:] if x not in tops)]) + "\n", left

@@ -1,1 +1,0 @@
-"""Figures of the commands, one file a figure."""

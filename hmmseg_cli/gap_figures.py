@@ -1,0 +1,262 @@
+"""Figures of a diagnosis beyond its JSON: recorded, simulated and corrected where they part most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmmseg.io.rig import FORCE_CHANNELS
+from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
+from simgap.gap.diagnose import Diagnosis
+from simgap.gap.trial_arrays import CHANNELS
+from simgap.generic.diagnose import GenericDiagnosis
+from simgap.generic.features import SLOW, bin_edges
+from simgap.generic.locate import both_variances
+from simgap.robots.diagnose import RobotDiagnosis
+
+LABELS = {
+    "x": "x [cm]",
+    "y": "y [cm]",
+    "distance": "distance [cm]",
+    "offset": "offset [cm]",
+    "vx": "vx [cm/s]",
+    "vy": "vy [cm/s]",
+    "fx": "net fx [N]",
+    "fy": "net fy [N]",
+    "grip": "grip [N]",
+    "shear": "shear [N]",
+}
+
+
+def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
+    """A recorded signal in task space, SI."""
+    import jax
+    import jax.numpy as jnp
+
+    from simgap.effects.base import tips
+
+    w = found.problem.frame.world
+    position, velocity = (np.asarray(z)[trial] for z in tips(jax.tree.map(jnp.asarray, w)))
+    force = dict(zip(FORCE_CHANNELS, w.force[trial].T, strict=True))
+    x1, y1, x2, y2 = position.T
+    table = {
+        "x": (x1 + x2) / 2,
+        "y": (y1 + y2) / 2,
+        "distance": x2 - x1,
+        "offset": y2 - y1,
+        "vx": (velocity[:, 0] + velocity[:, 2]) / 2,
+        "vy": (velocity[:, 1] + velocity[:, 3]) / 2,
+        "fx": force["fx1"] + force["fx2"],
+        "fy": force["fy1"] + force["fy2"],
+        "grip": np.minimum(force["fx1"], -force["fx2"]),
+        "shear": (force["fy1"] - force["fy2"]) / 2,
+    }
+    return table[channel]
+
+
+def draw_signal(found: Diagnosis, path: Path) -> None:
+    """The channel and trial of the largest excess: the signal, and its whitened residual beneath."""
+    frame = found.problem.frame
+    cell = max(found.cells, key=lambda c: c.energy - c.count)
+    r, c, n = cell.trial, CHANNELS.index(cell.channel), frame.lengths[cell.trial]
+    t, there = frame.world.t[r, :n], found.problem.whitening.weight[r, :n, c] > 0
+    with canvas(path, height=3.4) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        factor = 100.0 if "cm" in LABELS[cell.channel] else 1.0
+        recorded = _recorded(found, r, cell.channel)[:n]
+        above.plot(t, factor * recorded, color="black", lw=1.2, label="recorded")
+        off = found.problem.whitening.weight[r, :n, c]
+        for residual, colour, name in ((found.before, RED, "simulated"), (found.after, BLUE, "corrected")):
+            left = np.divide(residual[r, :n, c], off, out=np.full(n, np.nan), where=off > 0)
+            above.plot(t, factor * (recorded - left), ".", color=colour, ms=2, label=name)
+        above.set_ylabel(LABELS[cell.channel])
+        above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+        inside = t[frame.arrays.subtask[r, :n] == cell.subtask]
+        for axes in (above, below):
+            for event in frame.world.events[r]:
+                axes.axvline(event, color=GREY, lw=0.5)
+            axes.axvspan(inside[0], inside[-1], color=ORANGE, alpha=0.2, lw=0)
+        below.plot(t[there], found.before[r, :n, c][there], ".", color=RED, ms=3)
+        below.plot(t[there], found.after[r, :n, c][there], ".", color=BLUE, ms=3)
+        below.set_yscale("symlog", linthresh=3)
+        below.set(xlabel="time [s]", ylabel="residual [sd]")
+        above.set_title(f"{cell.channel} in {frame.files[r]}, largest gap shaded", loc="left")
+
+
+def draw_generic(found: GenericDiagnosis, path: Path) -> None:
+    """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
+    lay = found.scene.layout
+    slow = [k for k, cell in enumerate(lay.cells) if cell[0] >= 0 and lay.kind[lay.cell == k][0] == SLOW]
+    cell = max(slow, key=lambda k: found.located.z[k])
+    channel, worst = lay.cells[cell][:2]
+    index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
+    ends = found.scene.edges
+    edges = [bin_edges(lay, ends[k], ends[k + 1], k) for k in range(ends.size - 1)]
+    t = np.concatenate([(e[1:] + e[:-1]) / 2 for e in edges])
+    real, sim = found.real[:, index], found.sim[:, index]
+    with canvas(path, height=3.8) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        for rows, colour, label in ((real, RED, "real"), (sim, BLUE, "simulated")):
+            above.plot(t, rows.T, color=colour, lw=0.5, alpha=0.35)
+            above.plot(t, rows.mean(0), color=colour, lw=1.4, label=label)
+        moved = sim.mean(0) + found.leading.shift[index]
+        above.plot(
+            t, moved, color="black", lw=1, ls="--", label=f"simulated + {' + '.join(found.leading.effects)}"
+        )
+        above.legend(fontsize=6.5)
+        above.set_ylabel(lay.ensembles.channels[channel])
+        a, b = both_variances(lay, found.real, found.sim)
+        sd = np.sqrt(a + b / len(found.sim))[index]
+        below.plot(t, (real.mean(0) - sim.mean(0)) / sd, ".-", color=RED, ms=3, lw=0.6, label="before")
+        below.plot(t, (real.mean(0) - moved) / sd, ".-", color=BLUE, ms=3, lw=0.6, label="after")
+        below.set_yscale("symlog", linthresh=3)
+        below.set(xlabel="time [s], subtasks at their mean real durations", ylabel="residual [sd]")
+        below.legend()
+        for axes in (above, below):
+            for edge in found.scene.edges[1:-1]:
+                axes.axvline(edge, color=GREY, lw=0.5)
+            axes.axvspan(*found.scene.edges[worst : worst + 2], color="#E69F00", alpha=0.15, lw=0)
+        above.set_title(f"Largest difference of a course: {lay.ensembles.channels[channel]} (shaded subtask)")
+
+
+BARS = 12  # look: bars
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A diagnosis with its document, as the page takes it."""
+
+    found: RobotDiagnosis
+    body: dict[str, Any]
+    warnings: Sequence[str]
+
+
+def draw_robot(drawn: Drawn, path: Callable[[str], Path]) -> None:
+    """All figures, at the paths that `path(name)` gives."""
+    draw_where(drawn, path("gap_where.png"))
+    draw_windows(drawn, path("gap_signal.png"))
+    draw_probabilities(drawn, path("gap_probabilities.png"))
+    draw_before_after(drawn, path("gap_before_after.png"))
+
+
+def draw_robot_page(drawn: Drawn, path: Callable[[str], Path]) -> None:
+    """Those that a page shows beside its own tables."""
+    draw_windows(drawn, path("gap_signal.png"))
+    draw_before_after(drawn, path("gap_before_after.png"))
+
+
+def draw_where(drawn: Drawn, path: Path) -> None:
+    """Root mean square residual of every channel in every log, in noise's standard deviations."""
+    found = drawn.found
+    rows = found.composed.rows
+    logs = [r.name for r in found.composed.recordings]
+    size = np.sqrt(rows.variance)
+    grid = np.full((len(rows.channels), len(logs)), np.nan)
+    for c in range(len(rows.channels)):
+        for k in range(len(logs)):
+            mine = (rows.channel == c) & (rows.log == k) & np.isfinite(found.plain.residual)
+            if mine.any():
+                grid[c, k] = np.sqrt(np.mean((found.plain.residual[mine] / size[mine]) ** 2))
+    with canvas(path, height=1.6 + 0.25 * len(rows.channels)) as figure:
+        axes = figure.add_subplot()
+        shown = axes.imshow(np.log10(np.maximum(grid, 1.0)), aspect="auto", cmap="Oranges")
+        axes.set_yticks(range(len(rows.channels)), rows.channels)
+        axes.set_xticks(range(len(logs)), [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
+        for (row, column), value in np.ndenumerate(grid):
+            if np.isfinite(value) and grid.size <= 160:
+                dark = np.log10(max(value, 1)) > 0.6 * np.nanmax(np.log10(np.maximum(grid, 1)))
+                axes.text(
+                    column,
+                    row,
+                    f"{value:.2g}",
+                    ha="center",
+                    va="center",
+                    fontsize=6,
+                    color="white" if dark else "black",
+                )
+        bar = figure.colorbar(shown)
+        bar.set_label("log10 of rms [sd of noise]")
+        axes.set_title("Residual of restarted windows, model as it came")
+
+
+def _short(name: str) -> str:
+    stem = Path(name).stem
+    return stem if len(stem) <= 22 else "…" + stem[-21:]
+
+
+def draw_windows(drawn: Drawn, path: Path) -> None:
+    """Recorded, and simulated as it came and with the causes, in the log and channel that part most."""
+    found = drawn.found
+    rows = found.composed.rows
+    size = np.sqrt(rows.variance)
+    square = np.where(np.isfinite(found.plain.residual), (found.plain.residual / size) ** 2, 0.0)
+    key = rows.log * len(rows.channels) + rows.channel
+    log, channel = divmod(int(np.bincount(key, square).argmax()), len(rows.channels))
+    mine = (rows.log == log) & (rows.channel == channel)
+    t, window = rows.time[mine], rows.window[mine]
+    breaks = np.flatnonzero(np.diff(window)) + 1
+    unit = found.composed.simulator.channels[rows.channels[channel]].unit
+    before, after = _both_residuals(found)
+    label = "with the causes, held out" if found.shrinkage is not None else "with what was fitted"
+
+    def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan)
+
+    with canvas(path, height=4.2) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        observed = rows.observed[mine]
+        above.plot(t, observed, color="black", lw=1.2, label="recorded")
+        for residual, colour, name in ((before, RED, "model as it came"), (after, BLUE, label)):
+            above.plot(*split(observed - residual[mine]), color=colour, lw=0.8, label=name)
+            below.plot(*split(residual[mine]), color=colour, lw=0.8, label=name)
+        above.set_ylabel(f"{rows.channels[channel]} [{unit}]")
+        below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
+        below.axhline(0, color=GREY, lw=0.5)
+        above.legend(fontsize=6.5)
+        above.set_title(
+            f"{_short(found.composed.recordings[log].name)}: windows restarted from the recording"
+        )
+
+
+def _both_residuals(found: RobotDiagnosis) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals before and after, each log predicted from the others where that was done."""
+    far = found.shrinkage
+    return (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
+
+
+def draw_probabilities(drawn: Drawn, path: Path) -> None:
+    """Probabilities of the verdicts."""
+    ranked = sorted(drawn.body["probabilities"].items(), key=lambda item: item[1])[-BARS:]
+    with canvas(path, height=0.8 + 0.22 * len(ranked)) as figure:
+        axes = figure.add_subplot()
+        axes.barh([n for n, _ in ranked], [p for _, p in ranked], color=BLUE)
+        axes.set_xlim(0, 1)
+        axes.set_xlabel("probability")
+
+
+def draw_before_after(drawn: Drawn, path: Path) -> None:
+    """Root mean square residual by log of the channel with the largest gap, before and after, held out."""
+    found = drawn.found
+    rows = found.composed.rows
+    before, after = _both_residuals(found)
+    logs = [r.name for r in found.composed.recordings]
+    size = np.sqrt(rows.variance)
+    at = np.arange(len(logs))
+    with canvas(path, height=2.6) as figure:
+        axes = figure.add_subplot()
+        for place, residual, colour, name in (
+            (-0.2, before, RED, "before"),
+            (0.2, after, BLUE, "after"),
+        ):
+            each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
+            axes.bar(at + place, each, 0.4, color=colour, label=name)
+        axes.axhline(1, color=GREY, lw=0.8, ls="--")
+        axes.set_yscale("log")
+        axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
+        axes.set_ylabel("rms residual [sd of noise]")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+        axes.set_title("Held-out logs" if found.shrinkage is not None else "All logs")
