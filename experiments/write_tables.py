@@ -105,7 +105,6 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),
     ("docs/tables/special_cases.csv", "", ablation.table, "ablation"),
-    ("README.md", "alignment", table_speed.alignment, "bench"),
     ("docs/hmm.md", "hiro_network", hiro_network, "real"),
     ("docs/benchmarks.md", "alignment", table_speed.alignment, "bench"),
     ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),

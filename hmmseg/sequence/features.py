@@ -64,7 +64,7 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     for name in channels:
         if name not in trial.channels:
             raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")
-    start = float(trial.t[0] - 0.5 / trial.rate)  # a change lies anywhere between two samples
+    start = float(trial.t[0])
     num_cells = max(int(np.ceil((trial.t[-1] - start) / step * (1 - 1e-9))), 1)
     cell = np.minimum(((trial.t - start) / step).astype(int), num_cells - 1)
     means = np.full((num_cells, len(channels)), np.nan)
@@ -75,6 +75,14 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
         total = np.bincount(cell[finite], x[finite], minlength=num_cells)
         means[count > 0, j] = total[count > 0] / count[count > 0]
     return start + step * np.arange(num_cells + 1), means
+
+
+def _moving_average(x: np.ndarray, window: int) -> np.ndarray:
+    """Centred average over `window` cells along axis 0, shorter at the ends."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, 0)])
+    index = np.arange(len(x))
+    low, high = np.maximum(index - window // 2, 0), np.minimum(index + window // 2 + 1, len(x))
+    return (total[high] - total[low]) / (high - low)[:, None]
 
 
 def filled(x: np.ndarray) -> np.ndarray:
@@ -88,30 +96,10 @@ def filled(x: np.ndarray) -> np.ndarray:
     return out
 
 
-def local_slopes(x: np.ndarray, step: float, window: int) -> np.ndarray:
-    """Slope (num_cells, num_channels) of the straightest line through `window` cells that end at, lie around
-    or begin at each cell.
-
-    Around an abrupt change no line is straight, and the slope does not know of it beforehand: a centred
-    difference would begin half a window too early (edge-preserving filters: Kuwahara et al., 1976).
-    """
-    num_cells = len(x)
-    window = min(window, num_cells)
-    if window < 2:
-        return np.zeros_like(x)
-    lines = np.lib.stride_tricks.sliding_window_view(x, window, axis=0)
-    since = np.arange(window) - (window - 1) / 2
-    centred = lines - lines.mean(-1, keepdims=True)
-    slopes = centred @ since / (since**2).sum()
-    left = ((centred - slopes[..., None] * since) ** 2).sum(-1)
-    cell = np.arange(num_cells)
-    at = np.clip([cell - window + 1, cell - window // 2, cell], 0, num_cells - window)
-    chosen = np.take_along_axis(at[..., None], left[at].argmin(0)[None], 0)[0]
-    return np.take_along_axis(slopes, chosen, 0) / step
-
-
 def _raw(means: np.ndarray, step: float, window: int) -> np.ndarray:
-    slopes = local_slopes(filled(means), step, window)
+    slopes = np.zeros_like(means)
+    if len(means) > 1:
+        slopes = np.gradient(_moving_average(filled(means), window), step, axis=0)
     return np.hstack([means, np.where(np.isfinite(means), slopes, np.nan)])
 
 

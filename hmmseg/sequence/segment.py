@@ -19,7 +19,9 @@ from hmmseg.sequence.features import SequenceFeatures, features
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.labels import boundary_probabilities
 from hmmseg.sequence.model import SequenceModel, optional_states
-from hmmseg.sequence.places import Boundaries, places, together
+from hmmseg.sequence.places import Boundaries, near, places, together
+
+MAIN = 0.5  # chosen: least probability about a median for it to be the answer, not a time amid several places
 
 _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interval
 
@@ -92,7 +94,7 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
         median, sd, (low, high) = _boundary(
             data.edges, known.crossing[:, k - 1], first, last, scattered=bool(model.courses)
         )
-        if model.courses:  # of all places the one where this model has it, which is fitted on the fine grid
+        if model.courses and near(data.edges, known.crossing[:, k - 1], median) < MAIN:
             median = _boundary(data.edges, own[:, k - 1], first, last)[0]
         median = max(median, starts[-1][0])
         starts.append((median, sd, (min(low, median), max(high, median))))

@@ -41,13 +41,3 @@ EXPECTED = {
 
 def test_scikit_learns_own_checks():
     check_estimator(OrderedSegmenter(), expected_failed_checks=EXPECTED, on_skip=None)
-
-
-def test_every_state_is_predicted_however_short():
-    def sequence(k):
-        level = np.searchsorted([19.2, 19.4, 19.6], np.arange(1000) / 50, side="right")[:, None] * 3.0
-        return level + np.random.default_rng(k).normal(0, 0.2, (1000, 1))
-
-    Z = [sequence(k) for k in range(3)]
-    for states in OrderedSegmenter(4, rate=50).fit(Z).predict(Z):
-        assert np.unique(states, return_counts=True)[1].tolist() == [960, 10, 10, 20]
