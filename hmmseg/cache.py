@@ -19,9 +19,10 @@ import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:  # NumPy takes long to import, and light commands need none
+    import numpy as np
 
 MAGIC = b"hmmseg cache 1\n"
 OWN = ("hmmseg", "estimation", "simgap", "hmmseg_cli")  # packages whose dataclasses are read back
@@ -96,6 +97,8 @@ def keep_value(path: Path | None, value: Any) -> None:
 
     TypeError for any other.
     """
+    import numpy as np
+
     arrays: dict[str, np.ndarray] = {}
     tree = _flat(value, arrays, {})
     text = np.frombuffer(json.dumps(tree).encode(), np.uint8)
@@ -106,6 +109,8 @@ def keep_value(path: Path | None, value: Any) -> None:
 
 def kept_value(path: Path | None) -> Any:
     """The value kept under a path; None where there is none, or not as it was written."""
+    import numpy as np
+
     content = kept(path)
     if content is None or path is None:
         return None
@@ -119,6 +124,8 @@ def kept_value(path: Path | None) -> Any:
 
 def _flat(value: Any, arrays: dict[str, np.ndarray], seen: dict[int, str]) -> Any:
     """JSON of a value, its arrays put aside under names; one array met twice is kept once."""
+    import numpy as np
+
     kind: Any = type(value)
     if value is None or kind in (bool, int, float, str):
         return value

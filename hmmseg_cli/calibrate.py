@@ -12,8 +12,8 @@ from hmmseg_cli.console import (
     JsonOption,
     Output,
     QuietOption,
-    SeedOption,
     TrialsArgument,
+    UnusedSeed,
     check_folder,
     distinct_trials,
 )
@@ -33,7 +33,7 @@ def calibrate(
     map_file: MapOption,
     patch: PatchOption = None,
     json: JsonOption = None,
-    seed: SeedOption = 0,
+    seed: UnusedSeed = 0,
     quiet: QuietOption = False,
 ) -> None:
     """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these cannot tell."""

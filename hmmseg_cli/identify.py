@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from estimation.report import properties_table
 from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli.console import (
@@ -61,7 +60,7 @@ def run(
     description = read_task(task)
     if not isinstance(description, BlockTask):
         raise InputError(str(task), "a plain ordered task has no blocks to identify", "objects and moves")
-    from estimation.report import read_actual
+    from estimation.report import properties_table, read_actual
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
 
