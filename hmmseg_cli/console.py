@@ -440,12 +440,12 @@ def _sweep(where: Path) -> None:
         with contextlib.suppress(OSError):
             if folder.is_symlink() or time.time() - folder.stat().st_mtime < YOUNG:
                 continue
-            lock = folder / "lock"
-            if lock.exists():
-                with lock.open("r+") as file:
-                    if not _locked(file):
-                        continue
-            shutil.rmtree(folder, ignore_errors=True)
+            if not (lock := folder / "lock").exists():
+                folder.rmdir()  # where it is empty; what holds something without a lock is somebody else's
+                continue
+            with lock.open("r+") as file:
+                if _locked(file):
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _locked(file: Any) -> bool:

@@ -196,6 +196,8 @@ def test_what_a_killed_run_left_is_swept_by_the_next(lab, monkeypatch, tmp_path)
     dead.kill()
     dead.communicate()
     (where / "hmmseg-notes").mkdir()
+    (where / "hmmseg-theirs").mkdir()
+    (where / "hmmseg-theirs" / "thesis.txt").touch()
     for path in where.iterdir():
         os.utime(path, (time.time() - 3600,) * 2)
     monkeypatch.setattr(tempfile, "tempdir", str(where))
@@ -204,7 +206,7 @@ def test_what_a_killed_run_left_is_swept_by_the_next(lab, monkeypatch, tmp_path)
         assert mine.exists() and not folders[1].exists()
     assert alive2 and folders[0].exists()
     alive.communicate("\n", timeout=60)
-    assert sorted(p.name for p in where.iterdir()) == []
+    assert sorted(p.name for p in where.iterdir()) == ["hmmseg-theirs"]
 
 
 def test_without_a_temporary_folder_a_line_says_so(lab, monkeypatch, capsys):
