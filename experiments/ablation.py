@@ -57,7 +57,7 @@ SPECIAL: dict[str, tuple[Off, ...]] = {
     "disagreement of force and place": (("hmmseg.segmentation.changes._discrepancy", lambda *a: 0.0),),
     "slopes within grips": (("estimation.observations.slopes_within", lambda *a: {}),),
     "landing": (("estimation.observations.slope_of_landing", lambda *a: {}),),
-    "first push": (("estimation.pad_slopes.first_push", lambda t, net, carry, touch: touch),),
+    "first push": (("estimation.pads.first_push", lambda t, net, carry, touch: touch),),
 }
 
 

@@ -175,7 +175,8 @@ def test_plain_tasks_and_block_tasks_are_kept_apart(tmp_path, capsys):
     assert "no blocks to identify" in capsys.readouterr().err
     assert main(["fit", trial, "--task", str(NONE / "task.toml"), "--model", str(tmp_path / "m.npz")]) == 2
     assert "needs no fitting" in capsys.readouterr().err
-    assert main(["segment", trial, "--task", str(NONE / "task.toml")]) == 2
+    alone = shutil.copy(trial, tmp_path)  # no rig.toml lies beside it
+    assert main(["segment", alone, "--task", str(NONE / "task.toml")]) == 2
     assert "--rig" in capsys.readouterr().err
 
 
