@@ -62,7 +62,7 @@ def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segm
 def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior) -> Boundaries:
     """Of all boundaries: from the model itself where labels taught it, else from all its courses."""
     if not model.courses:
-        crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1]
+        crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1].copy()
         if model.detectors is not None:
             for b, jitter in enumerate(model.detectors.jitter):
                 if jitter > 0:
