@@ -173,7 +173,9 @@ def draw(document: dict) -> None:
             axes.bar([c + 0.2 * (i - 1.5) for c, _ in at], [r for _, r in at], 0.18, color=colour, label=name)
         axes.axhline(1.0, color="k", linewidth=0.6)
         axes.set(yscale="log", ylabel="processor time over hmmseg's inside jit", xticks=range(len(times)))
-        axes.set_xticklabels([title.replace(": ", ":\n") for title in document["cases"]])
+        axes.set_xticklabels(
+            [title.replace(": ", ":\n").replace(", ", "\n", 1) for title in document["cases"]]
+        )
         axes.legend(ncols=4, loc="upper left", bbox_to_anchor=(0.0, 1.18), frameon=False)
 
 

@@ -1,7 +1,7 @@
 """How what runs once for every reading is compiled: by numba, kept in the user's cache folder.
 
-A reading is a few thousand scalar steps with branches, which a jitted JAX function would pay for with a
-call per reading that alone takes as long (docs/watch.md).
+A reading is a few thousand scalar steps with branches. As a jitted JAX function it would cost a call for
+each reading, and an empty call with the table of hypotheses takes about as long as a whole reading here.
 """
 
 from __future__ import annotations
