@@ -71,7 +71,7 @@ def viterbi(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transition: 
 
 
 def _start(*arrays: ArrayLike) -> tuple[np.ndarray, Iterator[tuple[np.ndarray, np.int32]], np.ndarray]:
-    """Weights (num_states,) at the first row; further rows, in padded blocks with their numbers; transitions."""
+    """Weights (num_states,) at the first row; further rows, in padded blocks, and their numbers."""
     ll, initial, transition = (np.asarray(a, dtype=np.float64) for a in arrays)
     num_states = ll.shape[-1]
     expected = ((len(ll), num_states), (num_states,), (num_states, num_states))
