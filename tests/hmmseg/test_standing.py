@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import FORCE_CHANNELS, read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 from hmmseg.segmentation.free_contacts import astride, standing
 
