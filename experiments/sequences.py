@@ -6,7 +6,7 @@
 `check` segments drawn worlds (experiments/sequence_worlds.py), and published snap assemblies and a simulated
 arm's wrist signals where their folders are given: without labels; with the one boundary that the tool asks
 for; with one labelled trial. Writes experiments/results/sequences.json. `learn` finds what weighs readings
-(hmmseg.sequence.naming.Weighing) by maximum likelihood on other drawn worlds.
+(hmmseg.sequence.courses.Weighing) by maximum likelihood on other drawn worlds.
 """
 
 from __future__ import annotations

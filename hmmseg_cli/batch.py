@@ -82,7 +82,7 @@ def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
 
 def segment_each(paths: Sequence[Path], task: Path, rig: Path) -> list[Segmented]:
     """Segmentations of recordings that have nothing to do with each other; runs in a worker."""
-    from hmmseg.io.trial import read_trial
+    from hmmseg.hand.read import read_trial
     from hmmseg.segmentation.align import segment
 
     description, hand = _lab(task, rig)

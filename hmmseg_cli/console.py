@@ -313,7 +313,7 @@ def _keys(path: Path | None) -> set[str]:
 
 def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any = None) -> list[Any]:
     """The trials of a command; what is unlikely about them is warned of."""
-    from hmmseg.io.trial import read_trial
+    from hmmseg.hand.read import read_trial
 
     found = [read_trial(path, rig, task) for path in paths]
     if rig is not None and rig.effects and out.command != "simulate":

@@ -45,7 +45,7 @@ def fit(
                              "a task with `sequence`")  # fmt: skip
         from hmmseg.sequence.fit import fit_sequence
         from hmmseg.sequence.model import save_model
-        from hmmseg.sequence.places import SURE
+        from hmmseg.sequence.segment import SURE
 
         hand = None
         if rig is not None:

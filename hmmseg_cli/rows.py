@@ -33,7 +33,7 @@ class Rows:
     """
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
-        from hmmseg.io.columns import Column, source_of
+        from hmmseg.io.units import Column, source_of
 
         self._stream, self._number = stream, 0
         header = _text(self._line()).strip()

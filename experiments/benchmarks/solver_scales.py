@@ -14,9 +14,9 @@ Solve = Callable[[], tuple[list[float], list[np.ndarray]]]
 
 def aligned_trials(folder: Path):
     """The trials of a folder, aligned."""
+    from hmmseg.hand.read import read_trial
     from hmmseg.io.rig import read_rig
     from hmmseg.io.task import read_task
-    from hmmseg.io.trial import read_trial
     from hmmseg.segmentation.align import align
 
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")

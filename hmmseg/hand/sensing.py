@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmmseg.hand.plausibility import Finding, all_changed, check_forces, scale_to_velocity
 from hmmseg.hand.tool import Tool
-from hmmseg.io.plausibility import Finding, all_changed, check_forces, position_pairs, scale_to_velocity
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
-from hmmseg.io.trial import Trial
+from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
 from hmmseg.robust import robust_sd, white_sd

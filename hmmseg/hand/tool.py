@@ -22,8 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.gripper import AXES, Gripper, direction
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE, TAIL
 from hmmseg.robust import bridged, robust_sd, white_sd

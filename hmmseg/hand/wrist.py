@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmmseg.contact.decompose import HIDDEN_GRIP
 from hmmseg.errors import InputError
+from hmmseg.hand.plausibility import REACH, Finding, all_changed, changed, length_unit
 from hmmseg.hand.sensing import tool_warnings
 from hmmseg.hand.signals import grouped
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
-from hmmseg.io.gripper import AXES, Gripper, direction
-from hmmseg.io.plausibility import REACH, Finding, all_changed, changed, length_unit
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import MOVED, SURE
 from hmmseg.robust import bridged, robust_sd, white_sd
@@ -463,12 +463,6 @@ SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a tou
 CLIPPED = 2.0  # chosen: noise scales
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is told
 NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
-HIDDEN_GRIP = (
-    "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
-    "[gripper] would tell"
-)
-
-
 HALVES = (
     "columns fx1, fx2 and fy1, fy2 are the same in every sample, half of a wrist's force each: the grip is "
     "read from the fingers' distance instead"

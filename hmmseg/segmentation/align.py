@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
+from hmmseg.hand.read import LongRecording
 from hmmseg.hand.signals import Signals, task_space, timely, with_heights
-from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial

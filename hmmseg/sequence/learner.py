@@ -11,16 +11,17 @@ import numpy as np
 from hmmseg.hmm import Chain
 from hmmseg.hmm.learn import em, expectation
 from hmmseg.hmm.results import AlignmentPosterior
-from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import (
+    Detectors,
     StudentEmissions,
+    Transitions,
     from_weights,
     independent_share,
     residuals,
+    transitions,
     update,
 )
 from hmmseg.sequence.model import jumps, ratios_of
-from hmmseg.sequence.transitions import Transitions, transitions
 
 FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
 STEPS_PER_FLOOR = 4  # numerics: of EM

@@ -17,9 +17,9 @@ from websockets.sync.client import connect
 from estimation.identification import identify_aligned
 from experiments.play_session import browser, find_browser, save, served, stack
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 from hmmseg_cli.main import main
 from hmmseg_cli.play import diagnosed
