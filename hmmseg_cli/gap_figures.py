@@ -12,7 +12,7 @@ import numpy as np
 from hmmseg.io.rig import FORCE_CHANNELS
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.generic.features import SLOW, bin_edges
 from simgap.generic.locate import both_variances

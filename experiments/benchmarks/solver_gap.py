@@ -15,20 +15,19 @@ COLUMNS = 16  # that optimistix's one program has room for
 
 def gap_problem(folder: Path):
     """The problem of the gap's candidates, and the start of each."""
-    from simgap.gap.fit import Start
     from simgap.gap.frame import build
-    from simgap.gap.problem import neutral, problem
+    from simgap.gap.problem import Start, neutral, problem
 
     given = problem(build(aligned_trials(folder)))
     return given, [Start(effects, neutral(given)) for effects in SETS]
 
 
 def gap_ours(folder: Path) -> Solve:
-    """Levenberg-Marquardt of simgap.gap.fit: differences of rows that one program evaluates."""
+    """Levenberg-Marquardt of simgap.gap.problem: differences of rows that one program evaluates."""
     given, starts = gap_problem(folder)
 
     def solve() -> tuple[list[float], list[np.ndarray]]:
-        from simgap.gap.fit import fit
+        from simgap.gap.problem import fit
 
         found = [fit(given, start) for start in starts]
         return [f.cost for f in found], [f.u[f.columns] for f in found]
@@ -66,7 +65,7 @@ def gap_scipy(folder: Path) -> Solve:
     def one(start) -> tuple[float, np.ndarray]:
         from scipy.optimize import least_squares
 
-        from simgap.gap.evaluation import evaluated
+        from simgap.gap.problem import evaluated
 
         mine, low, high, begin = _place(given, start)
         blocks, z, known = _blocks(given, start), given.num_properties, {}
@@ -121,7 +120,7 @@ def gap_optimistix(folder: Path) -> Solve:
         import jax.numpy as jnp
         import optimistix
 
-        from simgap.gap.evaluation import STEP, corrected, whitened
+        from simgap.gap.problem import STEP, corrected, whitened
 
         (world, arrays, w), z = given.constants, given.num_properties
 
@@ -158,7 +157,7 @@ def gap_optimistix(folder: Path) -> Solve:
         import jax
         import jax.numpy as jnp
 
-        from simgap.gap.evaluation import _on, evaluated
+        from simgap.gap.problem import _on, evaluated
 
         mine, low, high, begin = _place(given, start)
         blocks = _blocks(given, start)

@@ -34,8 +34,8 @@ def quadratics(folder: Path) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, n
     """matrix, pull, low, high of every pair of candidates of a gap, groups counting alike."""
     from simgap.attribution.posterior import forms, quadratic_forms
     from simgap.gap.assemble import gap_of
-    from simgap.gap.candidates import best_fit, candidate_names, shifting
-    from simgap.gap.fit import fit
+    from simgap.gap.problem import fit
+    from simgap.gap.search import best_fit, candidate_names, shifting
 
     given, starts = gap_problem(folder)
     healthy = fit(given, starts[0])

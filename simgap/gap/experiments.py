@@ -16,16 +16,13 @@ from estimation.report import Actual
 from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.effects import catalogue, forms_of, name_of
-from simgap.gap.candidates import best_fit
-from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
-from simgap.gap.problem import neutral, problem
-from simgap.gap.search import Search
-from simgap.gap.synthetic import performed, recorded
-from simgap.gap.twins import blocks_of
+from simgap.gap.problem import Start, fit, neutral, problem
+from simgap.gap.search import Search, best_fit
+from simgap.gap.twins import blocks_of, performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
-from simgap.world.writing import task_table
+from simgap.world.simulate import task_table
 
 TRIALS = 2  # numerics: that are simulated: where contacts fall between samples is chance
 ENOUGH = 5.0  # physics: a definition: nats, the detection floor

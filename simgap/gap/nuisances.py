@@ -13,10 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import gradient, tips
-from simgap.gap.evaluation import derivatives
-from simgap.gap.marginal import Nuisances
-from simgap.gap.problem import Problem, free_of, neutral, slots
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
+from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, slots
 from simgap.phases import Phase
 
 PAD = 5e-3  # prior: m; half a pad's length: how hard it turns follows from that and its stiffness
@@ -29,7 +27,7 @@ def with_nuisances(given: Problem) -> Problem:
     """The problem with its nuisances, linear about no effect at all.
 
     How many there are depends on trials, grips and rig alone: a column of zeros stays, for with a little more
-    noise on the recordings it is none (`simgap.gap.redrawn_noise`).
+    noise on the recordings it is none (`simgap.gap.assemble`).
     """
     columns = [*_admitted(given), *_late_rates(given), *_turning(given), *_settling(given)]
     return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))

@@ -13,11 +13,8 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.model import SequenceModel
-from simgap.attribution.detection import Detection
-from simgap.attribution.document import entries
-from simgap.attribution.search import MOST
-from simgap.attribution.shares import Shares
-from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known
+from simgap.attribution.search import MOST, Detection
+from simgap.attribution.verdict import ALARM, Explanation, Shares, acting, conclude, entries, known
 from simgap.generic.aligned import Ensembles, align
 from simgap.generic.block_trials import block_ensembles
 from simgap.generic.effects import EFFECTS, Scene, scene

@@ -2,7 +2,7 @@
 
 Simulated forces differ from real ones in their whole course, and the best set has an effect for every way in
 which they do. A bias of the sensor is the same bias in every subtask; what takes another value in each is an
-imitation (random effects by subtask, as in `simgap.attribution.invariance`). And a cause takes most of the
+imitation (random effects by subtask, as in `simgap.attribution.heldout`). And a cause takes most of the
 gap where it acts, whatever is left elsewhere, which is told as the remainder.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.invariance import OTHER, WANDER
+from simgap.attribution.heldout import OTHER, WANDER
 from simgap.attribution.verdict import MOST
 from simgap.generic.effects import EFFECTS, Scene
 from simgap.generic.features import SLOW

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from simgap.attribution.document import entries, rows
 from simgap.attribution.posterior import Forms, Model, coordinates, fitted
+from simgap.attribution.verdict import entries, rows
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.explained import SEEN
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from simgap.attribution.detection import statistic
 from simgap.attribution.posterior import Forms, fitted, forms
+from simgap.attribution.search import statistic
 from simgap.progress import Progress, silent
 from simgap.robot_effects import effects_of
 from simgap.robot_effects.base import RobotEffect

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.invariance import residual_left
+from simgap.attribution.heldout import residual_left
 from simgap.attribution.posterior import Forms, fitted
 from simgap.attribution.verdict import Verdict
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.shares import Shares
+from simgap.attribution.verdict import Shares
 from simgap.robots.fit import moved_to
 from simgap.robots.gap import fitted_along
 from simgap.robots.linear import Linear, base_at, linearise

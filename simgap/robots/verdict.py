@@ -7,14 +7,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simgap.attribution.cells import Cell, significant
-from simgap.attribution.detection import Detection, detected, statistic
-from simgap.attribution.findings import Remainder
-from simgap.attribution.invariance import residual_left
+from simgap.attribution.attribute import Remainder
+from simgap.attribution.heldout import residual_left
 from simgap.attribution.posterior import Forms, Model, fitted
-from simgap.attribution.search import weights
-from simgap.attribution.shares import Shares
-from simgap.attribution.verdict import LEAST, MOST, Explanation, Verdict, acting, conclude, known
+from simgap.attribution.search import Detection, detected, statistic, weights
+from simgap.attribution.verdict import (
+    LEAST,
+    MOST,
+    Cell,
+    Explanation,
+    Shares,
+    Verdict,
+    acting,
+    conclude,
+    known,
+    significant,
+)
 from simgap.robots.explained import Explained
 from simgap.robots.scatter import scattering
 from simgap.robots.stand_ins import StandIn
