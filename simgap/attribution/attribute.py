@@ -152,6 +152,7 @@ def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap
 
 
 DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
+SPREAD = 0.9  # numerics: share of a parameter's squares in one part from which on it acts in no other
 EXAMINED = 6  # numerics: sets of which it is asked whether they are the cause
 
 
@@ -313,7 +314,7 @@ def _examined(
     """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
-    same = {j: invariance(f, model, j, f.gap.rows.trial) for j in effects}
+    same = {j: _same(f, model, j) for j in effects}
     part = explained.each.mean(0) if effects else np.zeros(0)
     least = LEAST * float(part.sum())
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
@@ -336,6 +337,17 @@ def _examined(
     share = 1 - explained.remainder if far is None else far.fraction
     sure = known(left, share, factors) if causes else 0.0
     return _Examined(effects, model, explained, same, causes, sure)
+
+
+def _same(f: Forms, model: Model, effect: int) -> Invariance:
+    """Whether an effect is the same in all trials, and where that is asked, in all parts: what says less."""
+    gap = f.gap
+    found = [invariance(f, model, effect, gap.rows.trial)]
+    by = [np.bincount(gap.rows.part, push**2) for push in gap.candidates[effect].jacobian.T]
+    if gap.parts_alike and any(each.max() < SPREAD * each.sum() for each in by):
+        by_part = invariance(f, model, effect, gap.rows.part)
+        found = [by_part] if np.isnan(found[0].wander) else [*found, by_part]
+    return min(found, key=lambda one: one.log_bayes_factor)
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:

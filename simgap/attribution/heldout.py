@@ -119,8 +119,9 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
     say of it differs by more: that of the mean of the random-effects model, over what it wanders by."""
     found = _parts(f, model, effect, part)
     out = np.zeros(found.loose.size)
-    if len(found.bend) < 2 or not (~found.free).any():
-        return out
+    says = np.trace(found.bend, axis1=1, axis2=2)
+    if (says > SINGULAR * says.max(initial=0.0)).sum() < 2 or not (~found.free).any():
+        return out  # one part that says anything differs from no other
     score, scatter = found.score(), []
     for i, wander in enumerate(WANDER):
         prior, one = found.prior(wander), np.eye(found.usual.size)
