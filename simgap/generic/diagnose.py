@@ -64,6 +64,8 @@ NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
 STEP = 1e-3  # numerics: of a usual size, for derivatives by differences
 STEPS = 12  # numerics: of a fit, at most
 CLOSE = 0.02  # numerics: nats
+AT_END = 0.02  # numerics: share of a range within which a descent that stays inside has run to its end
+NEUTRAL = 1e-9  # numerics: a coordinate that has not moved
 APART = 1e4  # numerics: s; powers have no order in time
 DURATIONS = "duration"
 POWER = ", power"
@@ -339,20 +341,33 @@ def fit(given: Scene, white: Sequence[Block], difference: np.ndarray, effects: S
     found, shift, slopes = [], np.zeros(difference.size), []
     for block in white:
         mine = [p for name in effects for p in parameters(given, name, block.channel)]
+        there, starts = np.linalg.inv(block.covariance), range(max(len(EFFECTS[n].starts) for n in effects))
+        while mine:
+            target = difference[block.index]
+            descents = [_descended(given, block, there, target, mine, _start(mine, j)) for j in starts]
+            _, u, moved, push = min(descents, key=lambda d: d[0])
+            inside = [not _ended(p, v) for p, v in zip(mine, u, strict=True)]
+            if all(inside):
+                break
+            mine = [p for p, kept in zip(mine, inside, strict=True) if kept]
         if not mine:
             continue
-        there = np.linalg.inv(block.covariance)
-        tries = max(len(EFFECTS[name].starts) for name in effects)
-        descents = [_descended(given, block, there, difference[block.index], mine, _start(mine, j))
-                    for j in range(tries)]  # fmt: skip
-        _, u, moved, push = min(descents, key=lambda d: d[0])
         shift[block.index] = moved
         wide = np.zeros((difference.size, len(mine)))
         wide[block.index] = push
         slopes.append(wide)
         found.append((mine, u))
     every = tuple(p for mine, _ in found for p in mine)
-    return Fit(every, np.concatenate([u for _, u in found]), shift, np.concatenate(slopes, 1))
+    u = np.concatenate([np.zeros(0), *(u for _, u in found)])
+    return Fit(every, u, shift, np.concatenate([np.zeros((difference.size, 0)), *slopes], 1))
+
+
+def _ended(p: Parameter, value: float) -> bool:
+    """Whether a coordinate ran to the end of its range: a filter of half a second stands for a course that
+    differs in another way, and is none of this channel's."""
+    change = EFFECTS[p.effect]
+    end = change.low if value < 0 else change.high
+    return bool(abs(value) > NEUTRAL and abs(value - end) < AT_END * abs(end))
 
 
 def _start(mine: Sequence[Parameter], which: int) -> np.ndarray:
@@ -396,6 +411,8 @@ def _descended(given, block, there, target, mine, u):
 
 def _candidates(white: Sequence[Block], found: Fit, count: int) -> list[Candidate]:
     """One effect in all channels (or subtasks, of durations), and in that alone in which it explains most."""
+    if not found.parameters:
+        return []
     every = np.ones(found.u.size, bool)
     parts = [np.array([(p.channel, p.place * (p.channel < 0)) == one for p in found.parameters])
              for one in {(p.channel, p.place * (p.channel < 0)) for p in found.parameters}]  # fmt: skip
