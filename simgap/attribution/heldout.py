@@ -21,7 +21,7 @@ from simgap.bounded import least
 
 WANDER = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5])  # prior: shares of the parameters
 OTHER = 0.5  # chosen: wander from which on it is not one cause
-SINGULAR = 1e-12  # numerics: share of the largest eigenvalue below which nothing is told
+SINGULAR = 1e-12  # numerics: share of the largest eigenvalue below which a direction is unknown
 # cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
 POSITIVE = float(np.log(3.0))
 
@@ -128,10 +128,10 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
         inner = np.linalg.inv(one + found.bend @ prior)
         bend, pull = (inner @ found.bend).sum(0), np.einsum("pij,pj->i", inner, found.pull)
         size, axes = np.linalg.eigh(bend)
-        told = size > SINGULAR * size.max()
-        covariance = (axes[:, told] / size[told]) @ axes[:, told].T
+        known = size > SINGULAR * size.max()
+        covariance = (axes[:, known] / size[known]) @ axes[:, known].T
         # The mean is known from the same parts (restricted likelihood: Patterson & Thompson, Biometrika 58).
-        score[i] += 0.5 * float(pull @ covariance @ pull - np.log(size[told]).sum())
+        score[i] += 0.5 * float(pull @ covariance @ pull - np.log(size[known]).sum())
         scatter.append(np.diag(covariance))
     weight = np.exp(score - np.logaddexp.reduce(score))
     out[found.loose] = weight @ np.maximum(np.stack(scatter) - scatter[0], 0.0)

@@ -1,4 +1,4 @@
-"""What an attribution is asked: whitened residuals, nuisances, and candidate effects about their best fits.
+"""The input of an attribution: whitened residuals, nuisances, and candidate effects about their best fits.
 
     residual = nuisance @ z + sum over acting effects shift_j(theta_j) + background + noise
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.fft import dct
 
-BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are told apart
+BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are distinguished
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Rows:
     """What each of n residuals is: indices of its trial, channel and part, and its time [s].
 
     A part is a subtask, or any stretch of a trial. Rows of one cell (a channel in a part of a trial) are in
-    the order of time. `bands` [Hz]: lower edges of the frequency bands that are told apart. `sd` (n,): the
+    the order of time. `bands` [Hz]: lower edges of the frequency bands that are distinguished. `sd` (n,): the
     noise's in the cosine coefficients of the cells, one where it is not given; `shape` (n,): what of it white
     noise of the sensors has by itself, their level and colour left out.
     """

@@ -259,7 +259,7 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
     }
 
 
-STAGES = 12  # look: that `progress` is told of, at most
+STAGES = 12  # look: that `progress` reports, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 
 
