@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -175,6 +176,15 @@ class HowFar:
     fraction: float
     interval_90: tuple[float, float]
     score: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The document's entry `shrinkage`."""
+        ends = [x if np.isfinite(x) else None for x in self.interval_90]
+        return {
+            "evaluated_on": "held-out trials", "before": self.before, "after": self.after,
+            "noise_floor": self.noise_floor, "fraction": self.fraction, "interval_90": ends,
+            "flexible_ceiling": None,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from simgap.attribution.attribute import Attribution, attribute
 from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.attribution.search import detected, sought, statistic
-from simgap.attribution.verdict import ALARM, entries, rows
+from simgap.attribution.verdict import ALARM, entries, log_odds, rows
 from simgap.bounded import least
 from simgap.generic.effects import (
     EFFECTS,
@@ -479,20 +479,13 @@ def _document(
     lay, far, rest = given.layout, verdict.how_far, verdict.remainder
     best = next((m for m in verdict.models if m.effects), verdict.models[0])
     leading = verdict.causes or tuple(gap.candidates[j].name for j in best.effects)
-    effects = {n: _described(given, gap, verdict, [n]) for n in verdict.effects}
+    effects = {n: _described(given, verdict, [n]) for n in verdict.effects}
     if len(verdict.causes) > 1:
-        effects["+".join(verdict.causes)] = _described(given, gap, verdict, verdict.causes)
+        effects["+".join(verdict.causes)] = _described(given, verdict, verdict.causes)
     attribution = {n: (e.probability, e.share, e.share_90) for n, e in verdict.effects.items()}
     body = entries(verdict, verdict.detection, (rest.share, rest.p_value, _cells(lay, rest.where)),
                    attribution, _cells(lay, verdict.where))  # fmt: skip
-    shrinkage = None
-    if far is not None:
-        ends = [x if np.isfinite(x) else None for x in far.interval_90]
-        shrinkage = {
-            "evaluated_on": "held-out trials", "before": far.before, "after": far.after,
-            "noise_floor": far.noise_floor, "fraction": far.fraction, "interval_90": ends,
-            "flexible_ceiling": None,
-        }  # fmt: skip
+    shrinkage = None if far is None else far.to_json()
     body |= {"effects": effects, "shrinkage": shrinkage, "next_experiment": None}
     warnings = [*lay.ensembles.warnings]
     if len(real) == 1:
@@ -522,15 +515,14 @@ def _cells(lay: Layout, found: Sequence[Any]) -> list[dict[str, Any]]:
     return out
 
 
-def _described(given: Scene, gap: Gap, verdict: Attribution, names: Sequence[str]) -> dict[str, Any]:
+def _described(given: Scene, verdict: Attribution, names: Sequence[str]) -> dict[str, Any]:
     """Parameters and evidence of some effects."""
-    out, chance = dict[str, Any](), 1.0
+    out = dict[str, Any]()
     for name in names:
-        e = verdict.effects[name]
-        chance = min(chance, float(np.clip(e.probability, 1e-12, 1 - 1e-12)))
         prefix = f"{name}." if len(names) > 1 else ""
-        out |= {prefix + k: v for k, v in _parameters(given, name, e.parameters).items()}
-    return {"parameters": out, "log_evidence": float(np.log(chance / (1 - chance))), "property_shift": {},
+        out |= {prefix + k: v for k, v in _parameters(given, name, verdict.effects[name].parameters).items()}
+    odds = log_odds(verdict.effects[n].probability for n in names)
+    return {"parameters": out, "log_evidence": odds, "property_shift": {},
             "heldout_score": None if len(names) < 2 or verdict.how_far is None else verdict.how_far.score,
             }  # fmt: skip
 
