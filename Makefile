@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz
+.PHONY: oldest newest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -104,6 +104,10 @@ gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what the
 gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn anew (build/gap_drawn); fills docs/gap_results.md
 	$(BIN)/python -m experiments.blind_check open --cases 36 --tiers healthy single --seed 519083 --out build/gap_drawn
 	$(BIN)/python -m experiments.gap_drawn build/gap_drawn --seed 519083
+	$(BIN)/python -m experiments.write_tables
+
+gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in the folder LABS; fills docs/gap_results.md
+	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
 	$(BIN)/python -m experiments.write_tables
 
 gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md

@@ -101,6 +101,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
     ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
+    ("docs/gap_results.md", "labs", gap_drawn.labs_table, "gap-labs"),
     ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),

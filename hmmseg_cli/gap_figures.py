@@ -14,8 +14,7 @@ from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.frame import CHANNELS
 from simgap.generic.diagnose import GenericDiagnosis
-from simgap.generic.features import SLOW, bin_edges
-from simgap.generic.locate import both_variances
+from simgap.generic.trials import SLOW, bin_edges
 from simgap.robots.diagnose import RobotDiagnosis
 
 LABELS = {
@@ -90,9 +89,9 @@ def draw_signal(found: Diagnosis, path: Path) -> None:
 def draw_generic(found: GenericDiagnosis, path: Path) -> None:
     """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
     lay = found.scene.layout
-    slow = [k for k, cell in enumerate(lay.cells) if cell[0] >= 0 and lay.kind[lay.cell == k][0] == SLOW]
-    cell = max(slow, key=lambda k: found.located.z[k])
-    channel, worst = lay.cells[cell][:2]
+    excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
+    courses = [(c, k) for c in range(len(lay.ensembles.channels)) for k in range(len(lay.ensembles.subtasks))]
+    channel, worst = max(courses, key=lambda cell: excess[lay.where(SLOW, *cell)].mean())
     index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
     ends = found.scene.edges
     edges = [bin_edges(lay, ends[k], ends[k + 1], k) for k in range(ends.size - 1)]
@@ -103,14 +102,11 @@ def draw_generic(found: GenericDiagnosis, path: Path) -> None:
         for rows, colour, label in ((real, RED, "real"), (sim, BLUE, "simulated")):
             above.plot(t, rows.T, color=colour, lw=0.5, alpha=0.35)
             above.plot(t, rows.mean(0), color=colour, lw=1.4, label=label)
-        moved = sim.mean(0) + found.leading.shift[index]
-        above.plot(
-            t, moved, color="black", lw=1, ls="--", label=f"simulated + {' + '.join(found.leading.effects)}"
-        )
+        moved = sim.mean(0) + found.shift[index]
+        above.plot(t, moved, color="black", lw=1, ls="--", label=f"simulated + {' + '.join(found.leading)}")
         above.legend(fontsize=6.5)
         above.set_ylabel(lay.ensembles.channels[channel])
-        a, b = both_variances(lay, found.real, found.sim)
-        sd = np.sqrt(a + b / len(found.sim))[index]
+        sd = np.sqrt(found.variance[index])
         below.plot(t, (real.mean(0) - sim.mean(0)) / sd, ".-", color=RED, ms=3, lw=0.6, label="before")
         below.plot(t, (real.mean(0) - moved) / sd, ".-", color=BLUE, ms=3, lw=0.6, label="after")
         below.set_yscale("symlog", linthresh=3)

@@ -83,7 +83,7 @@ class SmallGap:
 
 @dataclass(frozen=True)
 class Attribution(Verdict):
-    """The verdict, and everything found beside it; see the fields' own classes.
+    """The verdict, with everything else that was found; see the fields' own classes.
 
     `left` (n,): residual that the causes leave, `before` (n,): with nuisances alone, both as cosines of each
     cell.
@@ -152,7 +152,8 @@ def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap
 
 
 DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
-EXAMINED = 6  # numerics: sets of which it is asked whether they are the cause
+SPREAD = 0.9  # numerics: share of a parameter's squares in one part from which on it acts in no other
+EXAMINED = 6  # numerics: sets that are examined for being the cause
 
 
 def attribute(
@@ -313,7 +314,7 @@ def _examined(
     """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
-    same = {j: invariance(f, model, j, f.gap.rows.trial) for j in effects}
+    same = {j: _same(f, model, j) for j in effects}
     part = explained.each.mean(0) if effects else np.zeros(0)
     least = LEAST * float(part.sum())
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
@@ -338,6 +339,17 @@ def _examined(
     return _Examined(effects, model, explained, same, causes, sure)
 
 
+def _same(f: Forms, model: Model, effect: int) -> Invariance:
+    """Whether an effect is the same in all trials, and of `parts_alike` in all parts: the weaker evidence."""
+    gap = f.gap
+    found = [invariance(f, model, effect, gap.rows.trial)]
+    by = [np.bincount(gap.rows.part, push**2) for push in gap.candidates[effect].jacobian.T]
+    if gap.parts_alike and any(each.max() < SPREAD * each.sum() for each in by):
+        by_part = invariance(f, model, effect, gap.rows.part)
+        found = [by_part] if np.isnan(found[0].wander) else [*found, by_part]
+    return min(found, key=lambda one: one.log_bayes_factor)
+
+
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     """Those causes without which trials that took no part are predicted worse, taken out one by one."""
     while causes:
@@ -350,7 +362,7 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _matters(f: Forms, model: Model, effect: int) -> bool:
-    """Whether an effect's own deviation matters, however little it shifts beside others."""
+    """Whether an effect's own deviation matters, however little it shifts compared with others."""
     c, own = f.gap.candidates[effect], coordinates(f, model.effects)[effect]
     return c.least is not None and bool((np.abs(c.scale * model.x[own]) >= c.least).any())
 
@@ -391,7 +403,7 @@ def _effects(
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
         same = None if found is None else found.invariance[j]
-        # Of what is in no set that was asked, parts are not compared.
+        # Parts are compared for effects of the sets that were examined alone.
         wide = sd if found is None else np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,

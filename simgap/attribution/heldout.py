@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -21,7 +22,7 @@ from simgap.bounded import least
 
 WANDER = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5])  # prior: shares of the parameters
 OTHER = 0.5  # chosen: wander from which on it is not one cause
-SINGULAR = 1e-12  # numerics: share of the largest eigenvalue below which nothing is told
+SINGULAR = 1e-12  # numerics: share of the largest eigenvalue below which a direction is unknown
 # cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
 POSITIVE = float(np.log(3.0))
 
@@ -119,18 +120,19 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
     say of it differs by more: that of the mean of the random-effects model, over what it wanders by."""
     found = _parts(f, model, effect, part)
     out = np.zeros(found.loose.size)
-    if len(found.bend) < 2 or not (~found.free).any():
-        return out
+    says = np.trace(found.bend, axis1=1, axis2=2)
+    if (says > SINGULAR * says.max(initial=0.0)).sum() < 2 or not (~found.free).any():
+        return out  # one part that says anything differs from no other
     score, scatter = found.score(), []
     for i, wander in enumerate(WANDER):
         prior, one = found.prior(wander), np.eye(found.usual.size)
         inner = np.linalg.inv(one + found.bend @ prior)
         bend, pull = (inner @ found.bend).sum(0), np.einsum("pij,pj->i", inner, found.pull)
         size, axes = np.linalg.eigh(bend)
-        told = size > SINGULAR * size.max()
-        covariance = (axes[:, told] / size[told]) @ axes[:, told].T
+        known = size > SINGULAR * size.max()
+        covariance = (axes[:, known] / size[known]) @ axes[:, known].T
         # The mean is known from the same parts (restricted likelihood: Patterson & Thompson, Biometrika 58).
-        score[i] += 0.5 * float(pull @ covariance @ pull - np.log(size[told]).sum())
+        score[i] += 0.5 * float(pull @ covariance @ pull - np.log(size[known]).sum())
         scatter.append(np.diag(covariance))
     weight = np.exp(score - np.logaddexp.reduce(score))
     out[found.loose] = weight @ np.maximum(np.stack(scatter) - scatter[0], 0.0)
@@ -174,6 +176,15 @@ class HowFar:
     fraction: float
     interval_90: tuple[float, float]
     score: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The document's entry `shrinkage`."""
+        ends = [x if np.isfinite(x) else None for x in self.interval_90]
+        return {
+            "evaluated_on": "held-out trials", "before": self.before, "after": self.after,
+            "noise_floor": self.noise_floor, "fraction": self.fraction, "interval_90": ends,
+            "flexible_ceiling": None,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -127,8 +127,12 @@ def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
     slopes[[0, *(mine[0] for mine in gap.own_columns)]] = False
     out[:, slopes[:, None] & slopes] = 0.0
     out[:, 0, 0] = 0.0
-    turn = gap.to_constant
-    return np.einsum("ia,gij,jb->gab", turn, out, turn, optimize=True)
+    turn = gap.to_constant  # differs from one in columns of shifts alone
+    shifts = [mine[0] for mine in gap.own_columns]
+    turned = turn[:, shifts]
+    out[:, :, shifts] = out @ turned
+    out[:, shifts] = turned.T @ out
+    return out
 
 
 STEPS = 30  # numerics: of an iteration, at most

@@ -79,7 +79,7 @@ def weights(models: list[Model]) -> np.ndarray:
 # Vovk & Wang, Ann. Stat. 49, 2021). A simulator is never quite the healthy model; healthy twins, taken
 # through the same statistic, say how far it is off (conformal rank: Besag & Clifford, Biometrika 78, 1991).
 
-# prior: shares of groups off beside the usual one: a gap may be in one place alone
+# prior: shares of groups off, besides the usual one: a gap may be in one place alone
 RARE = (0.002, 0.01, 0.03)
 ENOUGH = 4  # cited: twins as extreme after which a p-value is clear (Besag & Clifford's h)
 FEW, SURE = 4, 1e-6  # chosen: twins after which so small a chance is clear, if none is as extreme

@@ -107,6 +107,12 @@ def probabilities(sets: Sequence[Explanation], p_value: float) -> dict[str, floa
     return {name: value / total for name, value in kept.items()}
 
 
+def log_odds(chances: Iterable[float]) -> float:
+    """Log posterior odds [nats] of several effects to act, by the least of their probabilities."""
+    chance = float(np.clip(min(chances, default=0.0), 1e-12, 1 - 1e-12))
+    return float(np.log(chance / (1 - chance)))
+
+
 def acting(sets: Sequence[Explanation], p_value: float) -> dict[str, float]:
     """Probability of every effect of some set to act."""
     gap, out = 1 - healthy(p_value), dict[str, float]()

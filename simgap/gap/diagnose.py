@@ -19,7 +19,7 @@ from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
 from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
-from simgap.attribution.verdict import ALARM, Cell, entries, rows
+from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
 from simgap.effects import catalogue, effect_named, fitted, free_parameters, name_of
 from simgap.effects.base import World, tips
 from simgap.gap.assemble import scatters, together
@@ -153,7 +153,7 @@ def body(
             "parameters": {
                 f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()
             },
-            "log_evidence": _evidence(verdict, verdict.causes),
+            "log_evidence": log_odds(verdict.effects[n].probability for n in verdict.causes),
             "heldout_score": None if verdict.how_far is None else verdict.how_far.score,
             "property_shift": _shifts(found, causes),
         }
@@ -163,14 +163,10 @@ def body(
     attribution = {n: (e.probability, e.share, e.share_90) for n, e in named.items()}
     out = entries(verdict, verdict.detection, (rest.share, rest.p_value, where(given, rest.where, None)),
                   attribution, where(given, verdict.where, causes))  # fmt: skip
-    out |= {"effects": effects, "noise": verdict.noise, "shrinkage": None, "next_experiment": following}
-    if far is not None:
-        ends = [x if np.isfinite(x) else None for x in far.interval_90]
-        out["shrinkage"] = {
-            "evaluated_on": "held-out trials", "before": far.before, "after": far.after,
-            "noise_floor": far.noise_floor, "fraction": far.fraction, "interval_90": ends,
-            "flexible_ceiling": None,
-        }  # fmt: skip
+    out |= {
+        "effects": effects, "noise": verdict.noise, "shrinkage": None if far is None else far.to_json(),
+        "next_experiment": following,
+    }  # fmt: skip
     if verdict.small_gap is not None:
         small = verdict.small_gap
         metres = small.channel in ("x", "y", "distance", "offset")
@@ -192,7 +188,7 @@ def _described(found: Search, verdict: Attribution, name: str, seed: int) -> dic
     """Parameters and evidence of one effect."""
     return {
         "parameters": parameters(found, verdict.effects[name], name, seed),
-        "log_evidence": _evidence(verdict, (name,)),
+        "log_evidence": log_odds([verdict.effects[name].probability]),
         "heldout_score": None,
         "property_shift": {},
     }
@@ -234,13 +230,6 @@ def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
             "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
 
 
-def _evidence(verdict: Attribution, names: tuple[str, ...]) -> float:
-    """Log posterior odds of an effect, or of several, to act [nats]."""
-    chance = min((verdict.effects[n].probability for n in names), default=0.0)
-    chance = float(np.clip(chance, 1e-12, 1 - 1e-12))
-    return float(np.log(chance / (1 - chance)))
-
-
 def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
     """Properties with rig.toml at its word and with the causes, of those that were identified or measured.
 
@@ -259,7 +248,7 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
     }
 
 
-STAGES = 12  # look: that `progress` is told of, at most
+STAGES = 12  # look: that `progress` reports, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 
 

@@ -62,8 +62,8 @@ def next_experiment(
 ) -> dict[str, Any] | None:
     """The experiment that tells most partners from the cause by ENOUGH nats; None where none tells any.
 
-    `cause` holds the parameters of each effect that acts, as the interface names them. What is told stands in
-    `separates`, the least gain of it beside.
+    `cause` holds the parameters of each effect that acts, as the interface names them. `separates` lists the
+    cause and the partners told from it, `expected_gain_nats` the least gain of these.
     """
     try:
         blocks = blocks_of(found)
@@ -105,13 +105,13 @@ def _gains(
     )
     trials = [recorded(s, frame.task, frame.rig, cause) for s in done]
     known = _measured(blocks) if experiment.measured else actual
-    asked = problem(build(align(trials, frame.task, frame.rig)), known)
-    healthy = fit(asked, Start((), neutral(asked)))
+    planned = problem(build(align(trials, frame.task, frame.rig)), known)
+    healthy = fit(planned, Start((), neutral(planned)))
 
     def cost(name: str) -> float:
         if catalogue()[name].correct is None:
             raise ValueError("what only scatters is not fitted")
-        return min(best_fit(asked, key, healthy).cost for key in forms_of(name_of(name)))
+        return min(best_fit(planned, key, healthy).cost for key in forms_of(name_of(name)))
 
     own = min(cost(name) for name in cause)
     return {p: (cost(p) - own) * frame.num_trials / TRIALS for p in partners}

@@ -1,4 +1,4 @@
-"""What recordings contain that is nobody's fault, as columns beside which every effect is judged.
+"""What recordings contain that is nobody's fault, as columns that are fitted along with every effect.
 
 What rig.toml admits under [systematic]; speeds that a drive takes as differences; and blocks that turn in the
 grip. Each column is per its standard deviation beforehand, so that its prior is N(0, 1).
@@ -133,7 +133,7 @@ def _settling(given: Problem) -> list[np.ndarray]:
 
 
 def _column(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
-    """The whitened column (n, 1) of shifts (T, N) of channels, told up to a constant in every grip."""
+    """The whitened column (n, 1) of shifts (T, N) of channels, known up to a constant in every grip."""
     weight, onehot = given.whitening.weight, given.frame.arrays.onehot
     out = np.zeros_like(weight)
     for name, shift in shifts.items():

@@ -64,7 +64,7 @@ class Nuisances:
         return residual - basis @ (taken * (basis.T @ residual))
 
 
-# prior: what measured weight (share), width, height [m] may be off beside their own sd
+# prior: what measured weight (share), width, height [m] may be off in addition to their own sd
 MEASURED = (2e-3, 3e-5, 4e-5)
 
 

@@ -150,8 +150,8 @@ def sensor_sd(
     out = np.empty((len(joints), 3))
     for k, (known, values) in enumerate(zip(stated, (joints, rates), strict=True)):
         shown = float(np.median([noise_sd(column) for column in values.T]))
-        told = shown if known is None else known / (np.sqrt(group) if rig.jointed else 1.0)
-        out[:, k] = np.fmin(told, shown)
+        stated = shown if known is None else known / (np.sqrt(group) if rig.jointed else 1.0)
+        out[:, k] = np.fmin(stated, shown)
     out[:, 2] = one["force"]
     return np.nan_to_num(out)
 
