@@ -46,9 +46,9 @@ golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ agai
 wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
 	$(BIN)/python .ci/check_wheel.py
 
-# Both ends of what pyproject.toml declares, each in an environment of its own; the newest on NEWEST_PYTHON, as
-# ArviZ 1 needs Python 3.12.
-NEWEST_PYTHON ?= 3.13
+# Both ends of what pyproject.toml declares, each in an environment of its own; ArviZ 1 needs Python 3.12,
+# which NEWEST_PYTHON can name.
+NEWEST_PYTHON ?= $(BIN)/python
 oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares
 	$(call at_versions,oldest,$(BIN)/python,--resolution lowest-direct)
 
