@@ -52,11 +52,6 @@ PARTS = {
     "actuator.gain": ("strength", "Command a known torque of {0}, or hold a known weight, and measure."),
     "actuator.damping": ("velocity gain", "Look up the velocity gain in the drive of {0}."),
     "actuator.limit": ("largest force", "Look up the current limit in the drive of {0}."),
-    "option.timestep": ("the simulator's time step", "Simulate with a tenth of the step: is the gap gone?"),
-    "option.iterations": ("the solver's iterations", "Simulate with more iterations: is the gap gone?"),
-    "option.hold": ("how commands hold between samples", "Log commands at the rate of the controller."),
-    "option.rk4": ("the simulator's integrator", "Simulate with the integrator RK4: is the gap gone?"),
-    "option.implicit": ("the simulator's integrator", "Simulate implicitly: is the gap gone?"),
     "gravity.direction": ("a base that is tilted", "Put a level on the robot's base."),
 }
 
