@@ -16,7 +16,7 @@ MAX_COLUMNS = 20_000  # limit: no robot says so many; the arrays of each take ki
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one file or frame under their own names; only those asked for are read.
+    """Columns of one file or frame under their own names; only those wanted are read.
 
     `names` are all that the file has; `rows` (num_rows,) numbers the rows as an editor does;
     `units` are those that the file itself states. `origin` is where t = 0 lies in ns since 1970

@@ -25,8 +25,8 @@ from hmmseg.sequence.features import SequenceFeatures, features
 from hmmseg.sequence.fit import boundary_probabilities, fit_sequence
 from hmmseg.sequence.model import NamedCourse, SequenceModel, find_failure, optional_states
 
-LISTED = 0.05  # chosen: least probability of a place that is told
-SURE = 0.95  # chosen: from here on one place is the answer and no other is told
+LISTED = 0.05  # chosen: least probability of a place that is listed
+SURE = 0.95  # chosen: from here on one place is the answer and no other is listed
 FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
 LEAST = 1e-3  # numerics: probability of a naming that makes no difference
 

@@ -109,11 +109,11 @@ SAID = 3  # look: places of a gap that a sentence has
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
 ALPHA = 0.05  # chosen: p-value below which what remains is more than noise
-TINY = 1e-16  # numerics: what double precision tells from zero beside one
+TINY = 1e-16  # numerics: what double precision tells from zero next to one
 
 
 def p_text(p: float) -> str:
-    """A p-value; what is too small to be told apart is only bounded."""
+    """A p-value; what is too small for its digits is only bounded."""
     return f"p = {plain(p, 2)}" if p >= 1e-4 else f"p = {p:.0e}" if p > TINY else "p < 1e-16"
 
 

@@ -32,5 +32,5 @@ def test_a_map_that_says_what_cannot_be(line, wanted, tmp_path):
 def test_a_model_whose_time_step_is_none(step, tmp_path):
     (tmp_path / "robot.xml").write_text(XML.format(step=step))
     (tmp_path / "map.toml").write_text(COLUMNS)
-    with pytest.raises(InputError, match="robot.xml"):
+    with pytest.raises(InputError, match=r"robot\.xml"):
         load_mjcf(tmp_path / "robot.xml", tmp_path / "map.toml")
