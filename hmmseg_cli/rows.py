@@ -8,7 +8,8 @@ from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.formats.delimited import COMMENTS, SPACES, cells_of, check_unique, separator_of, units_of
+from hmmseg.io.formats.delimited import COMMENTS, SPACES, cells_of, separator_of, units_of
+from hmmseg.io.table import check_unique
 from hmmseg.io.units import LARGEST, LATEST, si_factor
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table, numbers, times
+from hmmseg.io.table import Table, check_unique, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
 from hmmseg.tables import Tabled
@@ -182,9 +182,7 @@ def _every(table: Table, columns: Mapping[str, Column]) -> list[str]:
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
                  optional: tuple[str, ...], plain: bool) -> None:  # fmt: skip
     where = table.file
-    for name in table.names:
-        if table.names.count(name) > 1:
-            raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
+    check_unique(table.names, where)
     tables = "[topics]" if table.messages else "[columns]"
     for ours in columns:
         if names is not None and ours not in ("t", *names):
