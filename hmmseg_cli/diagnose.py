@@ -270,7 +270,7 @@ def _show(
     measured=None,
     shows: dict[str, str] | None = None,
 ) -> None:
-    """Figures where asked for, and the page, from the body alone; `signal` draws the recorded one."""
+    """Figures where wanted, and the page, from the body alone; `signal` draws the recorded one."""
     from hmmseg.contact.decompose import subtasks
     from hmmseg_cli.pages import Setting, page
     from simgap.report.figures import draw_all, draw_how_far

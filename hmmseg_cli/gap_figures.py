@@ -140,7 +140,7 @@ def draw_robot(drawn: Drawn, path: Callable[[str], Path]) -> None:
 
 
 def draw_robot_page(drawn: Drawn, path: Callable[[str], Path]) -> None:
-    """Those that a page shows beside its own tables."""
+    """Those that a page shows next to its own tables."""
     draw_windows(drawn, path("gap_signal.png"))
     draw_before_after(drawn, path("gap_before_after.png"))
 

@@ -102,7 +102,7 @@ def _seen(hand: Hand | None, looked: Any) -> tuple[Hand, float]:
 
 
 def _map(out: Output, path: Path, mjcf: Path, source: Path | None) -> str:
-    """Lay out a map.toml: columns of a log beside the parts of a model whose names they hold."""
+    """Lay out a map.toml: columns of a log with the parts of a model whose names they hold."""
     from hmmseg.hand.inspect import inspect as look
     from simgap.simulators.mjcf.map import proposed_map
 

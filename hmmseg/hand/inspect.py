@@ -208,7 +208,7 @@ def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = N
            ) -> tuple[dict[str, dict[str, Any]], list[str]]:  # fmt: skip
     """The proposal after what physics says of the recording, and what it said, line by line.
 
-    Where the hand is not told, links of a length of their own cannot be known: a jointed hand is
+    Where no rig is given, links of a length of their own cannot be known: a jointed hand is
     judged only with its rig.
     """
     rig = rig or Rig()

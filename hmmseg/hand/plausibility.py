@@ -30,7 +30,7 @@ WEAKEST, STRONGEST = 0.02, 1000.0  # limit: [N] of a grip
 STILL = 2e-4  # limit: [m]: travel of a hand that moved nothing
 WINDING = 4 * np.pi  # [rad]
 YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9  # physics: [s] since 1970
-SAME = 0.15  # limit: relative: a factor of 1000 or 57.3 is told apart from 1 by far more
+SAME = 0.15  # limit: relative: a factor of 1000 or 57.3 differs from 1 by far more
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
 def scale_to_velocity(trial: Trial, position: str, velocity: str) -> float:
     """What integrated velocity is to displacement over windows in which the hand moves; nan if unclear.
 
-    Windows make noise small beside displacement, as a difference of neighbours does not.
+    Windows make noise small against displacement, as a difference of neighbours does not.
     """
     q, v, t = trial.channels[position], trial.channels[velocity], trial.t
     there = np.isfinite(q) & np.isfinite(v)
@@ -389,7 +389,7 @@ def _downwards(holds: Holds, load: np.ndarray, trial: Trial, rig: Rig) -> list[F
 
 
 def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Finding]:
-    """A load in free motion [N] beside what a lift adds: the hand's own weight, or no zero taken.
+    """A load in free motion [N] against what a lift adds: the hand's own weight, or no zero taken.
 
     Smaller ones are a bias, which is estimated.
     """

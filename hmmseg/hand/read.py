@@ -1,6 +1,6 @@
 """Recordings as they are read: from any source, mapped, judged, and as the two fingers that a hand has.
 
-A long file is read piece by piece, in bounded memory, as often as its rows are asked for.
+A long file is read piece by piece, in bounded memory, as often as its rows are needed.
 """
 
 from __future__ import annotations

@@ -51,8 +51,7 @@ def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
 
 def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     """A line where the tool's inertia is none of a gripper's, or another unit's times the stated one."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     found = abs(tool.inertia)
     stated = gripper.tool_mass
     likely = LIGHTEST < found < HEAVIEST if stated is None else _nearest(stated / found)[1] > np.log(2)

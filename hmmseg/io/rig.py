@@ -223,7 +223,17 @@ class Rig(StrictTable):
 
     @classmethod
     def read(cls, source: str | Path | dict[str, Any] | Rig) -> Rig:
-        """Rig from a `rig.toml`, its table as a dict, or a rig itself; InputError for anything at fault."""
+        """Read the description of a hand.
+
+        Args:
+            source: a `rig.toml`, its table as a dict, or a rig, which is given back as it is.
+
+        Returns:
+            The rig, lengths in m, forces in N, angles in rad, stiffnesses in N/m.
+
+        Raises:
+            InputError: names the key at fault, and the nearest known one.
+        """
         if isinstance(source, Rig):
             return source
         return parse_rig(source) if isinstance(source, dict) else read_rig(Path(str(source)))
@@ -252,6 +262,13 @@ class Rig(StrictTable):
     def jointed(self) -> bool:
         """Whether trials are recorded in joint space."""
         return self.fingers is not None
+
+    @property
+    def wrist(self) -> Gripper:
+        """The gripper with a sensor in its wrist; ValueError for any other hand."""
+        if self.gripper is None:
+            raise ValueError("a hand of fingertips has no wrist sensor")
+        return self.gripper
 
     def finger(self, i: int) -> Finger:
         """Finger 1 (left) or 2 (right); ValueError for a Cartesian hand."""

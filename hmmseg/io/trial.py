@@ -11,7 +11,7 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table, numbers, times
+from hmmseg.io.table import Table, check_unique, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
 from hmmseg.tables import Tabled
@@ -31,7 +31,7 @@ class Trial(Tabled):
     `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
     channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
     `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
-    reason. `touch_sd` [m]: how well the distance is known at which the fingers touch a block, beside noise;
+    reason. `touch_sd` [m]: how well the distance at which the fingers touch a block is known, but for noise;
     `touches` [s]: times of touch and release known apart from forces, with their standard deviations;
     `timing` (num_timesteps,) [s]: how uncertain it is when a force changed that changes there. Of a sensor
     in the wrist, whose forces are halved between the fingers, `inertia` (num_timesteps, 2) [N]: by how much
@@ -56,10 +56,21 @@ class Trial(Tabled):
 
     @staticmethod
     def read(source: Any, rig: Any = None, task: Any = None) -> Trial:
-        """Trial from a file, a DataFrame (pandas, polars), a dict of arrays or a trial itself.
+        """Read one recording.
 
-        `rig` (or, for a plain ordered task, `task`) says which channels it has: a path, a dict or
-        what `Rig.read` and `Task.read` give. InputError names file, row or column at fault.
+        Args:
+            source: a file of any kind, a DataFrame (pandas, polars), a dict of arrays (num_timesteps,), or a
+                trial, which is given back as it is.
+            rig: the hand, which says which channels there are and how columns map to them: a `rig.toml`, its
+                table as a dict, or a `Rig`.
+            task: of a plain ordered task its description, instead of or with `rig`.
+
+        Returns:
+            The trial in SI units: times (num_timesteps,) [s] and channels by name, NaN where missing.
+
+        Raises:
+            InputError: names the file, row or column at fault and what was expected; also where the recording
+                cannot be what it says (other units, flipped signs, swapped fingers).
         """
         if isinstance(source, Trial):
             return source
@@ -171,9 +182,7 @@ def _every(table: Table, columns: Mapping[str, Column]) -> list[str]:
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
                  optional: tuple[str, ...], plain: bool) -> None:  # fmt: skip
     where = table.file
-    for name in table.names:
-        if table.names.count(name) > 1:
-            raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
+    check_unique(table.names, where)
     tables = "[topics]" if table.messages else "[columns]"
     for ours in columns:
         if names is not None and ours not in ("t", *names):

@@ -57,8 +57,7 @@ class Wrist:
     """
 
     def __init__(self, rig: Rig) -> None:
-        assert rig.gripper is not None
-        self.rig, self.gripper, self.names = rig, rig.gripper, rig.gripper.channels
+        self.rig, self.gripper, self.names = rig, rig.wrist, rig.wrist.channels
         self._rows: list[tuple[float, tuple[float, ...]]] = []  # in order of time, a window's context
         self._out = -math.inf  # up to where rows have come out
         self._opening = Closings(self._gives)
@@ -112,7 +111,7 @@ class Wrist:
         return None
 
     def ready(self, final: bool = False) -> list[tuple[float, np.ndarray]]:
-        """Rows that can be told of now, each once; with `final` all that are left."""
+        """Rows that are ready now, each once; with `final` all that are left."""
         if not self._rows:
             return []
         newest = self._rows[-1][0]

@@ -196,7 +196,7 @@ class Weighing:
     `independent`: observations that evidence counts as in the limit of many. `settled`: log odds of a
     state that nobody named after the last event. `shares`: exponent of the share of its trial that each state
     but the last takes. `lag`: scale of the Laplace law by which boundaries lie off the change they are, as a
-    share of the trial; `told`: the same where labels have told by how much. `elsewhere`: probability that a
+    share of the trial; `labelled`: the same where labels say by how much. `elsewhere`: probability that a
     boundary is at no change at all.
     """
 

@@ -122,7 +122,7 @@ class Detectors:
     `mean`, `spread` (num_boundaries, 2 * half, num_channels), `usual` (num_channels,) the spread of
     windows anywhere; `jitter` (num_boundaries,) [cells] how much more than their posterior says
     held-out labels scatter; `weight` multiplies the log-likelihood ratio (neighbouring cells and
-    channels are not independent), `state_weight` the state emissions beside it.
+    channels are not independent), `state_weight` the state emissions.
     """
 
     half: int

@@ -41,7 +41,7 @@ from hmmseg.sequence.model import (
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
 HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
 WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # prior: of templates; held-out labels choose
-STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior: of the emissions beside them, likewise
+STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior: of the emissions next to them, likewise
 FORGIVING = 1e-4  # prior: least probability of a held-out label, so that one odd label does not decide
 
 
@@ -355,7 +355,7 @@ def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: Fea
 def _finish(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap, learner: Learner,
             emissions: StudentEmissions, probability: list[np.ndarray],
             detectors: Detectors | None) -> SequenceModel:  # fmt: skip
-    """The model with what its own trials score, so that misfits can be told."""
+    """The model with what its own trials score, so that misfits can be recognised."""
     mean_cells, presence = learner.durations(probability)
     typical = np.median([p.sum(0) for p in probability], 0)
     settled = learner.num_states > len(task.sequence)

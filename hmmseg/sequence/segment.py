@@ -25,8 +25,8 @@ from hmmseg.sequence.features import SequenceFeatures, features
 from hmmseg.sequence.fit import boundary_probabilities, fit_sequence
 from hmmseg.sequence.model import NamedCourse, SequenceModel, find_failure, optional_states
 
-LISTED = 0.05  # chosen: least probability of a place that is told
-SURE = 0.95  # chosen: from here on one place is the answer and no other is told
+LISTED = 0.05  # chosen: least probability of a place that is listed
+SURE = 0.95  # chosen: from here on one place is the answer and no other is listed
 FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
 LEAST = 1e-3  # numerics: probability of a naming that makes no difference
 
@@ -180,17 +180,23 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     visited = _visit_probabilities(alignment)[: len(names)]
     optional = optional_states(model.task, False)
     kept = [k for k in range(len(names)) if not optional[k] or visited[k] >= 0.5]
-    first, last = float(trial.t[0]), float(trial.t[-1])
+    first, last, step = float(trial.t[0]), float(trial.t[-1]), float(data.edges[1] - data.edges[0])
     own = boundary_probabilities(alignment)
-    starts: list[_Boundary] = [(first, 0.0, (first, first))]
-    elsewhere: list[tuple[Place, ...]] = [()]
+    found = []
     for k in kept[1:]:
-        median, sd, (low, high) = _boundary(
+        median, sd, interval = _boundary(
             data.edges, known.crossing[:, k - 1], first, last, scattered=bool(model.courses)
         )
         if model.courses and near(data.edges, known.crossing[:, k - 1], median) < MAIN:
             median = _boundary(data.edges, own[:, k - 1], first, last)[0]
-        median = max(median, starts[-1][0])
+        found.append((median, sd, interval))
+    starts: list[_Boundary] = [(first, 0.0, (first, first))]
+    elsewhere: list[tuple[Place, ...]] = [()]
+    for number, (k, (median, sd, (low, high))) in enumerate(zip(kept[1:], found, strict=True), 1):
+        if model.courses and not any(course.shift[k - 1].any() for course in model.courses):
+            median = _jump(trial, model, median, starts[-1][0], [*found, (last,)][number][0])
+        # A state that is there lasts a cell at least, as in every alignment: medians of places need not.
+        median = max(starts[-1][0] + step, min(median, last - step * (len(kept) - number)))
         starts.append((median, sd, (min(low, median), max(high, median))))
         elsewhere.append(places(data.edges, known.crossing[:, k - 1], median) if model.courses else ())
     ends = [*starts[1:], (last, 0.0, (last, last))]
@@ -198,6 +204,35 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
         Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2], others)
         for k, start, end, others in zip(kept, starts, ends, elsewhere, strict=True)
     )
+
+
+def _jump(trial: Trial, model: SequenceModel, time: float, before: float, after: float) -> float:
+    """When [s] the channels jump near a change that the features place at `time`, between its neighbours.
+
+    Slopes look across a window, so that they know of an abrupt change half a window before it comes. The
+    samples themselves do not: a level on either side with normal noise, and a change that lies off `time` by
+    the law of `Weighing.lag`, no farther than NEAR, anywhere between two samples. The median.
+    """
+    length, window = float(trial.t[-1] - trial.t[0]), model.mapping.window * model.mapping.step
+    farthest = max(NEAR * length, model.mapping.step)
+    reach = farthest + window
+    inside = slice(*np.searchsorted(trial.t, [max(before, time - reach), min(after, time + reach)]))
+    x = np.stack([trial.channels[name][inside] for name in model.mapping.channels], axis=1)
+    between = (trial.t[inside][1:] + trial.t[inside][:-1]) / 2
+    open_ = np.abs(between - time) <= farthest
+    if not open_.any():
+        return time
+    there = np.isfinite(x)
+    x = np.where(there, x - np.nanmean(x, axis=0, where=there), 0.0)
+    count, first = there.cumsum(axis=0), x.cumsum(axis=0)
+    left, right = count[:-1], count[-1] - count[:-1]
+    explained = first[:-1] ** 2 / np.maximum(left, 1) + (first[-1] - first[:-1]) ** 2 / np.maximum(right, 1)
+    total = (x**2).sum(axis=0)
+    rest = np.maximum(total - explained, 1e-9 * total) + np.finfo(float).tiny
+    cost = model.emissions.temper * (count[-1] / 2 * np.log(rest)).sum(axis=1)
+    cost = (cost + np.abs(between - time) / (WEIGHING.lag * length))[open_]
+    weight = np.exp(cost.min() - cost).cumsum()
+    return float(between[open_][np.searchsorted(weight, weight[-1] / 2)])
 
 
 def _visit_probabilities(alignment: AlignmentPosterior) -> np.ndarray:
