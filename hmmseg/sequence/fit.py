@@ -32,7 +32,6 @@ from hmmseg.sequence.learner import FLOORS, Learner
 from hmmseg.sequence.model import (
     NamedCourse,
     SequenceModel,
-    jumps,
     misfit_scores,
     optional_states,
     usual_misfit,
@@ -181,9 +180,8 @@ def _held_out(values, channels, cells, paths, half, temper, floor,
         emissions = from_weights(np.vstack([values[j] for j in rest]), onehot, floor, temper)
         detectors = learn([channels[j] for j in rest], [shown(cells[j]) for j in rest], half)
         ll, ratios = emissions.log_likelihoods(values[i]), detectors.log_ratios(channels[i])
-        parts += [(s * ll, jumps(ratios, replace(detectors, weight=w), law.bands))
-                  for w in WEIGHTS for s in STATE_WEIGHTS]  # fmt: skip
-    aligned = align([p[0] for p in parts], [law.chain(p[1]) for p in parts])
+        parts += [(s * ll, law.chain(w * ratios)) for w in WEIGHTS for s in STATE_WEIGHTS]
+    aligned = align([p[0] for p in parts], [p[1] for p in parts])
     grid = (len(values), len(WEIGHTS), len(STATE_WEIGHTS))
     per_trial = grid[1] * grid[2]
     scores = [_log_probability(a, cells[n // per_trial]) for n, a in enumerate(aligned)]
