@@ -29,13 +29,7 @@ from hmmseg.sequence.courses import (
 from hmmseg.sequence.emissions import Detectors, StudentEmissions, Transitions, from_weights, learn
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures, feature_map, features
 from hmmseg.sequence.learner import FLOORS, Learner
-from hmmseg.sequence.model import (
-    NamedCourse,
-    SequenceModel,
-    misfit_scores,
-    optional_states,
-    usual_misfit,
-)
+from hmmseg.sequence.model import NamedCourse, SequenceModel, misfit_scores, optional_states, usual_misfit
 
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
 HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
@@ -225,11 +219,7 @@ ENOUGH = (
 )
 
 
-def fit_sequence(
-    trials: Sequence[Trial],
-    task: SequenceTask,
-    labels: Labels | None = None,
-) -> SequenceModel:
+def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | None = None) -> SequenceModel:
     """Emissions and durations of a plain ordered task.
 
     `labels` maps a trial's name (with or without its suffix) to its boundaries [s], one fewer than
