@@ -244,10 +244,7 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
     at = np.arange(len(logs))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
-        for place, residual, colour, name in (
-            (-0.2, before, RED, "before"),
-            (0.2, after, BLUE, "after"),
-        ):
+        for place, residual, colour, name in ((-0.2, before, RED, "before"), (0.2, after, BLUE, "after")):
             each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
             axes.bar(at + place, each, 0.4, color=colour, label=name)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")

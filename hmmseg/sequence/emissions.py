@@ -133,6 +133,10 @@ class Detectors:
     weight: float = 0.0
     state_weight: float = 1.0
 
+    def crossing(self, values: np.ndarray) -> np.ndarray:
+        """Log weights (num_cells - 1, num_boundaries) of crossing, from all features of a trial."""
+        return self.weight * self.log_ratios(values[:, : self.mean.shape[2]])
+
     def log_ratios(self, values: np.ndarray) -> np.ndarray:
         """Unweighted log-likelihood ratios (num_cells - 1, num_boundaries), one a cell edge."""
         windows = _windows(values, self.half)
@@ -193,9 +197,16 @@ class Transitions:
     log_initial: np.ndarray
     log_final: np.ndarray
 
-    def chain(self, bands: tuple[np.ndarray, ...] | None = None) -> Chain:
-        """The chain; with other bands, if given, that may vary in time."""
-        stay, advance, *skips = self.bands if bands is None else bands
+    def chain(self, crossing: np.ndarray | None = None) -> Chain:
+        """The chain; with log weights (num_cells - 1, num_boundaries) of crossing each boundary, if given.
+
+        Who skips subtasks crosses their boundaries.
+        """
+        stay, advance, *skips = self.bands
+        if crossing is not None:
+            total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
+            advance, *skips = (band + total[:, d:] - total[:, : total.shape[1] - d]
+                               for d, band in enumerate(self.bands[1:], 1))  # fmt: skip
         return Chain(stay, advance, skips or None, log_initial=self.log_initial, log_final=self.log_final)
 
 

@@ -29,14 +29,7 @@ from hmmseg.sequence.courses import (
 from hmmseg.sequence.emissions import Detectors, StudentEmissions, Transitions, from_weights, learn
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures, feature_map, features
 from hmmseg.sequence.learner import FLOORS, Learner
-from hmmseg.sequence.model import (
-    NamedCourse,
-    SequenceModel,
-    jumps,
-    misfit_scores,
-    optional_states,
-    usual_misfit,
-)
+from hmmseg.sequence.model import NamedCourse, SequenceModel, misfit_scores, optional_states, usual_misfit
 
 Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
 HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
@@ -181,9 +174,8 @@ def _held_out(values, channels, cells, paths, half, temper, floor,
         emissions = from_weights(np.vstack([values[j] for j in rest]), onehot, floor, temper)
         detectors = learn([channels[j] for j in rest], [shown(cells[j]) for j in rest], half)
         ll, ratios = emissions.log_likelihoods(values[i]), detectors.log_ratios(channels[i])
-        parts += [(s * ll, jumps(ratios, replace(detectors, weight=w), law.bands))
-                  for w in WEIGHTS for s in STATE_WEIGHTS]  # fmt: skip
-    aligned = align([p[0] for p in parts], [law.chain(p[1]) for p in parts])
+        parts += [(s * ll, law.chain(w * ratios)) for w in WEIGHTS for s in STATE_WEIGHTS]
+    aligned = align([p[0] for p in parts], [p[1] for p in parts])
     grid = (len(values), len(WEIGHTS), len(STATE_WEIGHTS))
     per_trial = grid[1] * grid[2]
     scores = [_log_probability(a, cells[n // per_trial]) for n, a in enumerate(aligned)]
@@ -227,11 +219,7 @@ ENOUGH = (
 )
 
 
-def fit_sequence(
-    trials: Sequence[Trial],
-    task: SequenceTask,
-    labels: Labels | None = None,
-) -> SequenceModel:
+def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | None = None) -> SequenceModel:
     """Emissions and durations of a plain ordered task.
 
     `labels` maps a trial's name (with or without its suffix) to its boundaries [s], one fewer than

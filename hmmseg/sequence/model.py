@@ -26,7 +26,6 @@ from hmmseg.sequence.emissions import Detectors, StudentEmissions, Transitions, 
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.tables import Tabled
 
-Bands = tuple[np.ndarray, ...]  # to stay, to advance by one state, by two, ...
 FORMAT = "hmmseg.sequence-model/3"
 INDEPENDENT = 250.0  # chosen: independent observations that one trial's fit is judged by in the limit of many
 
@@ -64,10 +63,6 @@ class SequenceModel(Tabled):
         """Transitions between neighbouring cells, without boundary detectors."""
         return transitions(self.mean_cells, self.presence, optional_states(self.task, self.settled))
 
-    def weights(self, trial: SequenceFeatures) -> tuple[np.ndarray, Bands]:
-        """Log-likelihoods (num_cells, num_states) and transition bands of one trial."""
-        return weights(trial.values, self.emissions, self.detectors, self.transitions.bands)
-
     def tables(self) -> list[Any]:
         """Its states: how long they usually last, and how surely the model has their beginnings."""
         from rich.table import Table
@@ -93,9 +88,12 @@ class SequenceModel(Tabled):
 
     def align(self, trials: list[SequenceFeatures]) -> list[AlignmentPosterior]:
         """Posterior alignments; InfeasibleAlignment for a trial with fewer cells than subtasks."""
-        parts = [self.weights(trial) for trial in trials]
-        law = self.transitions
-        return align([p[0] for p in parts], [law.chain(p[1]) for p in parts])
+        law, d = self.transitions, self.detectors
+        lls = [self.emissions.log_likelihoods(trial.values) for trial in trials]
+        if d is None:
+            return align(lls, [law.chain()] * len(lls))
+        chains = [law.chain(d.crossing(trial.values)) for trial in trials]
+        return align([d.state_weight * ll for ll in lls], chains)
 
 
 @dataclass(frozen=True)
@@ -124,28 +122,6 @@ class NamedCourse:
 def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
     """Which states of the model may be skipped."""
     return [name in task.optional for name in task.sequence] + [True] * settled
-
-
-def weights(values: np.ndarray, emissions: StudentEmissions, detectors: Detectors | None,
-            bands: Bands) -> tuple[np.ndarray, Bands]:  # fmt: skip
-    """Log-likelihoods and bands of one trial; detectors make advancing depend on time."""
-    ll = emissions.log_likelihoods(values)
-    if detectors is None:
-        return ll, bands
-    return detectors.state_weight * ll, jumps(ratios_of(values, detectors), detectors, bands)
-
-
-def ratios_of(values: np.ndarray, detectors: Detectors) -> np.ndarray:
-    """Log ratios (num_cells - 1, num_boundaries) of one trial's boundaries."""
-    return detectors.log_ratios(values[:, : detectors.mean.shape[2]])
-
-
-def jumps(log_ratios: np.ndarray, detectors: Detectors, bands: Bands) -> Bands:
-    """Bands with boundaries' emissions in them; who skips subtasks crosses their boundaries."""
-    crossed = np.pad(np.cumsum(detectors.weight * log_ratios, axis=1), ((0, 0), (1, 0)))
-    return (bands[0], *(
-        band + crossed[:, d:] - crossed[:, : crossed.shape[1] - d] for d, band in enumerate(bands[1:], 1)
-    ))  # fmt: skip
 
 
 def save_model(model: SequenceModel, path: str | Path) -> None:
