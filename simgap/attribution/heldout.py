@@ -120,9 +120,10 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
     say of it differs by more: that of the mean of the random-effects model, over what it wanders by."""
     found = _parts(f, model, effect, part)
     out = np.zeros(found.loose.size)
-    says = np.trace(found.bend, axis1=1, axis2=2)
-    if (says > SINGULAR * says.max(initial=0.0)).sum() < 2 or not (~found.free).any():
-        return out  # one part that says anything differs from no other
+    says = np.einsum("pii->pi", found.bend)
+    several = (says > SINGULAR * says.max(0, initial=0.0)).sum(0) > 1  # one part differs from no other
+    if not several.any() or not (~found.free).any():
+        return out
     score, scatter = found.score(), []
     for i, wander in enumerate(WANDER):
         prior, one = found.prior(wander), np.eye(found.usual.size)
@@ -135,7 +136,7 @@ def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np
         score[i] += 0.5 * float(pull @ covariance @ pull - np.log(size[known]).sum())
         scatter.append(np.diag(covariance))
     weight = np.exp(score - np.logaddexp.reduce(score))
-    out[found.loose] = weight @ np.maximum(np.stack(scatter) - scatter[0], 0.0)
+    out[found.loose] = np.where(several, weight @ np.maximum(np.stack(scatter) - scatter[0], 0.0), 0.0)
     return out
 
 
