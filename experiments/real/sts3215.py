@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
 from experiments.real.servo import Servo
 from experiments.saving import save
@@ -42,6 +43,7 @@ TOLD = 0.1  # chosen: share of the inertia; that of the rotor is told to some 5 
 ROTOR = 0.0275  # cited: kg m^2; fits of this servo by Rhoban/bam's users, 0.027 to 0.028
 SIGN = 10.24  # data sheet: the load register's direction stands in bit 10, in units of a hundredth
 FEW = 10  # logs of a configuration that a case takes at most
+GOAL = ">= 97 %"
 SHOWN = ("mass", "length", "kp")
 EFFECT = {"mass": "mass", "length": "length", "kp": "gain"}
 
@@ -177,6 +179,35 @@ def scored(case: Case, found: Changes) -> dict[str, Any]:
     return out
 
 
+def summary(cases: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of every figure the hits, of how many, and a 90 % interval (Clopper and Pearson)."""
+    nothing = [c for c in cases if not c["truth"]]
+    changed = [c for c in cases if c["truth"]]
+    sizes = {n: [c["sizes"][n] for c in changed if n in c["sizes"]] for n in ("mass", "gain")}
+    gains = [c for c in cases if c["kind"] == "kp"]
+    asked = (
+        *(
+            (f"nothing changed, other {kind}: none", [c["none"] for c in nothing if c["kind"] == kind], GOAL)
+            for kind in ("repeats", "motions")
+        ),
+        ("one change, named or in the set", [c["in_set"] for c in changed if c["kind"] != "two"], ">= 95 %"),
+        ("the same, two changes", [c["in_set"] for c in changed if c["kind"] == "two"], ""),
+        ("named alone where told so", [c["is_alone"] for c in changed if c["alone"]], ">= 80 %"),
+        ("mass within 5 %", [abs(s["off"]) <= 0.05 for s in sizes["mass"]], ""),
+        ("90 % interval holds the mass", [s["holds"] for s in sizes["mass"]], "85 to 95 %"),
+        ("gain: named, ratio within 5 %", [
+            c["is_alone"] and abs(c["sizes"]["gain"]["off"]) <= 0.05 for c in gains
+        ], ">= 95 %"),
+    )  # fmt: skip
+    out = []
+    for label, hits, goal in asked:
+        if hits:
+            interval = binomtest(sum(hits), len(hits)).proportion_ci(0.9)
+            out.append({"figure": label, "hits": sum(hits), "of": len(hits), "goal": goal,
+                        "interval_90": [float(interval.low), float(interval.high)]})  # fmt: skip
+    return out
+
+
 def main() -> None:
     """Draw, solve, score and save."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -197,7 +228,8 @@ def main() -> None:
         answer = one["verdict"], one["named"], one["others"], sizes, round(found.over, 2), round(seconds)
         print(case.kind, case.stated, case.truth, case.alone, "->", *answer, flush=True)
     if given.output is not None:
-        save(given.output, {"part": given.part, "seed": given.seed, "cases": out})
+        settings = {"part": given.part, "seed": given.seed, "drawn": given.cases}
+        save(given.output, {**settings, "figures": summary(out), "cases": out})
 
 
 if __name__ == "__main__":

@@ -313,14 +313,14 @@ class Changes:
         z = rest / max(float(self.null.left.std(ddof=1)), 0.1)
         excess = np.where(z > 2, np.maximum(np.exp(rest) - 1, 0), 0.0)
         share = excess / max(excess.sum(), 1e-300)
-        names = [r.name for r in self.composed.recordings]
+        logs = self.composed.recordings
         channel = ", ".join(self.composed.rows.channels)
         found = [
             {
-                "trial": names[i],
+                "trial": logs[i].name,
                 "channel": channel,
                 "subtask": "all",
-                "band": [0.0, None],
+                "band": [0.0, 0.5 / float(np.median(np.diff(logs[i].t)))],
                 "share": float(share[i]),
                 "z": float(z[i]),
             }
