@@ -115,6 +115,10 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 	$(BIN)/python -m paper_figs.gap_reliability
 	$(BIN)/python -m experiments.write_tables
 
+sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
+	$(BIN)/python -m experiments.real.sts3215 $(SET) --part judge --output experiments/results/sts3215.json
+	$(BIN)/python -m experiments.write_tables
+
 REAL := $(or $(RECORDINGS),../shared/real)
 real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECORDINGS; fills docs/results.md, draws their figures
 	$(BIN)/python -m experiments.real.hiro_snap $(REAL)/hiro_snap
