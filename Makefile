@@ -156,8 +156,8 @@ robots-check: robots-models  ## seeded faults in these models, diagnosed (in bui
 	$(BIN)/python -m experiments.robots_check $(ROBOTS) --score build/robots_check
 	$(BIN)/python -m experiments.write_tables
 
-bench-robot: robots-models  ## time of a diagnosis of a minute of an arm of six joints, in one go and interrupted; fills docs/robots_results.md
-	$(BIN)/python -m experiments.benchmarks.robot $(ROBOTS) --interrupt
+bench-robot: robots-models  ## time of a diagnosis of a minute of an arm of six joints; fills docs/robots_results.md
+	$(BIN)/python -m experiments.benchmarks.robot $(ROBOTS)
 	$(BIN)/python -m experiments.write_tables
 
 calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds that differ, NUTS beside the sampler; resumable

@@ -114,7 +114,6 @@ def diagnose_robot(
     from simgap.progress import heard
     from simgap.robots.describe import body
     from simgap.robots.diagnose import STAGES, diagnose
-    from simgap.robots.kept import kept_for, modules_beside
     from simgap.simulators.recording import read_recording
 
     more: list = []
@@ -127,7 +126,6 @@ def diagnose_robot(
         commands = [name for name, channel in simulator.channels.items() if channel.kind == "command"]
         recordings = [read_recording(path, wanted, commands=commands) for path in paths]
         at_risk = simulator
-        inputs = [own.simulator.encode(), *modules_beside(Path(own.simulator.rpartition(":")[0]))]
     else:
         from simgap.simulators.mjcf.load import load_mjcf
 
@@ -135,7 +133,6 @@ def diagnose_robot(
         loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
         recordings = [loaded.read(path) for path in paths]
         at_risk, length = loaded.simulator, loaded.map.length
-        inputs = [loaded.digest, *(name.encode() for name in own.candidates)]
         for warning in loaded.warnings:
             out.warn(warning)
         more = loaded.effects(recordings)
@@ -148,13 +145,6 @@ def diagnose_robot(
         from simgap.robots.task_phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
-    inputs += [
-        *(path.read_bytes() for path in paths),
-        b"" if task is None else task.read_bytes(),
-    ]
-    kept = kept_for([*inputs, repr((sorted(effect), out.seed)).encode()])
-    if kept.begun:
-        out.print("going on where an earlier run of this was interrupted")
     stage = "diagnosing"
 
     def tell(text: str) -> None:
@@ -163,23 +153,17 @@ def diagnose_robot(
         advance(1, text)
 
     with out.progress(stage, total=STAGES) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
-        try:
-            found = diagnose(
-                at_risk,
-                recordings,
-                forced=tuple(dict.fromkeys(effect)),
-                seed=out.seed,
-                more=more,
-                length=length,
-                phases=phases,
-                tell=tell,
-                warn=out.warn,
-                kept=kept,
-            )
-        except KeyboardInterrupt:
-            if kept.begun:
-                out.warn("interrupted; the same command goes on from here")
-            raise
+        found = diagnose(
+            at_risk,
+            recordings,
+            forced=tuple(dict.fromkeys(effect)),
+            seed=out.seed,
+            more=more,
+            length=length,
+            phases=phases,
+            tell=tell,
+            warn=out.warn,
+        )
     document = body(found)
     if own.mjcf is not None:
         from simgap.simulators.mjcf.engine import warned
@@ -203,7 +187,6 @@ def diagnose_robot(
         for line in json.loads(out.stage(ranges).read_text(encoding="utf-8")).get("not_in_xml", ()):
             out.warn(f"--patch: an MJCF has no place for {line}; correct the driver by ranges.json")
     out.finish(document)
-    kept.forget()
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
