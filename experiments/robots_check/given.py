@@ -3,8 +3,8 @@
     python -m experiments.robots_check.given FOLDER [CASE...]    # results/robots_check_given.json
 
 A case is a folder with robot.xml, map.toml, train_*.csv (fitted), held_*.csv (never seen before the end) and
-truth.json: `right`, a list of causes, each as names of which any is right; none for a healthy robot; "unknown"
-for what no catalogue has.
+truth.json: `right`, a list of causes, each as names of which any is right; none for a healthy robot;
+"unknown" for what no catalogue has.
 """
 
 from __future__ import annotations
