@@ -1,8 +1,8 @@
 """The verdict on a robot's logs, read off the sets that were fitted exactly.
 
 There is a gap if some set, or a discrepancy alone, is likelier than the sensors' noise. Causes are known if
-they explain most of the whole gap, of all channels together, in logs that took no part, at values that robots
-can have.
+they explain most of the whole gap, of all channels together, in logs that took no part, at values that a
+robot can have.
 """
 
 from __future__ import annotations

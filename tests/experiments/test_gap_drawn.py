@@ -30,10 +30,17 @@ from experiments.gap_drawn import outcome, row
         ("single", {"verdict": "none", "small_gap": {"size": 1.0}}, "too small"),
         ("single", {"verdict": "none"}, "missed"),
         ("single", {"verdict": "unknown"}, "unknown"),
+        ("pair", {"verdict": "named", "causes": ["grip_slip", "force_lag"]}, "named"),
+        ("pair", {"verdict": "named", "causes": ["force_lag"]}, "half"),
+        ("pair", {"verdict": "set", "causes": ["table_tilt"]}, "wrong name"),
+        ("pair", {"verdict": "unknown", "causes": []}, "unknown"),
+        ("outside", {"verdict": "unknown", "causes": []}, "unknown"),
+        ("outside", {"verdict": "named", "causes": ["table_tilt"]}, "wrong name"),
     ],
 )
 def test_outcomes(tier, found, expected):
-    assert outcome({"tier": tier, "effects": ["force_lag"]}, found) == expected
+    effects = ["force_lag", "grip_slip"] if tier == "pair" else ["force_lag"]
+    assert outcome({"tier": tier, "effects": effects}, found) == expected
 
 
 def test_the_table_counts_what_gains_enough(monkeypatch):

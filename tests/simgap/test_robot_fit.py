@@ -104,7 +104,7 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
         search.settled(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
         for one in (names[:1], names[1:], names)
     )
-    assert large.score - none.score > 2 * hidden > 300
+    assert large.score - none.score > 2 * hidden > 100
     assert both.score > large.score + 100 > small.score + 200
     assert {*large.discrepancy.scale} == {"angle_b"} and {*small.discrepancy.scale} == {"angle_a"}
     assert both.discrepancy.scale.get("angle_a", 0.0) < 0.01 * none.discrepancy.scale["angle_a"]

@@ -6,7 +6,7 @@ motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,8 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
-from simgap.simulators.mjcf.runs import HOLD, LATE
+from simgap.simulators.mjcf.play import played
+from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
 from simgap.simulators.mjcf.settable import setting_of
 from simgap.simulators.mjcf.settable_parts import body_setting, payload_place
 from simgap.simulators.mjcf.setting import Setting, name_of, names_of, object_id
@@ -29,6 +30,8 @@ from simgap.simulators.mjcf.state_friction import (
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
+GAP = 0.02  # prior: of a joint's reach: the usual play
+JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 SIZE = 0.1  # prior: of a value that the model states: the usual size of what is wrong with it
 GEOMS = 4  # chosen: pairs of touching geoms, those that touch most, whose contact is offered
 HINGES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -55,6 +58,7 @@ def offered(
     catalogue.add_named(named)
     simulator.parameters, simulator.settings = catalogue.parameters, catalogue.settings
     simulator.says = catalogue.says
+    catalogue.add_play(joints, motions, {log.name: log for log in recordings})
     simulator.__post_init__()
     simulator.prepare(recordings)
     beyond = (state_friction, gravity_compensation, elasticity)
@@ -149,6 +153,37 @@ class _Catalogue:
         name = f"body:{body}.payload"
         self.add(name, SIZE * _largest(m), f"a load on {body}, at {where} mm in its frame", low=0.0)
         self.settings[name] = body_setting(m, body, "payload", np.array(at))
+
+    def add_play(
+        self, joints: Sequence[int], motions: Sequence[Motion], logs: Mapping[str, Recording]
+    ) -> None:
+        """Play between the motors and the joints that they move."""
+        m, simulator, wanted, made = self.model, self.simulator, tuple(self.settings), {}
+        for column, a in (simulator.driven or {}).items():
+            j = int(m.actuator_trnid[a, 0])
+            alone = np.sum(np.asarray(m.actuator_trnid)[:, 0] == j) == 1
+            if j not in joints or int(m.actuator_trntype[a]) != JOINT or not alone:
+                continue
+            name = name_of(m, "joint", j)
+
+            def runs(model: Any) -> Runs:
+                data = [mujoco.MjData(model) for _ in range(simulator.threads)]
+                columns = simulator.channels, simulator.sensor, simulator.driven, simulator.free
+                return Runs(model, data, *columns)
+
+            names = name, name_of(m, "actuator", a)
+            found = played(simulator.spec.copy(), *names, runs, wanted, logs, simulator.joints)
+            if found is None:
+                continue
+            unit = "rad" if int(m.jnt_type[j]) == HINGES[0] else "m"
+            effect = f"command:{column}.backlash"
+            made[found.width] = found
+            sd = GAP * sizes_of(motions, j).reach
+            self.parameters[found.width] = Parameter(0.0, sd, unit, low=0.0, effect=effect)
+            none = lambda model, value=0.0: 0.0  # noqa: E731
+            self.settings[found.width] = Setting(found.width, unit, none, none, False, None)
+            self.says[effect] = f"play between motor and {name}"
+        simulator.played = made
 
     def add_options(self) -> None:
         """Gravity's direction, and of the simulation its step, its solver and how it holds commands."""

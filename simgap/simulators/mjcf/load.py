@@ -117,6 +117,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     simulator, warnings = _simulator(mujoco, model, described, address)
+    simulator.spec = spec
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, whole)
     digest = hashlib.sha256(f"{mujoco.__version__} {described}".encode() + whole.tobytes()).digest()

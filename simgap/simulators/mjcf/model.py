@@ -15,6 +15,7 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
+from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
 from simgap.simulators.mjcf.setting import Setting
 from simgap.simulators.mjcf.signals import Held, body_rate
@@ -46,6 +47,8 @@ class MjcfSimulator:
     touching: bool
     poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     says: Mapping[str, str] = field(default_factory=dict)
+    played: Mapping[str, Played] = field(default_factory=dict)  # by setting
+    spec: Any = None  # what the model was compiled from
     restarts: bool = True
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
     _runs: dict[str, np.ndarray] = field(default_factory=dict)
@@ -87,6 +90,8 @@ class MjcfSimulator:
 
     def _all(self, jobs: Sequence[Job], changed: tuple[tuple[str, float], ...]) -> list[Channels | None]:
         """Every job's channels with some settings changed."""
+        if plays := [n for n, _ in changed if n in self.played]:
+            return self.played[plays[0]](jobs, self._states(jobs), changed, self.model)
         with Changed(self.model, self.settings, changed):
             return self._runs_of([j.recording for j in jobs], self._states(jobs), changed)
 
