@@ -45,7 +45,10 @@ from simgap.simulators.recording import Recording
 
 STAGES = 8  # look: what a progress bar counts
 LEAST = 0.2  # numerics: of a log's own size over that of OLD's logs
-GROUPS, MANY = 8, 12  # numerics: logs or stretches held out, at least, and of those whose signs are all tried
+GROUPS, MANY = (
+    10,
+    12,
+)  # numerics: logs or stretches held out, at least, and of those whose signs are all tried
 PRIOR = (0.5, 0.3, 0.2)  # prior: that nothing changed, one thing, two
 LADDER = (-1.4, -0.7, -0.35, 0.35, 0.7, 1.4)  # numerics: logarithms from which a fit may begin
 SIZE = np.log(2.0)  # prior: a change that is usual, as a logarithm

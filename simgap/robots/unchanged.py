@@ -23,10 +23,11 @@ from simgap.robots.calibrate import Calibration
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point
+from simgap.robots.noise import resolution
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-BROKEN = 12.0  # chosen: noise's standard deviations by which a single sample leaves both of its neighbours
+BROKEN = 10.0  # chosen: of what 5 % of samples leave the mean of their neighbours by, a sample that is broken
 SCATTER = 0.05  # prior: of a parameter's usual size, by which a model's error moves it from motion to motion
 WEIGHT = 3.0  # prior: motions that this is worth
 FEW = 3.0  # numerics: factor on the scatter that is learned from few motions, at most
@@ -62,10 +63,14 @@ def without_broken(
                 continue
             v = values[seen]
             before, after = np.concatenate([[v[1]], v[:-1]]), np.concatenate([v[1:], [v[-2]]])
-            off = np.minimum(np.abs(v - before), np.abs(v - after))
-            same = np.where(np.sign(v - before) == np.sign(v - after), off, 0.0)
-            usual = max(float(robust_sd(np.diff(v))), float(np.quantile(np.abs(np.diff(v)), 0.99)) / 3)
-            wrong = seen[same > BROKEN * max(usual, 1e-300)]
+            off = v - (before + after) / 2
+            out_of = (np.sign(v - before) == np.sign(v - after)) & (v != before) & (v != after)
+            size = np.abs(off)
+            usual = max(float(robust_sd(off)), float(np.quantile(size, 0.95)), resolution(values), 1e-300)
+            beside = np.maximum(
+                np.append(size[1:], 0.0), np.append(0.0, size[:-1])
+            )  # a wild one has half of it
+            wrong = seen[out_of & (size > BROKEN * usual) & (size > 1.5 * beside)]
             if wrong.size:
                 columns[name] = np.where(np.isin(np.arange(values.size), wrong), np.nan, values)
                 found += [Broken(log.name, name, float(log.t[k]), float(values[k])) for k in wrong]
