@@ -38,14 +38,26 @@ from simgap.robots.calibrate import LONGEST, Calibration, calibrate
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
-from simgap.robots.unchanged import Broken, Coordinates, Null, Whitened, learned, sums, without_broken
+from simgap.robots.unchanged import (
+    Broken,
+    Coordinates,
+    Null,
+    Whitened,
+    learned,
+    of_one_motion,
+    sums,
+    without_broken,
+)
 from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 STAGES = 8  # look: what a progress bar counts
 LEAST = 0.2  # numerics: of a log's own size over that of OLD's logs
-GROUPS, MANY = 8, 12  # numerics: logs or stretches held out, at least, and of those whose signs are all tried
+GROUPS, MANY = (
+    10,
+    12,
+)  # numerics: logs or stretches held out, at least, and of those whose signs are all tried
 PRIOR = (0.5, 0.3, 0.2)  # prior: that nothing changed, one thing, two
 LADDER = (-1.4, -0.7, -0.35, 0.35, 0.7, 1.4)  # numerics: logarithms from which a fit may begin
 SIZE = np.log(2.0)  # prior: a change that is usual, as a logarithm
@@ -91,12 +103,20 @@ class Comparison:
         self.prior = np.linalg.inv(spread)
         self.inside = np.linalg.inv(self.loose.T @ self.loose + self.prior)
         motion = self.new.motion
-        pieces = -(-GROUPS // (motion.max() + 1))  # few motions are held out by stretches
+        # Few motions are held out by stretches, but what a model gets wrong all along a motion that OLD never
+        # made says the same in every stretch: of such a motion there is one.
+        pieces = -(-GROUPS // (motion.max() + 1)) if self.known_motions else 1
         self.group = np.zeros(rows.log.size, int)
         for i in range(self.logs):
             mine = rows.log == i
             order = np.argsort(np.argsort(rows.time[mine], kind="stable"), kind="stable")
             self.group[mine] = motion[mine] * pieces + order * pieces // mine.sum()
+
+    @property
+    def known_motions(self) -> bool:
+        """Whether OLD made every motion of NEW."""
+        old = self.null.motions
+        return all(any(of_one_motion(one, other) for other in old) for one in self.new.motions)
 
     def coordinates(self, effects: Sequence[str]) -> Coordinates:
         """Of some effects about OLD's point."""

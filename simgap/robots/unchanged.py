@@ -23,14 +23,15 @@ from simgap.robots.calibrate import Calibration
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point
+from simgap.robots.noise import resolution
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-BROKEN = 12.0  # chosen: noise's standard deviations by which a single sample leaves both of its neighbours
+BROKEN = 10.0  # chosen: of what 5 % of samples leave the mean of their neighbours by, a sample that is broken
 SCATTER = 0.05  # prior: of a parameter's usual size, by which a model's error moves it from motion to motion
 WEIGHT = 3.0  # prior: motions that this is worth
 FEW = 3.0  # numerics: factor on the scatter that is learned from few motions, at most
-ALIKE = 0.1  # chosen: of a channel's standard deviation; simulations closer than this are of one motion
+ALIKE = 0.1  # chosen: of a command's usual size; logs whose commands are closer than this are of one motion
 PASSES, ROUNDS = 3, 60  # numerics: of learning the processes, and of EM
 POSITIVE = 0.05  # numerics: of its sd, above which a parameter that cannot be negative is varied by factors
 STEP = 0.02  # numerics: of a finite difference
@@ -62,10 +63,14 @@ def without_broken(
                 continue
             v = values[seen]
             before, after = np.concatenate([[v[1]], v[:-1]]), np.concatenate([v[1:], [v[-2]]])
-            off = np.minimum(np.abs(v - before), np.abs(v - after))
-            same = np.where(np.sign(v - before) == np.sign(v - after), off, 0.0)
-            usual = max(float(robust_sd(np.diff(v))), float(np.quantile(np.abs(np.diff(v)), 0.99)) / 3)
-            wrong = seen[same > BROKEN * max(usual, 1e-300)]
+            off = v - (before + after) / 2
+            out_of = (np.sign(v - before) == np.sign(v - after)) & (v != before) & (v != after)
+            size = np.abs(off)
+            usual = max(float(robust_sd(off)), float(np.quantile(size, 0.95)), resolution(values), 1e-300)
+            beside = np.maximum(
+                np.append(size[1:], 0.0), np.append(0.0, size[:-1])
+            )  # a wild one has half of it
+            wrong = seen[out_of & (size > BROKEN * usual) & (size > 1.5 * beside)]
             if wrong.size:
                 columns[name] = np.where(np.isin(np.arange(values.size), wrong), np.nan, values)
                 found += [Broken(log.name, name, float(log.t[k]), float(values[k])) for k in wrong]
@@ -212,7 +217,8 @@ def _innovations(spread, gain, decay, values):
 class Null:
     """What is known of a robot that did not change: its `point`, the coordinates of what was fitted with
     their covariance (p, p), by channel the `processes`, all coordinates' scatter `tau` from log to log, and
-    how well logs that took no part are met: logarithms of whitened mean squares (num_old,)."""
+    how well logs that took no part are met: logarithms of whitened mean squares (num_old,). `motions`: every
+    log's."""
 
     point: Point
     theta: Coordinates
@@ -221,6 +227,7 @@ class Null:
     every: Coordinates
     tau: np.ndarray
     left: np.ndarray
+    motions: list[Motion]
 
     def tail(self, left: np.ndarray) -> float:
         """The share of unchanged robots whose logs are met no better than those that leave squares `left`
@@ -229,6 +236,30 @@ class Null:
         sd = max(float(self.left.std(ddof=1)), 0.1)
         far = float(new.mean() - self.left.mean()) / (sd * np.sqrt(1 / n + 1 / new.size))
         return float(student.sf(far, n - 1))
+
+
+Motion = list[tuple[np.ndarray, np.ndarray, float]]  # by command times [s], values, and their usual size
+
+
+def motions_of(composed: Composed) -> list[Motion]:
+    """What every log's commands are."""
+    logs, known = composed.recordings, composed.simulator.channels
+    out: list[Motion] = [[] for _ in logs]
+    for name in (n for n, c in known.items() if c.kind == "command"):
+        every = np.concatenate([log[name] for log in logs])
+        size = float(np.std(every) + abs(np.mean(every)))
+        for mine, log in zip(out, logs, strict=True):
+            mine.append((log.t - log.t[0], log[name], max(size, 1e-300)))
+    return out
+
+
+def of_one_motion(one: Motion, other: Motion) -> bool:
+    """Whether commands are alike: logs of one motion share what a model gets wrong."""
+    far = []
+    for (t, a, size), (u, b, _) in zip(one, other, strict=True):
+        both = t <= min(t[-1], u[-1])
+        far.append(float(np.sqrt(np.mean((a[both] - np.interp(t[both], u, b)) ** 2))) / size)
+    return bool(far) and max(far) < ALIKE
 
 
 class Whitened:
@@ -247,32 +278,14 @@ class Whitened:
         own = [np.where(self.log == i, d, 0.0) for d in doubts for i in np.unique(self.log)]
         self.doubts = np.array(own).T.reshape(self.log.size, -1)
         self.columns = self.slopes(point, every)
-        self.motion = self._motions()
-
-    def _motions(self) -> np.ndarray:
-        """The number (N,) of each row's motion: logs of one are alike in what the model makes of them."""
-        rows, made = self.composed.rows, self.composed.rows.observed - self.residual
-        size = [max(float(made[rows.channel == c].std()), 1e-300) for c in range(len(rows.channels))]
-        first: list[int] = []
-        out = np.zeros(int(self.log.max()) + 1, int)
-
-        def answer(log: int, channel: int) -> tuple[np.ndarray, np.ndarray]:
-            mine = (self.log == log) & (rows.channel == channel)
-            return rows.time[mine] - rows.time[mine][0], made[mine]
-
-        def apart(one: int, other: int) -> float:
-            far = []
-            for c, scale in enumerate(size):
-                (t, a), (u, b) = answer(one, c), answer(other, c)
-                both = t <= min(t[-1], u[-1])
-                far.append(float(np.sqrt(np.mean((a[both] - np.interp(t[both], u, b)) ** 2))) / scale)
-            return max(far)
-
-        for log in range(out.size):
-            same = next((k for k, other in enumerate(first) if apart(log, other) < ALIKE), len(first))
-            first += [log] if same == len(first) else []
-            out[log] = same
-        return out[self.log]
+        self.motions = motions_of(composed)
+        first: list[Motion] = []
+        number = np.zeros(len(self.motions), int)
+        for log, motion in enumerate(self.motions):
+            same = next((k for k, other in enumerate(first) if of_one_motion(motion, other)), len(first))
+            first += [motion] if same == len(first) else []
+            number[log] = same
+        self.motion = number[self.log]  # (N,)
 
     def slopes(self, point: Point, of: Coordinates, x: np.ndarray | None = None) -> np.ndarray:
         """Derivatives (N, k) of the simulated rows by coordinates, at a point that holds them at x."""
@@ -373,7 +386,9 @@ def _learned(composed: Composed, point: Point, fitted: Sequence[str], candidates
     columns = old.whiten(old.columns[:, :p])
     covariance = np.linalg.inv(columns.T @ columns + prior)
     few = float(student.ppf(0.975, max(len(told) - 1, 1)) / normal.ppf(0.975))  # of so few motions
-    return Null(point, theta, covariance, processes, every, min(few, FEW) * tau, np.log(squares / level))
+    return Null(
+        point, theta, covariance, processes, every, min(few, FEW) * tau, np.log(squares / level), old.motions
+    )
 
 
 def sums(columns: np.ndarray, white: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
