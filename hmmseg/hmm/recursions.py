@@ -178,7 +178,7 @@ def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | Non
         def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             t, (states, moves, now) = n - 1 - i, carry
             moved = now[None] * shares(row(before, t - 1), row(w, t - 1))
-            now = sum(backwards(moved[d], d, 0.0) for d in range(num_bands))
+            now = reduce(jnp.add, [backwards(moved[d], d, 0.0) for d in range(num_bands)])
             states = lax.dynamic_update_index_in_dim(states, now, t - 1, 0)
             return states, lax.dynamic_update_index_in_dim(moves, moved, t - 1, 0), now
 

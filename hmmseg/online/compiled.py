@@ -63,7 +63,8 @@ def _or_nothing(of_cache: Callable) -> Callable:
 def _for_numbers(function: Callable) -> None:
     """Let compiled functions call for single numbers what other packages compute of arrays."""
     plain = inspect.unwrap(function)
-    overload(function, jit_options=OPTIONS, strict=False)(lambda *_, **__: plain)
+    options: Any = OPTIONS
+    overload(function, jit_options=options, strict=False)(lambda *_, **__: plain)
 
 
 for _shared in (densities.log_student, densities.log_student_below, densities.log_between,

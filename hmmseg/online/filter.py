@@ -320,7 +320,8 @@ class Filter:
         s = self._state
         best = int(s.rows["weight"][: s.count].argmax())
         h, known = s.rows[best], s.known[best]
-        scale = dict(zip(SCALES, np.sqrt(h["scale"][:, 0] / h["scale"][:, 1]).tolist(), strict=True))
+        sds = np.sqrt(h["scale"][:, 0] / h["scale"][:, 1]).tolist()
+        scale: dict[str, float] = dict(zip(SCALES, sds, strict=True))
         weight, width = {}, {}
         for o, name in enumerate(self.task.objects):
             (load, sure), (size, seen) = known[2 * o : 2 * o + 2].tolist()

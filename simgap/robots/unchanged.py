@@ -354,6 +354,7 @@ def _learned(composed: Composed, point: Point, fitted: Sequence[str], candidates
     sd = np.array([composed.effects[e].parameters[s].sd for e, s in theta.names])
     prior = np.diag((theta.slopes(np.zeros(p)) / sd) ** 2) if p else np.zeros((0, 0))
     tau, left, scale = np.full(len(every.names), SCATTER), old.residual, np.ones(n)
+    squares, level, processes = np.ones(n), 1.0, ()
     for _ in range(PASSES):
         processes = tuple(old.sequences.learned(left / scale[old.log]))
         old.by(processes, 0 * tau, scale)
