@@ -182,8 +182,9 @@ class _Catalogue:
             made[found.width] = found
             sd = GAP * sizes_of(motions, j).reach
             self.parameters[found.width] = Parameter(0.0, sd, unit, low=0.0, effect=effect)
-            none = lambda model, value=0.0: 0.0  # noqa: E731
-            self.settings[found.width] = Setting(found.width, unit, none, none, False, None)
+            self.settings[found.width] = Setting(
+                found.width, unit, lambda model: 0.0, lambda model, value: None, False, None
+            )
             self.says[effect] = f"play between motor and {name}"
         simulator.played = made
 
