@@ -26,7 +26,7 @@ from experiments.worlds import GRASP_SPREAD, Cell, deviated, disturbed, draw_dev
 from hmmseg.io.rig import Fingertip, Noise, Rig, Systematic
 from hmmseg.io.task import BlockTask, parse_task
 from hmmseg.io.trial import Trial
-from simgap.gap.synthetic import recorded
+from simgap.gap.twins import recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import random_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials

@@ -22,9 +22,9 @@ from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Fingertip, Noise, Rig, Systematic, read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import Trial
-from simgap.gap.synthetic import recorded
+from simgap.gap.twins import recorded
+from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.operator import OperatorSettings, Plan, Window, minimum_jerk
-from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import random_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 

@@ -12,11 +12,12 @@ import numpy as np
 from hmmseg.io.rig import FORCE_CHANNELS
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
 from simgap.generic.diagnose import GenericDiagnosis
-from simgap.generic.features import SLOW, bin_edges
-from simgap.generic.locate import both_variances
+from simgap.generic.trials import SLOW, bin_edges
+from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
+from simgap.robots.linear import base_at
 
 LABELS = {
     "x": "x [cm]",
@@ -90,9 +91,9 @@ def draw_signal(found: Diagnosis, path: Path) -> None:
 def draw_generic(found: GenericDiagnosis, path: Path) -> None:
     """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
     lay = found.scene.layout
-    slow = [k for k, cell in enumerate(lay.cells) if cell[0] >= 0 and lay.kind[lay.cell == k][0] == SLOW]
-    cell = max(slow, key=lambda k: found.located.z[k])
-    channel, worst = lay.cells[cell][:2]
+    excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
+    courses = [(c, k) for c in range(len(lay.ensembles.channels)) for k in range(len(lay.ensembles.subtasks))]
+    channel, worst = max(courses, key=lambda cell: excess[lay.where(SLOW, *cell)].mean())
     index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
     ends = found.scene.edges
     edges = [bin_edges(lay, ends[k], ends[k + 1], k) for k in range(ends.size - 1)]
@@ -103,14 +104,11 @@ def draw_generic(found: GenericDiagnosis, path: Path) -> None:
         for rows, colour, label in ((real, RED, "real"), (sim, BLUE, "simulated")):
             above.plot(t, rows.T, color=colour, lw=0.5, alpha=0.35)
             above.plot(t, rows.mean(0), color=colour, lw=1.4, label=label)
-        moved = sim.mean(0) + found.leading.shift[index]
-        above.plot(
-            t, moved, color="black", lw=1, ls="--", label=f"simulated + {' + '.join(found.leading.effects)}"
-        )
+        moved = sim.mean(0) + found.shift[index]
+        above.plot(t, moved, color="black", lw=1, ls="--", label=f"simulated + {' + '.join(found.leading)}")
         above.legend(fontsize=6.5)
         above.set_ylabel(lay.ensembles.channels[channel])
-        a, b = both_variances(lay, found.real, found.sim)
-        sd = np.sqrt(a + b / len(found.sim))[index]
+        sd = np.sqrt(found.variance[index])
         below.plot(t, (real.mean(0) - sim.mean(0)) / sd, ".-", color=RED, ms=3, lw=0.6, label="before")
         below.plot(t, (real.mean(0) - moved) / sd, ".-", color=BLUE, ms=3, lw=0.6, label="after")
         below.set_yscale("symlog", linthresh=3)
@@ -257,3 +255,22 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         axes.set_title("Held-out logs" if found.shrinkage is not None else "All logs")
+
+
+def draw_changes(found: Changes, path: Path) -> None:
+    """Recorded, the model of the old logs, and with what changed, in the new log that parts most."""
+    rows, point = found.composed.rows, found.null.point
+    runs = [base_at(found.composed, p).rows for p in (point, found.point())]
+    size = np.sqrt(rows.variance)
+    log = int(np.bincount(rows.log, ((rows.observed - runs[0]) / size) ** 2).argmax())
+    with canvas(path, height=1.2 + 1.5 * len(rows.channels)) as figure:
+        axes = np.atleast_1d(figure.subplots(len(rows.channels), 1, sharex=True))
+        for c, (name, ax) in enumerate(zip(rows.channels, axes, strict=True)):
+            mine = (rows.log == log) & (rows.channel == c)
+            ax.plot(rows.time[mine], rows.observed[mine], color="black", lw=1.2, label="recorded")
+            for run, colour, label in zip(runs, (RED, BLUE), ("as it was", "with what changed"), strict=True):
+                ax.plot(rows.time[mine], run[mine], color=colour, lw=0.8, label=label)
+            ax.set_ylabel(f"{name} [{found.composed.simulator.channels[name].unit}]")
+        axes[0].legend(fontsize=6.5)
+        axes[0].set_title(f"{_short(found.composed.recordings[log].name)}, run freely from its first sample")
+        axes[-1].set_xlabel("time [s]")

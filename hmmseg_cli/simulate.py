@@ -56,7 +56,7 @@ def simulate(
         from hmmseg.io.task import BlockTask, read_task
         from simgap.world.animation import require_encoder
         from simgap.world.properties import PAPER_BLOCKS, paper_blocks, read_properties
-        from simgap.world.writing import scene_files
+        from simgap.world.simulate import scene_files
 
         if animation:
             require_encoder(f".{animation_format.value}")
@@ -102,8 +102,7 @@ def _perform(out: Output, task, rig, blocks, count: int, operator, seed: int, fi
 
     from simgap.world.animation import Scene, Trace
     from simgap.world.operator import OperatorSettings, read_operator
-    from simgap.world.simulate import simulate_trials
-    from simgap.world.writing import trial_files
+    from simgap.world.simulate import simulate_trials, trial_files
 
     settings = OperatorSettings() if operator is None else read_operator(operator)
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
@@ -141,7 +140,7 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     from hmmseg.segmentation.align import segment
     from simgap.world.animation import Scene, Trace
     from simgap.world.replay import replay, residual_summary
-    from simgap.world.writing import trial_files
+    from simgap.world.simulate import trial_files
 
     recording = read_trials(out, [path], rig)[0]
     segmentation = segment([recording], task, rig)[0]

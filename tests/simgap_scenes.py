@@ -7,7 +7,7 @@ from hmmseg.io.rig import Finger, Fingertip, Noise, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from simgap.world.dynamics import Physics, State, Tips, resting_state, substep
 from simgap.world.properties import Block
-from simgap.world.scene import Surroundings, physics
+from simgap.world.virtual_model import Surroundings, physics
 
 RIG = Rig(fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))
 HAND = Rig(

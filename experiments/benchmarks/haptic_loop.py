@@ -30,11 +30,15 @@ from experiments.saving import save
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.jaxconfig import configure
-from simgap.world.haptics import PassivityControl, stiffest_passive
 from simgap.world.properties import PAPER_BLOCKS
-from simgap.world.scene import Surroundings
 from simgap.world.simulate import simulate_trial
-from simgap.world.virtual_model import VirtualModel, _program
+from simgap.world.virtual_model import (
+    PassivityControl,
+    Surroundings,
+    VirtualModel,
+    _program,
+    stiffest_passive,
+)
 
 TASK = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
 PADS = Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0)

@@ -27,13 +27,11 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.segmentation.thresholds import segment_qualitative
+from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.operator import minimum_jerk
-from simgap.world.performance import CONTROL_PERIOD
 from simgap.world.properties import PAPER_BLOCKS
-from simgap.world.scene import physics, substeps_for
-from simgap.world.sensors import record
-from simgap.world.simulate import SimulatedTrial, simulate_trials
-from simgap.world.virtual_model import Rollout, rollout, standing
+from simgap.world.simulate import SimulatedTrial, record, simulate_trials
+from simgap.world.virtual_model import Rollout, physics, rollout, standing, substeps_for
 
 STACK = BlockTask({"block1": GROUND, "block2": GROUND}, (Move("block2", "block1"),))
 PLACES = {"block1": 0.15, "block2": 0.11}  # m

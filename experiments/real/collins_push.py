@@ -136,7 +136,7 @@ def told(found: RobotDiagnosis) -> dict[str, Any]:
         for k, name in enumerate(found.phases.names)
         if (phase == k).any()
     }
-    borne = [found.forms.gap.candidates[j].name for j in found.verdict.model.effects]
+    borne = list(found.verdict.explanation)
     point = {n: dict(at) for n, at in found.linear.point.items() if not n.startswith("log.")}
     more: Any = rounded({"where": where, "rms_fitted": left, "borne_out": borne, "point": point})
     return summary(found) | more

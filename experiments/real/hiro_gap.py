@@ -22,9 +22,8 @@ from experiments.real.on_folder import run_on_folder
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from simgap.generic.diagnose import GenericDiagnosis, diagnose
-from simgap.generic.features import transformed
-from simgap.generic.report import channel_name
-from simgap.generic.ringing import Ring, fit_ring, from_swing
+from simgap.generic.effects import Ring, fit_ring, from_swing
+from simgap.generic.trials import DURATION, SLOW, transformed
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "hiro_gap.json"
 REAL, SIM = "real_guarded", "sim"
@@ -65,29 +64,25 @@ def compared(real: Labelled, sim: Labelled, tail: float, seed: int = 0) -> Gener
 
 
 def table(found: GenericDiagnosis) -> dict:
-    """By channel and subtask: mean real and simulated force, their difference and each kind's scatter, and
-    the scores of all bands."""
+    """By channel and subtask: mean real and simulated force and each kind's scatter; durations [s]."""
     lay, out = found.scene.layout, {}
-    for k, (c, s, low, high) in enumerate(lay.cells):
-        name, subtask = channel_name(lay, c), lay.ensembles.subtasks[s]
-        entry = out.setdefault(name, {}).setdefault(subtask, {"bands": []})
-        z = float(found.located.z[k])
-        entry["bands"].append({"band": [low, high], "z": z, "significant": z > found.located.threshold})
-        mine = lay.cell == k
-        if low == 0 and c >= 0:
-            for kind, rows in (("real", found.real), ("sim", found.sim)):
-                each = rows[:, mine].mean(1)
-                entry[kind] = {"mean": float(each.mean()), "sd_between_trials": float(each.std(ddof=1))}
-        elif c < 0:
-            entry |= {"real": float(np.exp(found.real[:, mine].mean())),
-                      "sim": float(np.exp(found.sim[:, mine].mean()))}  # fmt: skip
+    kinds = {"real": found.real, "sim": found.sim}
+    for s, subtask in enumerate(lay.ensembles.subtasks):
+        for c, name in enumerate(lay.ensembles.channels):
+            each = {kind: rows[:, lay.where(SLOW, c, s)].mean(1) for kind, rows in kinds.items()}
+            out.setdefault(name, {})[subtask] = {
+                kind: {"mean": float(v.mean()), "sd_between_trials": float(v.std(ddof=1))}
+                for kind, v in each.items()
+            }
+        (log,) = lay.where(DURATION, -1, s)
+        durations = {kind: float(np.exp(rows[:, log].mean())) for kind, rows in kinds.items()}
+        out.setdefault("duration", {})[subtask] = durations
     return out
 
 
 def summary(found: GenericDiagnosis) -> dict:
     """Verdict, best explanation, its parameters and shrinkage."""
     body = found.body
-    best = "+".join(found.leading.effects)
     lay = found.scene.layout
     share: dict[str, float] = {}
     for row in body["where"]:
@@ -97,9 +92,9 @@ def summary(found: GenericDiagnosis) -> dict:
         "trials": {"real": len(lay.ensembles.real), "sim": len(lay.ensembles.sim)},
         **{k: body[k] for k in ("verdict", "causes", "probabilities", "detection", "attribution")},
         "remainder": body["remainder"]["share"],
-        "significant_cells": int((found.located.z > found.located.threshold).sum()),
-        "cells": len(lay.cells), "largest_shares": dict(sorted(share.items(), key=lambda i: -i[1])[:12]),
-        "best_explanation": body["best_explanation"], "parameters": body["effects"][best]["parameters"],
+        "largest_shares": dict(sorted(share.items(), key=lambda i: -i[1])[:12]),
+        "best_explanation": list(found.leading), "shrinkage": body["shrinkage"],
+        "parameters": {n: body["effects"][n]["parameters"] for n in found.leading},
         "by_subtask": by_subtask(found), "forces": table(found),
     }  # fmt: skip
 
@@ -201,7 +196,7 @@ def course(found: GenericDiagnosis, channels: Sequence[str] = ("fx", "fz", "my")
             "real_sd": found.real[:, index].std(0, ddof=1).tolist(),
             "sim": found.sim[:, index].mean(0).tolist(),
             "sim_sd": found.sim[:, index].std(0, ddof=1).tolist(),
-            "explained": (found.sim.mean(0) + found.leading.shift)[index].tolist(),
+            "explained": (found.sim.mean(0) + found.shift)[index].tolist(),
             "subtask": lay.subtask[index].tolist(),
         }  # fmt: skip
     return out

@@ -47,10 +47,9 @@ def summary(found: RobotDiagnosis) -> dict:
     likely = sorted(told["probabilities"].items(), key=lambda item: -item[1])[:8]
     out: dict[str, Any] = {k: told[k] for k in KEPT} | {
         "probabilities": dict(likely),
-        "remainder": {"share": told["remainder"]["share"], "regimes": told["remainder"]["regimes"]},
+        "remainder": {n: told["remainder"][n] for n in ("share", "rms_over_noise")},
     }
     if found.shrinkage is not None:
-        out["by_fold"] = [list(names) for names in found.shrinkage.found]
         rows, far = found.composed.rows, found.shrinkage
         if len(rows.channels) == 1:
             names = [log.name for log in found.composed.recordings]

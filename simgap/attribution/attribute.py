@@ -9,26 +9,151 @@ from itertools import product
 import numpy as np
 
 from hmmseg.errors import InputError
-from simgap.attribution.cells import significant
-from simgap.attribution.detection import detected, leniently, statistic
-from simgap.attribution.findings import Attribution, EffectPosterior, ParameterPosterior, Remainder, SmallGap
-from simgap.attribution.heldout import Heldout
-from simgap.attribution.invariance import (
+from simgap.attribution.heldout import (
     POSITIVE,
+    Heldout,
+    HowFar,
     Invariance,
     invariance,
     residual_left,
     scatter_between,
 )
-from simgap.attribution.noise import noise_of, small_gap, stated
 from simgap.attribution.posterior import Forms, Model, channel_of, coordinates, fitted, forms
-from simgap.attribution.problem import Gap
-from simgap.attribution.search import sought, weights
-from simgap.attribution.shares import Shares, shares
-from simgap.attribution.verdict import ALARM, LEAST, Explanation, acting, conclude, known
+from simgap.attribution.problem import Gap, Rows
+from simgap.attribution.search import Detection, detected, leniently, sought, statistic, weights
+from simgap.attribution.verdict import (
+    ALARM,
+    LEAST,
+    Cell,
+    Explanation,
+    Shares,
+    Verdict,
+    acting,
+    conclude,
+    known,
+    shares,
+    significant,
+)
+
+# What an attribution finds, as frozen objects.
+
+
+@dataclass(frozen=True)
+class ParameterPosterior:
+    """Mean, standard deviation and 90 % interval, given that the effect acts."""
+
+    mean: float
+    sd: float
+    interval_90: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EffectPosterior:
+    """One effect: `probability` to act, `share` of the gap it explains with its 90 % interval (0 where it
+    does not act), parameters, whether they are the same in all trials, and which of the gap's candidates (an
+    effect may have several forms) they are of."""
+
+    probability: float
+    share: float
+    share_90: tuple[float, float]
+    parameters: dict[str, ParameterPosterior]
+    invariance: Invariance | None
+    candidate: int
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What no named cause explains: its `share` of the gap, the chance of noise to look so, and where."""
+
+    share: float
+    p_value: float
+    where: tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class SmallGap:
+    """A gap below the smallest that matters: `size` over that, of the `channel` and `part` with the most;
+    `amount` there in sds of the noise, for the caller to turn into units."""
+
+    size: float
+    channel: str
+    part: str
+    amount: float
+
+
+@dataclass(frozen=True)
+class Attribution(Verdict):
+    """The verdict, with everything else that was found; see the fields' own classes.
+
+    `left` (n,): residual that the causes leave, `before` (n,): with nuisances alone, both as cosines of each
+    cell.
+    """
+
+    effects: dict[str, EffectPosterior]
+    detection: Detection
+    remainder: Remainder
+    where: tuple[Cell, ...]
+    how_far: HowFar | None
+    small_gap: SmallGap | None
+    noise: dict[str, float]
+    models: tuple[Model, ...]
+    shares: Shares
+    before: np.ndarray
+    left: np.ndarray
+
+
+# Noise of each channel over the stated one, and gaps too small to matter.
+
+STATED = (0.6, 1.7)  # prior: bounds of a channel's noise over the stated one, in standard deviations
+
+
+def noise_of(f: Forms, model: Model) -> np.ndarray:
+    """Noise (channels,) over the stated one, sd: the median of the groups that a set leaves, by their counts.
+
+    Groups where the model is off by itself are few: a median does not see them. Each is measured by the
+    median of as many squares of noise, which is less than their mean (Wilson & Hilferty, PNAS 17, 1931).
+    """
+    count = np.maximum(f.count, 1)
+    channel, ratio = channel_of(f), model.energy / (count * (1 - 2 / (9 * count)) ** 3)
+    out = np.ones(len(f.gap.rows.channels))
+    for c in np.unique(channel):
+        mine = np.flatnonzero((channel == c) & (f.count >= 8))
+        if mine.size >= 3:
+            order = mine[np.argsort(ratio[mine])]
+            share = np.cumsum(f.count[order]) / f.count[order].sum()
+            out[c] = np.sqrt(ratio[order[np.searchsorted(share, 0.5)]])
+    return np.clip(out, *STATED)
+
+
+def stated(rows: Rows) -> np.ndarray:
+    """The noise (channels,) that rows are measured by, over the stated one."""
+    out = np.ones(len(rows.channels))
+    for c in np.unique(rows.channel) if rows.sd is not None else ():
+        out[c] = np.sqrt(np.mean(rows.sd[rows.channel == c] ** 2))  # type: ignore[index]
+    return out
+
+
+def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap:
+    """The gap's size, over what matters least, where it is largest."""
+    before = residual_left(f, fitted(f, ()))
+    rows = f.gap.rows
+    key, inverse = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
+    count = np.bincount(inverse).astype(float)
+    noise = by_group[f.spectrum.group]
+    excess = np.maximum(np.bincount(inverse, before**2) - np.bincount(inverse, noise), 0.0) / count
+    chance = np.sqrt(2 / count) * np.bincount(inverse, noise) / count
+    amount = np.sqrt(np.maximum(excess - 2 * chance, 0.0))
+    sd = np.sqrt(np.bincount(inverse, np.ones(inverse.size) if rows.sd is None else rows.sd**2) / count)
+    amount, least = amount * sd, np.bincount(inverse, tolerance) / count
+    size = amount / least
+    most = int(size.argmax())
+    channel, part = divmod(int(key[most]), len(rows.parts))
+    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]))
+
 
 DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
-EXAMINED = 6  # numerics: sets of which it is asked whether they are the cause
+SPREAD = 0.9  # numerics: share of a parameter's squares in one part from which on it acts in no other
+EXAMINED = 6  # numerics: sets that are examined for being the cause
 
 
 def attribute(
@@ -189,7 +314,7 @@ def _examined(
     """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
-    same = {j: invariance(f, model, j, f.gap.rows.trial) for j in effects}
+    same = {j: _same(f, model, j) for j in effects}
     part = explained.each.mean(0) if effects else np.zeros(0)
     least = LEAST * float(part.sum())
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
@@ -214,6 +339,17 @@ def _examined(
     return _Examined(effects, model, explained, same, causes, sure)
 
 
+def _same(f: Forms, model: Model, effect: int) -> Invariance:
+    """Whether an effect is the same in all trials, and of `parts_alike` in all parts: the weaker evidence."""
+    gap = f.gap
+    found = [invariance(f, model, effect, gap.rows.trial)]
+    by = [np.bincount(gap.rows.part, push**2) for push in gap.candidates[effect].jacobian.T]
+    if gap.parts_alike and any(each.max() < SPREAD * each.sum() for each in by):
+        by_part = invariance(f, model, effect, gap.rows.part)
+        found = [by_part] if np.isnan(found[0].wander) else [*found, by_part]
+    return min(found, key=lambda one: one.log_bayes_factor)
+
+
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     """Those causes without which trials that took no part are predicted worse, taken out one by one."""
     while causes:
@@ -226,7 +362,7 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _matters(f: Forms, model: Model, effect: int) -> bool:
-    """Whether an effect's own deviation matters, however little it shifts beside others."""
+    """Whether an effect's own deviation matters, however little it shifts compared with others."""
     c, own = f.gap.candidates[effect], coordinates(f, model.effects)[effect]
     return c.least is not None and bool((np.abs(c.scale * model.x[own]) >= c.least).any())
 
@@ -267,7 +403,7 @@ def _effects(
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
         same = None if found is None else found.invariance[j]
-        # Of what is in no set that was asked, parts are not compared.
+        # Parts are compared for effects of the sets that were examined alone.
         wide = sd if found is None else np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,

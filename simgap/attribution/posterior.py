@@ -13,10 +13,127 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit, gammaln
 
-from simgap.attribution.background import Background
-from simgap.attribution.noise_products import of_noise, products
-from simgap.attribution.problem import Candidate, Gap, Spectrum, spectrum
+from simgap.attribution.problem import Candidate, Gap, Spectrum, cosines, spectrum
 from simgap.bounded import least
+
+# The background: what no candidate explains, by group of rows, with a variance of its own.
+#
+# The rows of a group (a channel in a part, in a band) have variance phi, one as a rule. Beforehand log phi is
+# normal, as stated noise is a little off, and with some probability log-uniform above that: there the model
+# is off for reasons of its own. By what does not matter (a tolerance) any group is as likely off as not.
+# Averaged over phi, what a group's squares say grows with their logarithm only, so that no group decides
+# alone (a scale mixture of normals: West, Biometrika 74, 1987).
+
+STATED = 0.3  # prior: sd of log variance about the stated one: noise stated to 15 %
+OFF = 0.1  # prior: share of groups, beforehand, in which the model is off by itself
+WITHIN = 0.5  # prior: share of groups in which it is off by less than matters
+NEAR, FAR = 13, 20  # numerics: points of the grid
+NEAR_BY = 3.5 * STATED  # numerics: log variance between the two parts of the grid
+LARGEST = 1e6  # numerics: the most that a variance exceeds the stated one
+
+
+@dataclass(frozen=True)
+class Background:
+    """A grid of log variances and the log of their prior weights; `plain` knows no background at all."""
+
+    log_phi: np.ndarray
+    log_prior: np.ndarray
+
+    @classmethod
+    def usual(cls, stated: float = STATED, off: float = OFF) -> Background:
+        """Stated noise, or the model off."""
+        grid = np.concatenate(
+            [np.linspace(-3, 3, NEAR) * stated, np.linspace(4 * stated, np.log(LARGEST), FAR)]
+        )
+        normal = -0.5 * (grid[:NEAR] / stated) ** 2
+        log_prior = np.concatenate([
+            np.log(1 - off) + normal - np.logaddexp.reduce(normal), np.full(FAR, np.log(off / FAR)),
+        ])  # fmt: skip
+        return cls(grid, log_prior)
+
+    @classmethod
+    def plain(cls) -> Background:
+        """Noise exactly as stated."""
+        return cls(np.zeros(1), np.zeros(1))
+
+    def tolerant(self, most: np.ndarray) -> np.ndarray:
+        """The log prior (grid, G) of groups whose variance may be so much (G,) without it mattering."""
+        inside = (self.log_phi[:, None] > NEAR_BY) & (self.log_phi[:, None] <= np.log(most))
+        number = inside.sum(0)
+        share = np.where(number > 0, WITHIN, 0.0)
+        # What is beyond any tolerance stays as likely as it was.
+        usual = self.log_phi <= NEAR_BY
+        taken = share * np.exp(self.log_prior[usual]).sum()
+        with np.errstate(divide="ignore"):
+            more = np.log(np.where(inside, taken / np.maximum(number, 1), 0.0))
+        less = np.where(usual[:, None], np.log1p(-share), 0.0)
+        return np.logaddexp(self.log_prior[:, None] + less, more)
+
+    def marginal(
+        self,
+        energy: np.ndarray,
+        count: np.ndarray,
+        shift: np.ndarray | float = 0.0,
+        most: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Log density (G,) of groups with these squares and counts, but for (2 pi)^(-count/2), and their
+        expected precisions (G,). `shift`: log variance that the groups have in any case; `most` (G,): the
+        variance that does not matter."""
+        log_phi = self.log_phi[:, None] + shift
+        precision = np.exp(-log_phi)
+        prior = self.log_prior[:, None] if most is None else self.tolerant(most)
+        each = prior - 0.5 * (count * log_phi + energy * precision)
+        peak = each.max(axis=0)
+        weight = np.exp(each - peak)
+        total = weight.sum(axis=0)
+        return peak + np.log(total), (weight * precision).sum(axis=0) / total
+
+
+# What the sensors' noise adds to the products of a gap's columns, to be taken off again.
+#
+# An effect takes a recording back, noise and all: softer pads bring more of the force's noise into a
+# distance, a force read between two samples has less of it. Its columns are noisy, then, and by noise alone a
+# set of effects may leave smaller squares than none (errors in variables). Each product of two columns is in
+# expectation that of their noiseless parts and that of their noises; the second is known and subtracted: the
+# moments' correction of Fuller (Measurement Error Models, 1987), a corrected score (Nakamura, Biometrika 77,
+# 1990). It needs no residual to be free of other errors, as a likelihood of both variables does.
+
+
+def products(columns: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Products (G, M, M) of columns (n, M) by group (n,)."""
+    size = int(group.max()) + 1
+    out = np.zeros((size, columns.shape[1], columns.shape[1]))
+    order = np.argsort(group, kind="stable")
+    ends = np.cumsum(np.bincount(group, minlength=size))[:-1]
+    for g, mine in enumerate(np.split(order, ends)):
+        out[g] = columns[mine].T @ columns[mine]
+    return out
+
+
+def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
+    """The noise's part (G, M, M) of the products of a spectrum's columns, the residual's own square left out.
+
+    Of second order in deviations from where effects were linearised it is left out, too: no curvature is
+    taken off, so that every mode stays a maximum.
+    """
+    assert gap.carried is not None
+    rows, columns = gap.rows, gap.carried
+    out = np.zeros((int(s.group.max()) + 1, columns.shape[2], columns.shape[2]))
+    noisy = np.flatnonzero((columns != 0).any((0, 1)))
+    for draw in columns:
+        white, _ = cosines(rows, draw[:, noisy].astype(float), rows.shape)
+        out[:, noisy[:, None], noisy] += products(white, s.group) / len(columns)
+    slopes = np.ones(columns.shape[2], bool)
+    slopes[[0, *(mine[0] for mine in gap.own_columns)]] = False
+    out[:, slopes[:, None] & slopes] = 0.0
+    out[:, 0, 0] = 0.0
+    turn = gap.to_constant  # differs from one in columns of shifts alone
+    shifts = [mine[0] for mine in gap.own_columns]
+    turned = turn[:, shifts]
+    out[:, :, shifts] = out @ turned
+    out[:, shifts] = turned.T @ out
+    return out
+
 
 STEPS = 30  # numerics: of an iteration, at most
 CLOSE = 0.02  # numerics: nats

@@ -1,4 +1,4 @@
-"""What an attribution is asked: whitened residuals, nuisances, and candidate effects about their best fits.
+"""The input of an attribution: whitened residuals, nuisances, and candidate effects about their best fits.
 
     residual = nuisance @ z + sum over acting effects shift_j(theta_j) + background + noise
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.fft import dct
 
-BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are told apart
+BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are distinguished
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Rows:
     """What each of n residuals is: indices of its trial, channel and part, and its time [s].
 
     A part is a subtask, or any stretch of a trial. Rows of one cell (a channel in a part of a trial) are in
-    the order of time. `bands` [Hz]: lower edges of the frequency bands that are told apart. `sd` (n,): the
+    the order of time. `bands` [Hz]: lower edges of the frequency bands that are distinguished. `sd` (n,): the
     noise's in the cosine coefficients of the cells, one where it is not given; `shape` (n,): what of it white
     noise of the sensors has by itself, their level and colour left out.
     """
@@ -105,6 +105,7 @@ class Gap:
     from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
     of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same. `told` (n,):
     the mean square of a row if nothing acts, 1 where it is not given: repeats of one motion share an error.
+    `parts_alike`: whether a cause must be the same in all parts, too, and not only in all trials.
     """
 
     rows: Rows
@@ -117,6 +118,7 @@ class Gap:
     tolerance: Float[np.ndarray, " n"] | None = None
     usual: bool = False
     told: Float[np.ndarray, " n"] | None = None
+    parts_alike: bool = False
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
@@ -124,7 +126,7 @@ class Gap:
                    tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
                    None if self.carried is None else self.carried[:, rows],
                    None if self.tolerance is None else self.tolerance[rows], self.usual,
-                   None if self.told is None else self.told[rows])  # fmt: skip
+                   None if self.told is None else self.told[rows], self.parts_alike)  # fmt: skip
 
     def only(self, effects: Sequence[int]) -> Gap:
         """The gap with some of its candidates alone, in this order."""

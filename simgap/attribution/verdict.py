@@ -6,12 +6,17 @@ fitted to, and in what each set is said to leave.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.special import expit
+from scipy.stats import chi2, false_discovery_control, norm
+
+from simgap.attribution.posterior import Forms, Model, squares_left
+from simgap.attribution.problem import Rows
+from simgap.attribution.search import Detection
 
 ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
 SOFT = 0.5  # chosen: of the p-value's logarithm, logistic: so sharply an alarm turns into a gap
@@ -102,6 +107,12 @@ def probabilities(sets: Sequence[Explanation], p_value: float) -> dict[str, floa
     return {name: value / total for name, value in kept.items()}
 
 
+def log_odds(chances: Iterable[float]) -> float:
+    """Log posterior odds [nats] of several effects to act, by the least of their probabilities."""
+    chance = float(np.clip(min(chances, default=0.0), 1e-12, 1 - 1e-12))
+    return float(np.log(chance / (1 - chance)))
+
+
 def acting(sets: Sequence[Explanation], p_value: float) -> dict[str, float]:
     """Probability of every effect of some set to act."""
     gap, out = 1 - healthy(p_value), dict[str, float]()
@@ -149,3 +160,165 @@ def alike(sets: Sequence[Explanation], causes: tuple[str, ...]) -> tuple[str, ..
         if one.weight * RULED_OUT > best.weight and len(mine) <= len(causes):
             found |= mine - {*causes}
     return tuple(sorted(found))
+
+
+# What share of the gap each effect of a set explains, and what is left: squares, the noise's taken off.
+
+DRAWS = 200  # numerics: of the posterior, for intervals
+
+
+@dataclass(frozen=True)
+class Shares:
+    """`before`: squares of the residual with nuisances alone fitted, `after`: with the set, `floor`: the
+    noise's own. `each`: draws (D, J of the set) of the share that each effect explains by itself. `inside`:
+    share that is left where the set itself shifts anything."""
+
+    before: float
+    after: float
+    floor: float
+    each: np.ndarray
+    inside: float
+
+    @classmethod
+    def of(
+        cls, before: float, after: float, floor: float, lost: np.ndarray, rng: np.random.Generator,
+        inside: float = 1.0,
+    ) -> Shares:  # fmt: skip
+        """Each effect has what is `lost` (J,) by leaving it out, in proportion: they and the remainder sum to
+        one. Noise around what is left, and around what there was, makes the interval."""
+        part = lost / max(float(lost.sum()), 1e-12)
+        scatter = np.sqrt(2 * floor + 4 * max(after - floor, 0.0))
+        drawn = after + scatter * rng.standard_normal(DRAWS)
+        explained = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
+        return cls(before, after, floor, explained[:, None] * part, inside)
+
+    @property
+    def remainder(self) -> float:
+        """Share of the gap that the set leaves."""
+        return float(np.clip((self.after - self.floor) / max(self.before - self.floor, 1e-9), 0.0, 1.0))
+
+    def of_effect(self, k: int) -> tuple[float, tuple[float, float]]:
+        """The share of the k-th effect, and its 90 % interval."""
+        low, high = np.percentile(self.each[:, k], (5, 95))
+        return float(self.each[:, k].mean()), (float(low), float(high))
+
+
+def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) -> Shares:
+    """Shares of a set's effects; `noise` (G,): variance of each group's noise."""
+    weight, count = 1 / noise, np.append(f.count, f.spectrum.num_nuisances)
+    floor, by_group = float(count.sum()), squares_left(f, (), weight)
+    before = float(by_group.sum())
+    if not model.effects:
+        return Shares(before, before, floor, np.zeros((DRAWS, 0)), 1.0)
+    at_mode = squares_left(f, model.effects, weight, model.x)
+    at_best = squares_left(f, model.effects, weight)
+    rest = min(at_mode, at_best, key=lambda squares: float(squares.sum()))
+    after = min(float(rest.sum()), before)
+    lost = np.array([
+        max(float(squares_left(f, tuple(j for j in model.effects if j != out), weight).sum()) - after, 0.0)
+        for out in model.effects
+    ])  # fmt: skip
+    gone = np.maximum(by_group - at_mode, 0.0)
+    left = np.clip((at_mode - count) / np.maximum(by_group - count, np.sqrt(2 * count + 1)), 0.0, 1.0)
+    inside = float(gone @ left / gone.sum()) if gone.sum() > 0 else 1.0
+    return Shares.of(before, after, floor, lost, rng, inside)
+
+
+# Where the gap lies: excess of squares by trial, channel, part and band, false discoveries controlled.
+
+RATE = 0.05  # chosen: share of false discoveries among the cells that are listed
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell that shows a gap: its `share` of the excess square, and its excess as a normal score `z`."""
+
+    trial: str
+    channel: str
+    part: str
+    band: tuple[float, float]
+    share: float
+    z: float
+
+
+def tallied(
+    rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers (c,), squares in units of the noise (c,) and counts (c,) of the cells with each a band.
+
+    `left` (n,): cosine coefficients of a residual; `noise` (n,): their standard deviation.
+    """
+    key, inverse = np.unique(rows.cell * len(rows.bands) + band, return_inverse=True)
+    square = (left / noise) ** 2
+    return key, np.bincount(inverse, square), np.bincount(inverse).astype(float)
+
+
+def _step(rows: Rows) -> float:
+    """Usual time [s] from row to row of a cell; infinite where no cell has two."""
+    order = np.argsort(rows.cell, kind="stable")
+    step = np.diff(rows.time[order])[np.diff(rows.cell[order]) == 0]
+    return float(np.median(step)) if step.size else np.inf
+
+
+def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray) -> tuple[Cell, ...]:
+    """Cells whose squares exceed the noise's, largest share first (Benjamini & Hochberg, JRSS B 57, 1995)."""
+    key, energy, count = tallied(rows, band, left, noise)
+    chance = chi2.sf(energy, count)
+    listed = np.flatnonzero(false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE)
+    excess = np.maximum(energy - count, 0.0)
+    total = max(float(excess[listed].sum()), 1e-12)
+    edges = (*rows.bands, 0.5 / _step(rows))
+    out = []
+    for at in listed:
+        cell, b = divmod(int(key[at]), len(rows.bands))
+        cell, part = divmod(cell, len(rows.parts))
+        trial, channel = divmod(cell, len(rows.channels))
+        # log sf keeps what is far beyond the smallest number
+        z = float(norm.isf(chance[at])) if chance[at] > 1e-300 else float(np.sqrt(2 * excess[at] / 2 + 37**2))
+        out.append(Cell(rows.trials[trial], rows.channels[channel], rows.parts[part],
+                        (edges[b], edges[b + 1]), float(excess[at]) / total, z))  # fmt: skip
+    return tuple(sorted(out, key=lambda c: -c.share))
+
+
+# What every diagnosis says of a gap, as entries of the JSON document.
+
+Entries = list[dict[str, Any]]
+
+
+def entries(
+    verdict: Verdict,
+    detection: Detection,
+    remainder: tuple[float, float | None, Entries],
+    attribution: Mapping[str, tuple[float, float, tuple[float, float]]],
+    where: Entries,
+) -> dict[str, Any]:
+    """Verdict, detection, remainder (share, p-value, where), every effect's probability, share of the
+    gap and its 90 % interval, and where. A gap that is none, or does not matter, lies nowhere."""
+    gap = verdict.verdict != "none"
+    share, p_value, places = remainder
+    return {
+        "verdict": verdict.verdict,
+        "causes": list(verdict.causes),
+        "indistinguishable": list(verdict.indistinguishable),
+        "probabilities": verdict.probabilities,
+        "detection": {
+            "p_value": detection.p_value,
+            "statistic": detection.statistic,
+            "resolution": detection.resolution,
+        },
+        "remainder": {"share": share, "p_value": p_value, "where": places if gap else []},
+        "attribution": {
+            name: {"probability": chance, "share": share, "interval_90": list(interval)}
+            for name, (chance, share, interval) in sorted(attribution.items(), key=lambda item: -item[1][0])
+        },
+        "where": where if gap else [],
+    }  # fmt: skip
+
+
+def rows(cells: Iterable[Cell]) -> Entries:
+    """Cells as the document lists them."""
+    return [
+        {"trial": c.trial, "channel": c.channel, "subtask": c.part,
+         "band": list(c.band), "share": c.share, "z": c.z}
+        for c in cells
+    ]  # fmt: skip

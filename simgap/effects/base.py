@@ -141,7 +141,7 @@ class Effect:
 
     `correct(world, values, on)` takes the recording back; `on` is 1 where the effect is in the
     candidate and 0 elsewhere, for parameters that have no neutral value. `scatter(problem, residual)`
-    gives the variance of a random disturbance instead (a `simgap.gap.scatter.Scatter`).
+    gives the variance of a random disturbance instead (a `simgap.gap.assemble.Scatter`).
     `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
     scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
     `chosen` is false for effects that only `--effect` asks for. `report(values, rig)` gives the parameters

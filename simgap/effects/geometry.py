@@ -12,7 +12,7 @@ import numpy as np
 from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance, World, gradient, per_channel
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
 # Helper of effects that act on joint angles: from true tips to what the nominal hand would read.
@@ -252,8 +252,7 @@ def _scatter_hand_roll(given, residual: np.ndarray):
     """
     from scipy.fft import dct
 
-    from simgap.gap.assemble import rows_of
-    from simgap.gap.scatter import on_grid
+    from simgap.gap.assemble import on_grid, rows_of
 
     rows, arrays, there = rows_of(given), given.frame.arrays, given.whitening.weight > 0
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])

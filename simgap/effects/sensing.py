@@ -26,7 +26,7 @@ from simgap.effects.base import (
     with_mode,
 )
 from simgap.effects.filters import of_finger
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
 
 # A constant offset of every force channel.
 
@@ -335,8 +335,7 @@ def _scatter_quantisation(given, residual: np.ndarray):
     most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
     were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each.
     """
-    from simgap.gap.rounding import rounded_variance
-    from simgap.gap.scatter import Scatter
+    from simgap.gap.assemble import Scatter, rounded_variance
 
     read = np.concatenate([force.ravel() for force in given.frame.forces])
     values = read[np.isfinite(read)]
@@ -378,8 +377,7 @@ JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 
 
 def _scatter_clock_jitter(given, residual: np.ndarray):
-    from simgap.gap.assemble import rows_of
-    from simgap.gap.scatter import on_grid
+    from simgap.gap.assemble import on_grid, rows_of
 
     rows, rate = rows_of(given), _rates_clock_jitter(given)[given.whitening.weight > 0]
     size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)

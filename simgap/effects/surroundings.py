@@ -66,7 +66,7 @@ WRONG = 0.05  # prior: share by which a measured property may be off
 def _wrong_actual(given, push: np.ndarray) -> list:
     """A candidate for each property that was measured apart."""
     from simgap.attribution.problem import Candidate
-    from simgap.gap.tolerance import properties_tolerated
+    from simgap.gap.problem import properties_tolerated
 
     out, nothing, least = [], np.zeros(1), properties_tolerated(given)
     for o, name in enumerate(given.frame.task.objects):

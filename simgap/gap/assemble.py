@@ -2,23 +2,244 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
+from scipy.fft import dct
+from scipy.stats import norm
 
 from hmmseg.io.rig import Tolerance
-from simgap.attribution.problem import BANDS, Candidate, Gap, Rows
+from simgap.attribution.heldout import POSITIVE
+from simgap.attribution.posterior import STATED
+from simgap.attribution.problem import BANDS, Candidate, Gap, Rows, cosines
 from simgap.effects import catalogue, decoys, fitted, name_of
-from simgap.gap.evaluation import residual_at
-from simgap.gap.fit import Fitted
-from simgap.gap.noise_model import with_noise
-from simgap.gap.problem import Problem, columns_of, free_of, limits, neutral
-from simgap.gap.redrawn_noise import carried, on_other
-from simgap.gap.scatter import Scatter
-from simgap.gap.tolerance import tolerated
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
+from simgap.gap.nuisances import with_nuisances
+from simgap.gap.problem import (
+    Fitted,
+    Problem,
+    columns_of,
+    evaluated,
+    free_of,
+    limits,
+    neutral,
+    residual_at,
+    tolerated,
+)
+from simgap.gap.sensor_noise import MEDIAN
 from simgap.phases import Phase
+
+# What scatters residuals instead of shifting them: the variance that an effect adds, and how much of it.
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """`variance` (n,) over the noise's that an effect of size `value` adds to each cosine coefficient of a
+    cell (in the order of `assemble.rows_of`), log sd of that value, and evidence [nats] `known` of another
+    kind. `same`: whether its size is the same everywhere. The variance of
+    coefficients that it `frees` may be larger by so much (n,), whatever it is."""
+
+    effect: str
+    value: float
+    log_sd: float
+    variance: np.ndarray
+    known: float = 0.0
+    same: bool = True
+    frees: np.ndarray | None = None
+
+
+def on_grid(
+    effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None,
+    spread: float = 0.0,
+) -> Scatter:  # fmt: skip
+    """The most likely size of a scatter with variance size^2 `unit` (n,), from squares (n,) of residuals.
+
+    `part` (n,): numbers of parts in which one cause has one size, but for a log sd of `spread`. One that
+    would have any other in each, by a Bayes factor of POSITIVE, or a size at the grid's end, is an imitation.
+    """
+    mine = np.flatnonzero(unit > 0)
+    variance = 1 + grid[:, None] ** 2 * unit[mine]
+    nats = 0.5 * (square[mine] * (1 - 1 / variance) - np.log(variance))
+    score = nats.sum(1)
+    best, weight = int(score.argmax()), np.exp(score - score.max())
+    centre = np.average(np.log(grid), weights=weight)
+    sd = max(float(np.sqrt(np.average((np.log(grid) - centre) ** 2, weights=weight))), 1e-3)
+    known = float(np.log(np.mean(weight)))  # what the choice of its size costs: uniform over the grid
+    same = best < grid.size - 1
+    if part is not None:
+        each = np.stack([np.bincount(part[mine], row) for row in nats])
+        several = (np.logaddexp.reduce(each, axis=0) - np.log(grid.size)).sum()
+        if spread > 0:
+            near = norm.logpdf(np.log(grid), np.log(grid)[:, None], spread)
+            near -= np.logaddexp.reduce(near, axis=1, keepdims=True)
+            each = np.logaddexp.reduce(near[:, :, None] + each, axis=1)
+        one = np.logaddexp.reduce(each.sum(1)) - np.log(grid.size)
+        same = same and bool(one > several - POSITIVE)
+    return Scatter(effect, float(grid[best]), sd, grid[best] ** 2 * unit, known, same)
+
+
+def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
+    """What each of the named effects that scatter adds to residuals (n,); not those that say nothing."""
+    scattering: list[Callable] = [
+        e.scatter for n, e in fitted().items() if n in names and e.scatter is not None
+    ]
+    found = [scatter(given, residual) for scatter in scattering]
+    return [s for s in found if s is not None]
+
+
+# How loud a recording's noise is and how it is coloured, learned where nothing but noise is expected.
+#
+# A velocity's residual averages three samples of velocity and differences three of position, so its noise is
+# not white: at low frequency it holds (4 + 2 cos w)^2 / 36 of the velocity's density and sin(w)^2 of the
+# position's. Beyond that sensors of one kind may be louder than stated and remember their last error (AR(1)).
+# Level and colour of each kind are the likeliest for the median squares of some frequency bands: free motion
+# for forces, hands at rest for velocities, grips for positions. Medians do not see what an effect does in
+# places.
+
+KINDS = (("x", "y", "distance", "offset"), ("vx", "vy"), ("fx", "fy", "grip", "shear"))
+LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; beyond that it is an effect
+COLOURS = np.linspace(0.0, 0.4, 9)  # prior: correlation from sample to sample; more is an effect
+NOISE_BANDS = 6  # numerics: of which medians are taken
+SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
+OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it
+FEWEST = 12  # numerics: coefficients of a band
+CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they tell nothing of it
+
+
+def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
+    """The rows with the noise's standard deviation in each cosine coefficient of their cells, in units of the
+    stated noise, and with the shape of white noise there."""
+    turn, frequency = _places(rows)
+    shape = _shape(given, rows, turn)
+    square = cosines(rows, residual[:, None])[0][:, 0] ** 2 / shape
+    arrays = given.frame.arrays
+    there = given.whitening.weight > 0
+    doubt = np.square(arrays.sd[there] / arrays.plain[there])
+    sure = (np.bincount(rows.cell, doubt) < CLEAN * np.bincount(rows.cell))[rows.cell]
+    phase = arrays.phase.argmax(-1)[..., None].repeat(len(CHANNELS), -1)[there]
+    quiet = (None, (Phase.PICKUP, Phase.PLACE), (Phase.FREE,))
+    variance = shape.copy()
+    for names, at in zip(KINDS, quiet, strict=True):
+        mine = np.isin(rows.channel, [CHANNELS.index(n) for n in names])
+        seen = mine & sure & (frequency > SLOWEST) & (True if at is None else np.isin(phase, at))
+        level, colour = _likeliest(turn[seen], square[seen])
+        variance[mine] *= level**2 * _density(turn[mine], colour)
+    return replace(rows, sd=np.sqrt(variance), shape=shape)
+
+
+def _places(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Of each coefficient (n,): radians from sample to sample, and frequency [Hz]."""
+    turn, frequency = np.zeros(rows.cell.size), np.zeros(rows.cell.size)
+    order = np.argsort(rows.cell, kind="stable")
+    for mine in np.split(order, np.flatnonzero(np.diff(rows.cell[order])) + 1):
+        turn[mine] = np.pi * np.arange(mine.size) / mine.size
+        if mine.size > 1:
+            frequency[mine] = turn[mine] / (2 * np.pi * np.median(np.diff(rows.time[mine])))
+    return turn, frequency
+
+
+def _shape(given: Problem, rows: Rows, turn: np.ndarray) -> np.ndarray:
+    """Density (n,) of the residual's stated noise over white noise's of the same variance."""
+    arrays, t = given.frame.arrays, given.frame.world.t
+    step = float(np.median(np.diff(t[0])))
+    out = np.ones(turn.size)
+    for place, speed in (("x", "vx"), ("y", "vy")):
+        p, v = (arrays.sample[..., CHANNELS.index(n)] for n in (place, speed))
+        shaken = float(np.median(np.square(p / step) / np.square(v)))
+        mine = rows.channel == CHANNELS.index(speed)
+        w = turn[mine]
+        out[mine] = 2 * (np.square((4 + 2 * np.cos(w)) / 6) + shaken * np.square(np.sin(w))) / (1 + shaken)
+    return np.maximum(out, 0.02)
+
+
+def _density(turn: np.ndarray | float, colour: float | np.ndarray) -> np.ndarray:
+    """Spectral density of AR(1) noise of unit variance."""
+    return (1 - colour**2) / (1 - 2 * colour * np.cos(turn) + colour**2)
+
+
+def _likeliest(turn: np.ndarray, square: np.ndarray) -> tuple[float, float]:
+    """Level and colour of coefficients at `turn` with these squares."""
+    at = np.minimum((turn / np.pi * NOISE_BANDS).astype(int), NOISE_BANDS - 1)
+    score = -0.5 * np.square(2 * np.log(LEVELS)[:, None] / STATED) + np.zeros(COLOURS.size)
+    for band in range(NOISE_BANDS):
+        mine = at == band
+        if mine.sum() < FEWEST:
+            continue
+        seen = np.log(max(float(np.median(square[mine])) / MEDIAN, 1e-9))
+        expected = 2 * np.log(LEVELS)[:, None] + np.log(_density(float(np.mean(turn[mine])), COLOURS))
+        # The median of n squares is off by 2.33 / sqrt(n) of itself.
+        score = score - np.minimum(0.5 * np.square(seen - expected) * mine.sum() / 2.33**2, OUTLIER)
+    level, colour = np.unravel_index(int(score.argmax()), score.shape)
+    return float(LEVELS[level]), float(COLOURS[colour])
+
+
+# What sensors' noise makes of fitted candidates: the same ones on recordings with a little more noise.
+#
+# `simgap.attribution.posterior` takes it off the products of their columns.
+
+Other = TypeVar("Other")
+
+# numerics: signs of draws by places; products of what has different places cancel over the draws
+SIGNS = np.array([[1, 1], [1, -1]], float)
+SIZES = (1.0, -0.25)  # numerics: sds of noise of a draw; both tell whether it acts in proportion
+ALIKE = 0.5  # numerics: by which share of the larger both may differ
+
+
+def redrawn(given: Problem) -> tuple[Problem, ...]:
+    """The problem with more noise on what was recorded: of every draw one of each of SIZES.
+
+    Every number is off by its sensor's standard deviation, up or down. Signs of a sample and the next, and
+    of a channel and the next, are orthogonal over the draws, so that squares of what combines these have
+    their expectation without any scatter.
+    """
+    world, sensor = given.frame.world, given.frame.arrays.sensor
+    place = (np.arange(world.t.shape[1])[:, None] + np.arange(4)) % len(SIGNS)
+    rng = np.random.default_rng(0)
+    noise = {
+        name: sensor[..., [k]] * rng.choice((-1.0, 1.0), (*world.t.shape, 4))
+        for k, name in enumerate(("joints", "rates", "force"))
+    }
+    out = []
+    for signs in SIGNS.T:
+        for size in SIZES:
+            shaken = {n: getattr(world, n) + size * signs[place] * each for n, each in noise.items()}
+            frame = replace(given.frame, world=world._replace(**shaken))
+            out.append(with_nuisances(replace(given, frame=frame)))
+    return tuple(out)
+
+
+def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], np.ndarray]) -> np.ndarray:
+    """What noise makes of columns (n, M), (D, n, M) draws, from those `on` the redrawn recordings.
+
+    Where it does not act in proportion, as beside a contact that it makes or breaks, nothing is said.
+    """
+    changes = [(on(other) - columns) / size for other, size in zip(others, SIZES * len(SIGNS.T), strict=True)]
+    out = []
+    for one, other in zip(changes[::2], changes[1::2], strict=True):
+        alike = np.abs(one - other) <= ALIKE * np.maximum(np.abs(one), np.abs(other))
+        out.append(np.where(alike, (one + other) / 2, 0.0).astype(np.float32))
+    return np.stack(out)
+
+
+def on_other(other: Problem, f: Fitted) -> Fitted:
+    """A fit's residual and derivatives at the same coordinates on another recording."""
+    now = evaluated(other, f.effects, f.u, f.columns, [])
+    return replace(f, residual=now.residual, push=now.push)
+
+
+def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float:
+    """What a fit gains [nats] over the one without effects by leaving less of the sensors' noise."""
+    columns = np.stack([healthy.residual, f.residual], 1)
+    noise = carried(
+        columns,
+        others,
+        lambda other: np.stack([on_other(other, healthy).residual, on_other(other, f).residual], 1),
+    )
+    without, left = np.square(noise.astype(float)).sum(1).mean(0)
+    return 0.5 * float(without - left)
+
 
 SHOWN = 1.0  # chosen: squared residual [noise's] of a measured property's sd, above which it shows at all
 
@@ -180,3 +401,64 @@ def _scattering(s: Scatter, rows: Rows) -> Candidate:
     variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))
     return Candidate(s.effect, (), nothing, nothing, nothing, np.zeros(count), np.zeros((count, 0)), nothing,
                      nothing, variance, s.known, s.same, frees=s.frees)  # fmt: skip
+
+
+# Forces rounded to a step: by how much every residual that they enter is in doubt.
+#
+# A rounded reading is off by up to half a step, with a variance of step^2 / 12. While it stays on one level
+# it is off by the same, or, as a force passes slowly through the level, by what changes evenly from one half
+# to the other: errors within a plateau are alike or as good as independent (Widrow & Kollar, Quantization
+# Noise, 2008, ch. 1 on slow signals). One is as likely here as the other. Through the pads that give,
+# forces' errors are those of distances as well.
+
+TOGETHER = 0.5  # prior: share of a plateau's errors that are alike throughout it
+
+
+def rounded_variance(given: Problem, step: float) -> np.ndarray:
+    """Variance (n,) of the cosine coefficients of each cell, in the noise's, of forces rounded to `step` [N].
+
+    Coefficients are in the order of `assemble.rows_of`.
+    """
+    frame, there = given.frame, given.whitening.weight > 0
+    rows, sample, scale = rows_of(given), np.nonzero(there)[1], given.whitening.weight[there]
+    shares, out = _shares(given), np.zeros(scale.size)
+    levels = [_plateaus(force) for force in frame.forces]
+    order = np.argsort(rows.cell, kind="stable")
+    for mine in np.split(order, np.flatnonzero(np.diff(rows.cell[order])) + 1):
+        trial, of_channel = rows.trial[mine[0]], shares[:, rows.channel[mine[0]]]
+        group = frame.groups[trial]
+        for k in np.flatnonzero(of_channel):
+            weight = of_channel[k] * scale[mine]
+            on = weight[:, None] * _on_plateaus(levels[trial][:, k], sample[mine], group)
+            alike = np.square(np.asarray(dct(on, axis=0, norm="ortho"))).sum(1)
+            out[mine] += TOGETHER * alike + (1 - TOGETHER) * np.mean(weight**2) / group
+    return step**2 / 12 * out
+
+
+def _shares(given: Problem) -> np.ndarray:
+    """How much (4, C) of each force's error every channel has: net forces, and what pads give."""
+    world, out = given.frame.world, np.zeros((4, len(CHANNELS)))
+    for axis, give, place, apart, net, half in (
+        (0, world.give_normal, "x", "distance", "fx", "grip"),
+        (1, world.give_shear, "y", "offset", "fy", "shear"),
+    ):
+        for finger in (0, 1):
+            for channel, share in (
+                (place, give[finger] / 2), (apart, give[finger]), (net, 1.0), (half, 0.5)
+            ):  # fmt: skip
+                out[2 * finger + axis, CHANNELS.index(channel)] = share
+    return out
+
+
+def _plateaus(force: np.ndarray) -> np.ndarray:
+    """The number (N, 4) of the plateau that each reading is on."""
+    return np.cumsum(np.diff(force, axis=0, prepend=force[:1]) != 0, axis=0)
+
+
+def _on_plateaus(level: np.ndarray, sample: np.ndarray, group: int) -> np.ndarray:
+    """Share (m, R) of the readings behind each of m samples that is on each of R plateaus."""
+    mine = level[sample[:, None] * group + np.arange(group)]
+    number = mine - mine.min()
+    out = np.zeros((sample.size, int(number.max()) + 1))
+    np.add.at(out, (np.arange(sample.size)[:, None], number), 1 / group)
+    return out[:, out.any(0)]

@@ -7,35 +7,248 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from hmmseg.contact.decompose import subtasks
+from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
-from simgap.attribution.attribute import attribute
-from simgap.attribution.findings import Attribution
+from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
 from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
-from simgap.attribution.verdict import ALARM
-from simgap.effects import effect_named, free_parameters, name_of
-from simgap.gap.assemble import together
-from simgap.gap.body import body, drawn, parameters
-from simgap.gap.evaluation import residual_at
+from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
+from simgap.effects import catalogue, effect_named, fitted, free_parameters, name_of
+from simgap.effects.base import World, tips
+from simgap.gap.assemble import scatters, together
 from simgap.gap.experiments import next_experiment
-from simgap.gap.fit import Fitted, Start, fit
-from simgap.gap.located import Tally, tallies
-from simgap.gap.problem import Problem
-from simgap.gap.scatter import scatters
+from simgap.gap.frame import CHANNELS, check_forced, of_wrist
+from simgap.gap.problem import (
+    Fitted,
+    Problem,
+    Start,
+    fit,
+    properties_tolerated,
+    raw_residual_at,
+    residual_at,
+    world_without,
+)
 from simgap.gap.search import Identified, Search, search
-from simgap.gap.tolerance import properties_tolerated
 from simgap.gap.twins import own_healthy, twin_statistics
-from simgap.gap.wrist_gap import check_forced, of_wrist
 from simgap.progress import Progress, silent
 from simgap.report.finding import sentence, tables
 
-STAGES = 12  # look: that `progress` is told of, at most
+# Where a gap lies: cells whose residuals show it, and those whose signals the named causes shift.
+
+# cited: sds of a sample: mean shift of a cell that counts as shifted (the interface's definition)
+SHIFTED = 3.0
+
+
+def where(given: Problem, found: Sequence[Cell], causes: Fitted | None) -> list[dict[str, Any]]:
+    """Rows of the document: significant cells and those that the causes shift, largest share first.
+
+    Shares are of the excess that residuals show: a shift that the properties absorb has none.
+    """
+    frame = given.frame
+    out = [{**row, "subtask": row["subtask"].partition(":")[2]} for row in rows(found)]
+    if causes is None or not causes.effects:
+        return out
+    known = {(c.trial, c.channel, c.part) for c in found}
+    mean = shifts(given, causes)
+    for r, s, c in np.argwhere(mean >= SHIFTED):
+        name = frame.steps[s].label
+        if (frame.files[r], CHANNELS[c], f"{s}:{name}") not in known:
+            out.append({"trial": frame.files[r], "channel": CHANNELS[c], "subtask": name,
+                         "band": [0.0, 1.0], "share": 0.0, "z": float(mean[r, s, c])})  # fmt: skip
+    return out
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Squared whitened residual of a trial's channel in a subtask over its `count`, as a normal score `z`."""
+
+    trial: int
+    channel: str
+    subtask: int
+    energy: float
+    count: int
+    z: float
+
+
+def tallies(given: Problem, z: np.ndarray) -> tuple[Tally, ...]:
+    """All cells of whitened residuals z (T, N, C) that hold anything."""
+    frame, out = given.frame, []
+    there = given.whitening.weight > 0
+    for r in range(frame.num_trials):
+        for s in range(len(frame.steps)):
+            inside = frame.arrays.subtask[r] == s
+            for c, channel in enumerate(CHANNELS):
+                values = z[r, inside & there[r, :, c], c]
+                if values.size:
+                    energy, n = float(values @ values), values.size
+                    # Wilson & Hilferty, PNAS 17, 1931
+                    score = (np.cbrt(energy / n) - (1 - 2 / (9 * n))) / np.sqrt(2 / (9 * n))
+                    out.append(Tally(r, channel, s, energy, n, float(score)))
+    return tuple(out)
+
+
+def shifts(given: Problem, causes: Fitted) -> np.ndarray:
+    """Mean shift (T, S, C) of a cell under effects, in noise of one sample.
+
+    What acts on sensors or kinematics shifts what is recorded. What acts on contact or dynamics shows in the
+    equations of the contact as well; the larger of the two counts.
+    """
+    frame, u = given.frame, causes.u
+    change = np.abs(channels(frame.world) - channels(world_without(given, causes.effects, u)))
+    there = given.whitening.weight > 0
+    mechanical = [e for e in causes.effects if fitted()[name_of(e)].acts_on not in ("sensing", "kinematics")]
+    violated = np.zeros_like(change)
+    if mechanical:
+        rest = [e for e in causes.effects if e not in mechanical]
+        violated = raw_residual_at(given, rest, u) - raw_residual_at(given, causes.effects, u)
+        violated = np.where(there, violated, 0.0) / frame.arrays.sample
+    change = change / frame.arrays.sample
+    mean = np.zeros((frame.num_trials, len(frame.steps), len(CHANNELS)))
+    for r in range(frame.num_trials):
+        for s in range(len(frame.steps)):
+            mine = np.flatnonzero(frame.arrays.subtask[r, : frame.lengths[r]] == s)
+            if mine.size:
+                number = np.maximum(there[r, mine].sum(0), 1)
+                mean[r, s] = np.maximum(change[r, mine].mean(0), np.abs(violated[r, mine].sum(0)) / number)
+    return mean
+
+
+def channels(world: World) -> np.ndarray:
+    """Task-space channels (T, N, C) of a world: x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
+    world = jax.tree.map(jnp.asarray, world)
+    position, velocity = (np.asarray(z) for z in tips(world))
+    force = np.asarray(world.force)
+    mean, apart = (position[..., :2] + position[..., 2:]) / 2, position[..., 2:] - position[..., :2]
+    speed = (velocity[..., :2] + velocity[..., 2:]) / 2
+    net, half = force[..., :2] + force[..., 2:], (force[..., :2] - force[..., 2:]) / 2
+    return np.concatenate([mean, apart, speed, net, half], -1)
+
+
+# An attribution in the words of the interface.
+
+DRAWS = 2000  # numerics: of the posterior, for intervals
+LISTED = 8  # look: effects that are described
+
+
+def body(
+    found: Search, verdict: Attribution, causes: Fitted | None, following: dict | None, seed: int
+) -> dict[str, Any]:
+    """The JSON document of a diagnosis; `causes`: the joint fit of the named effects that shift signals."""
+    given, posterior = found.problem, verdict.effects
+    named = {n: e for n, e in posterior.items() if n in catalogue()}
+    ranked = sorted(named, key=lambda n: -named[n].probability)
+    shown = [
+        n for k, n in enumerate(ranked) if k < LISTED or n in verdict.causes or n in verdict.indistinguishable
+    ]
+    effects = {n: _described(found, verdict, n, seed) for n in shown}
+    if len(verdict.causes) > 1:
+        effects["+".join(verdict.causes)] = {
+            "parameters": {
+                f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()
+            },
+            "log_evidence": log_odds(verdict.effects[n].probability for n in verdict.causes),
+            "heldout_score": None if verdict.how_far is None else verdict.how_far.score,
+            "property_shift": _shifts(found, causes),
+        }
+    elif verdict.causes and causes is not None:
+        effects[verdict.causes[0]]["property_shift"] = _shifts(found, causes)
+    rest, far = verdict.remainder, verdict.how_far
+    attribution = {n: (e.probability, e.share, e.share_90) for n, e in named.items()}
+    out = entries(verdict, verdict.detection, (rest.share, rest.p_value, where(given, rest.where, None)),
+                  attribution, where(given, verdict.where, causes))  # fmt: skip
+    out |= {
+        "effects": effects, "noise": verdict.noise, "shrinkage": None if far is None else far.to_json(),
+        "next_experiment": following,
+    }  # fmt: skip
+    if verdict.small_gap is not None:
+        small = verdict.small_gap
+        metres = small.channel in ("x", "y", "distance", "offset")
+        unit = "m" if metres else "m/s" if small.channel in ("vx", "vy") else "N"
+        out["small_gap"] = {
+            "size": small.amount * _unit_of_noise(found, small.channel), "unit": unit,
+            "where": where(given, verdict.where, None),
+        }  # fmt: skip
+    return out
+
+
+def _unit_of_noise(found: Search, channel: str) -> float:
+    """A residual's usual noise in the channel's unit."""
+    arrays, c = found.problem.frame.arrays, CHANNELS.index(channel)
+    return float(np.median(arrays.sd[..., c][arrays.there[..., c] > 0]))
+
+
+def _described(found: Search, verdict: Attribution, name: str, seed: int) -> dict[str, Any]:
+    """Parameters and evidence of one effect."""
+    return {
+        "parameters": parameters(found, verdict.effects[name], name, seed),
+        "log_evidence": log_odds([verdict.effects[name].probability]),
+        "heldout_score": None,
+        "property_shift": {},
+    }
+
+
+def parameters(found: Search, posterior: EffectPosterior, name: str, seed: int) -> dict[str, Any]:
+    """An effect's parameters as the interface names them."""
+    every = drawn(found, posterior, name, seed)
+    return {key: _summary(values, unit) for key, (values, unit) in every.items()}
+
+
+def drawn(
+    found: Search, posterior: EffectPosterior, name: str, seed: int
+) -> dict[str, tuple[np.ndarray, str]]:
+    """Draws (DRAWS,) of an effect's parameters given that it acts, and their units, as the interface names
+    them."""
+    effect, rng = catalogue()[name], np.random.default_rng(seed)
+    of = {p.name: p for p in effect.parameters}
+    scatter = next((s for s in found.scatters if s.effect == name), None)
+    if scatter is not None:
+        p = effect.parameters[0]
+        return {p.name: (scatter.value * np.exp(scatter.log_sd * rng.standard_normal(DRAWS)), p.unit)}
+    draws = {}
+    for key, p in posterior.parameters.items():
+        u = p.mean + p.sd * rng.standard_normal(DRAWS)
+        if key not in of:  # by how much a property that was measured apart is off
+            obj, kind = key.rsplit(".", 1)
+            one = found.problem.sd[found.problem.frame.task.objects.index(obj), PROPERTIES.index(kind)]
+            return {key: (u * float(one), UNITS[kind])}
+        draws[key] = np.asarray(of[key].value(np.clip(u, *of[key].limits)))
+    if effect.report is not None:
+        return effect.report(draws, found.problem.frame.rig)
+    return {p.name: (draws[p.name], p.unit) for p in effect.parameters if p.name in draws and not p.hidden}
+
+
+def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
+    low, high = np.percentile(values, (5, 95))
+    return {"mean": float(np.median(values)), "sd": float(np.std(values)),
+            "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
+
+
+def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
+    """Properties with rig.toml at its word and with the causes, of those that were identified or measured.
+
+    Both are of one model, pads included, so that either can be simulated; what `identify` says is of a rig
+    that may be wrong by what it doubts (`estimation.sampler`), and stands between them.
+    """
+    if causes is None:
+        return {}
+    given, (_, known) = found.problem, found.blocks
+    before, after = given.properties(found.healthy.u), given.properties(causes.u)
+    return {
+        f"{name}.{kind}": {"before": float(before[o, j]), "after": float(after[o, j]), "unit": UNITS[kind]}
+        for o, name in enumerate(given.frame.task.objects)
+        for j, kind in enumerate(PROPERTIES)
+        if known[o, j]
+    }
+
+
+STAGES = 12  # look: that `progress` reports, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
 
 

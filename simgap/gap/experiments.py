@@ -16,16 +16,13 @@ from estimation.report import Actual
 from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.effects import catalogue, forms_of, name_of
-from simgap.gap.candidates import best_fit
-from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
-from simgap.gap.problem import neutral, problem
-from simgap.gap.search import Search
-from simgap.gap.synthetic import performed, recorded
-from simgap.gap.twins import blocks_of
+from simgap.gap.problem import Start, fit, neutral, problem
+from simgap.gap.search import Search, best_fit
+from simgap.gap.twins import blocks_of, performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
-from simgap.world.writing import task_table
+from simgap.world.simulate import task_table
 
 TRIALS = 2  # numerics: that are simulated: where contacts fall between samples is chance
 ENOUGH = 5.0  # physics: a definition: nats, the detection floor
@@ -65,8 +62,8 @@ def next_experiment(
 ) -> dict[str, Any] | None:
     """The experiment that tells most partners from the cause by ENOUGH nats; None where none tells any.
 
-    `cause` holds the parameters of each effect that acts, as the interface names them. What is told stands in
-    `separates`, the least gain of it beside.
+    `cause` holds the parameters of each effect that acts, as the interface names them. `separates` lists the
+    cause and the partners told from it, `expected_gain_nats` the least gain of these.
     """
     try:
         blocks = blocks_of(found)
@@ -108,13 +105,13 @@ def _gains(
     )
     trials = [recorded(s, frame.task, frame.rig, cause) for s in done]
     known = _measured(blocks) if experiment.measured else actual
-    asked = problem(build(align(trials, frame.task, frame.rig)), known)
-    healthy = fit(asked, Start((), neutral(asked)))
+    planned = problem(build(align(trials, frame.task, frame.rig)), known)
+    healthy = fit(planned, Start((), neutral(planned)))
 
     def cost(name: str) -> float:
         if catalogue()[name].correct is None:
             raise ValueError("what only scatters is not fitted")
-        return min(best_fit(asked, key, healthy).cost for key in forms_of(name_of(name)))
+        return min(best_fit(planned, key, healthy).cost for key in forms_of(name_of(name)))
 
     own = min(cost(name) for name in cause)
     return {p: (cost(p) - own) * frame.num_trials / TRIALS for p in partners}

@@ -1,4 +1,4 @@
-"""What recordings contain that is nobody's fault, as columns beside which every effect is judged.
+"""What recordings contain that is nobody's fault, as columns that are fitted along with every effect.
 
 What rig.toml admits under [systematic]; speeds that a drive takes as differences; and blocks that turn in the
 grip. Each column is per its standard deviation beforehand, so that its prior is N(0, 1).
@@ -13,10 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import gradient, tips
-from simgap.gap.evaluation import derivatives
-from simgap.gap.marginal import Nuisances
-from simgap.gap.problem import Problem, free_of, neutral, slots
-from simgap.gap.trial_arrays import CHANNELS
+from simgap.gap.frame import CHANNELS
+from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, slots
 from simgap.phases import Phase
 
 PAD = 5e-3  # prior: m; half a pad's length: how hard it turns follows from that and its stiffness
@@ -29,7 +27,7 @@ def with_nuisances(given: Problem) -> Problem:
     """The problem with its nuisances, linear about no effect at all.
 
     How many there are depends on trials, grips and rig alone: a column of zeros stays, for with a little more
-    noise on the recordings it is none (`simgap.gap.redrawn_noise`).
+    noise on the recordings it is none (`simgap.gap.assemble`).
     """
     columns = [*_admitted(given), *_late_rates(given), *_turning(given), *_settling(given)]
     return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
@@ -135,7 +133,7 @@ def _settling(given: Problem) -> list[np.ndarray]:
 
 
 def _column(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
-    """The whitened column (n, 1) of shifts (T, N) of channels, told up to a constant in every grip."""
+    """The whitened column (n, 1) of shifts (T, N) of channels, known up to a constant in every grip."""
     weight, onehot = given.whitening.weight, given.frame.arrays.onehot
     out = np.zeros_like(weight)
     for name, shift in shifts.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,58 @@ import numpy as np
 
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from hmmseg.contact.decompose import PROPERTIES
+from simgap.bounded import least
 from simgap.effects import fitted as known_effects
 from simgap.effects import free_parameters, name_of
-from simgap.effects.base import Effect, Parameter
-from simgap.gap.frame import Frame
-from simgap.gap.marginal import Nuisances
-from simgap.gap.whitening import Whitening, whitening
+from simgap.effects.base import Effect, Parameter, World
+from simgap.gap.frame import CHANNELS, Arrays, Frame
+from simgap.gap.residuals import contact, residuals
 
-# prior: what measured weight (share), width, height [m] may be off beside their own sd
+# Residuals in units of their sensors' noise.
+
+
+class Whitening(NamedTuple):
+    """`weight` (T, N, C) of trials, samples, channels: 1 / standard deviation, 0 where there is nothing."""
+
+    weight: np.ndarray
+
+
+def whitening(frame: Frame) -> Whitening:
+    """The whitening of a frame's residuals."""
+    a = frame.arrays
+    return Whitening(np.where(a.there > 0, 1 / a.sd, 0.0))
+
+
+# Linear unknowns with a normal prior, integrated out of a least-squares problem.
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """Columns (n, Z) of whitened residuals, each per its standard deviation beforehand."""
+
+    columns: np.ndarray
+
+    @cached_property
+    def _basis(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal directions (n, R), and what share (R,) of a square along each they take away."""
+        bend = self.columns.T @ self.columns
+        square, turn = np.linalg.eigh(bend)
+        kept = square > 1e-9 * max(float(square.max(initial=0.0)), 1e-9)
+        return self.columns @ (turn[:, kept] / np.sqrt(square[kept])), square[kept] / (1 + square[kept])
+
+    def product(self, a: np.ndarray, b: np.ndarray) -> Any:
+        """a' (1 + columns columns')^-1 b of (n, ...) each: what nuisances may have made counts less."""
+        basis, taken = self._basis
+        mine, other = basis.T @ a, basis.T @ b
+        return a.T @ b - (mine.T * taken) @ other
+
+    def left(self, residual: np.ndarray) -> np.ndarray:
+        """What they leave of a residual (n,), each at its likeliest value."""
+        basis, taken = self._basis
+        return residual - basis @ (taken * (basis.T @ residual))
+
+
+# prior: what measured weight (share), width, height [m] may be off in addition to their own sd
 MEASURED = (2e-3, 3e-5, 4e-5)
 
 
@@ -162,3 +206,239 @@ def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
         for j, p in enumerate(slot.effect.parameters):
             low[slot.start + j], high[slot.start + j] = p.limits
     return low, high
+
+
+# The smallest gap that matters: what rig.toml says under [tolerance], or what its sensors could not show.
+
+SAMPLES = 0.5  # chosen: sds of one sample: a shift below that is not seen in any single one
+PROPERTY = 0.01  # chosen: the same, of a property
+SHARE = 0.005  # cited: of a block's width or weight: the better half of the paper's own errors (its Table 4)
+
+
+def properties_tolerated(given: Problem) -> np.ndarray:
+    """By how much properties (3 O,) may be off before it matters, in sds of their prior."""
+    share = given.frame.rig.tolerance.property or PROPERTY
+    return (share * np.abs(given.centre) / given.sd).ravel()
+
+
+def tolerated(given: Problem) -> np.ndarray:
+    """The smallest shift (n,) of each residual that matters, in sds of its noise.
+
+    Positions and forces as [tolerance] has them; by default one sample's noise or SHARE of the smallest
+    block's width and weight, whichever is more. Velocities matter as much as a sample's noise.
+    """
+    frame, there = given.frame, given.whitening.weight > 0
+    stated = frame.rig.tolerance
+    width, weight = (float(np.abs(given.centre[:, k]).min()) for k in (1, 0))
+    noise = frame.arrays.sample
+    out = np.empty_like(given.whitening.weight)
+    for c, name in enumerate(CHANNELS):
+        least = SAMPLES * noise[..., c]
+        if name in ("x", "y", "distance", "offset"):
+            least = stated.position or np.maximum(least, SHARE * width)
+        elif name in ("fx", "fy", "grip", "shear"):
+            least = stated.force or np.maximum(least, SHARE * weight)
+        out[..., c] = least * given.whitening.weight[..., c]
+    return out[there]
+
+
+# What a candidate leaves: the contact equations' residuals with its effects taken out, and derivatives.
+
+STEP = 1e-5  # numerics: of a usual deviation, for differences
+
+
+def corrected(world: World, u: jax.Array, on: jax.Array, num_properties: int) -> World:
+    """The world with every effect of coordinates u (all columns) taken out; `on` (num_slots,)."""
+    world = jax.tree.map(lambda z: jnp.asarray(z, float), world)
+    for k, slot in enumerate(slots(num_properties)[0]):
+        values = {p.name: p.value(u[slot.start + j]) for j, p in enumerate(slot.effect.parameters)}
+
+        def taken_out(values=values, effect=slot.effect, k=k, world=world) -> World:
+            changed = effect.correct(world, values, on[k])  # type: ignore[misc]
+            return jax.tree.map(lambda new, old: jnp.broadcast_to(new, old.shape), changed, world)
+
+        world = jax.lax.cond(on[k] > 0, taken_out, lambda world=world: world)
+    return world
+
+
+def whitened(
+    world: World, arrays: Arrays, w: Whitening, properties: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Whitened residuals (T, N, C) of a world that effects were taken out of, and the cost of doubts [nats].
+
+    A residual in doubt counts for less; half the log of its variance's factor is what that costs.
+    `properties` (O, 3): weight, width, height.
+    """
+    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
+    raw, factor = residuals(world, arrays, properties, noise)
+    cost = jnp.where(w.weight > 0, 0.5 * jnp.log(factor), 0.0).sum()
+    return raw / jnp.sqrt(factor) * w.weight, cost
+
+
+_corrected = jax.jit(corrected, static_argnames="num_properties")
+_whitened = jax.jit(whitened)
+
+
+@jax.jit
+def _whitened_at_each(world, arrays, w, properties):
+    """Of B rows of properties (B, O, 3): a property alone needs no effect taken out once more."""
+    return jax.vmap(lambda row: whitened(world, arrays, w, row))(properties)
+
+
+def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
+    """Whitened residuals (T, N, C) of a candidate at coordinates u."""
+    _, arrays, w = given.constants
+    world = _without_effects(given, effects, u)
+    return np.asarray(_whitened(world, arrays, w, jnp.asarray(given.properties(u)))[0])
+
+
+@jax.jit
+def _in_contact(world):
+    return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
+
+
+def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
+    """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
+    return _in_contact(_without_effects(given, effects, u))
+
+
+def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
+    """Residuals (T, N, C) in units of their channels."""
+    world, (_, arrays, w) = _without_effects(given, effects, u), given.constants
+    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
+    return np.asarray(_raw(world, arrays, jnp.asarray(given.properties(u)), noise)[0])
+
+
+_raw = jax.jit(residuals)
+
+
+def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
+    on = jnp.asarray(_on(given, effects))
+    return _corrected(given.constants[0], jnp.asarray(u), on, given.num_properties)
+
+
+def _on(given: Problem, effects: Sequence[str]) -> np.ndarray:
+    names = {name_of(e) for e in effects}
+    return np.array([float(s.effect.name in names) for s in slots(given.num_properties)[0]])
+
+
+class Evaluated(NamedTuple):
+    """A candidate at some coordinates: its residual (n,), the cost of doubts [nats], both one's derivatives
+    `push` (n, K) and `lift` (K,), and the cost."""
+
+    residual: np.ndarray
+    doubts: float
+    push: np.ndarray
+    lift: np.ndarray
+    cost: float
+
+
+def evaluated(
+    given: Problem, effects: tuple[str, ...], u: np.ndarray, mine: np.ndarray, blocks: list[np.ndarray]
+) -> Evaluated:
+    """What a candidate leaves at coordinates u, and its derivatives by the columns `mine`.
+
+    They are differences over a small step: in double precision good to STEP of a usual deviation, and cheaper
+    to compile than derivatives.
+    """
+    k, on = given.num_properties, jnp.asarray(_on(given, effects))
+    recorded, arrays, w = given.constants
+
+    def without(u: np.ndarray) -> World:
+        return _corrected(recorded, jnp.asarray(u), on, k)
+
+    steps = given.properties(u + STEP * np.eye(k + 1, u.size, -1))
+    found, cost = _whitened_at_each(without(u), arrays, w, jnp.asarray(steps))
+    z, doubts = [np.asarray(found)], [np.asarray(cost)]
+    usual, step = jnp.asarray(steps[0]), u.copy()
+    for column in mine[k:]:
+        step[column] += STEP
+        residual, doubt = _whitened(without(step), arrays, w, usual)
+        step[column] = u[column]
+        z.append(np.asarray(residual)[None])
+        doubts.append(np.asarray(doubt)[None])
+    z = np.concatenate([each.reshape(len(each), -1)[:, given.existing] for each in z])
+    doubts = np.concatenate(doubts)
+    push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
+    own = u[mine[: given.num_properties]]
+    cost = 0.5 * float(given.product(z[0], z[0])) + float(doubts[0]) + 0.5 * float(own @ own)
+    for block in blocks:
+        x = u[mine[block]]
+        cost += 0.5 * (1 + block.size) * float(np.log1p(x @ x))
+    return Evaluated(z[0], float(doubts[0]), push, lift, cost)
+
+
+def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
+    """Derivatives (n, K) of a candidate's n whitened residuals by its free columns, at coordinates u.
+
+    Residuals are those that exist, in the order of the mask `whitening.weight > 0`.
+    """
+    return evaluated(given, tuple(effects), u, columns_of(given, effects), []).push
+
+
+# Properties and effects fitted together, by Levenberg-Marquardt steps within the limits of each.
+
+STEPS = 12  # numerics: of an iteration, at most
+CLOSE = 0.02  # numerics: nats
+
+
+@dataclass(frozen=True)
+class Start:
+    """A candidate's start: its effects and the coordinates (all columns) to start from."""
+
+    effects: tuple[str, ...]
+    u: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted candidate: coordinates `u` (all columns), of which `columns` (K,) were free.
+
+    `residual` (n,): what it leaves, whitened, in the order of the mask `whitening.weight > 0`; `push` (n, K)
+    its derivatives; `doubts` [nats]: the cost of residuals in doubt; `cost`: these, half the squares with
+    nuisances integrated out, and the prior.
+    """
+
+    effects: tuple[str, ...]
+    u: np.ndarray
+    columns: np.ndarray
+    residual: np.ndarray
+    push: np.ndarray
+    doubts: float
+    cost: float
+
+
+def fit(given: Problem, start: Start, steps: int = STEPS) -> Fitted:
+    """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
+
+    Properties have normal priors, an effect's parameters together a Cauchy distribution.
+    """
+    mine, z = columns_of(given, start.effects), given.num_properties
+    low, high = (edge[mine] for edge in limits(given))
+    u = start.u.copy()
+    u[mine] = np.clip(u[mine], low, high)
+    blocks, at = [], z
+    for key in start.effects:
+        blocks.append(np.arange(at, at + len(free_parameters(key))))
+        at += blocks[-1].size
+    now, damping = evaluated(given, start.effects, u, mine, blocks), 1e-3
+    for _ in range(steps):
+        prior = np.ones(mine.size)
+        for block in blocks:
+            x = u[mine[block]]
+            prior[block] = (1 + block.size) / (1 + x @ x)
+        slope = given.product(now.push, now.residual) + now.lift + prior * u[mine]
+        bend = given.product(now.push, now.push) + np.diag(prior)
+        step, _ = least(bend + damping * np.diag(np.diag(bend)), -slope, low - u[mine], high - u[mine])
+        trial = u.copy()
+        trial[mine] = np.clip(u[mine] + step, low, high)
+        new = evaluated(given, start.effects, trial, mine, blocks)
+        if np.isfinite(new.cost) and new.cost < now.cost:
+            gained, u, now, damping = now.cost - new.cost, trial, new, damping / 5
+            if gained < CLOSE:
+                break
+        else:
+            damping *= 8
+            if damping > 1e3:
+                break
+    return Fitted(start.effects, u, mine, now.residual, now.push, now.doubts, now.cost)

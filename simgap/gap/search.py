@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,21 +11,150 @@ import numpy as np
 from estimation.identification import identify_aligned
 from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.errors import InputError
+from hmmseg.hand.signals import task_space
+from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.problem import Gap
-from simgap.effects import decoys, name_of
-from simgap.gap.assemble import gap_of
-from simgap.gap.candidates import best_fit, candidate_names, shifting
-from simgap.gap.fit import Fitted, Start, fit
-from simgap.gap.frame import build
+from simgap.bounded import least
+from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
+from simgap.effects.base import tips
+from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
+from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import Problem, neutral, problem, rebased
-from simgap.gap.realign import moved, realigned
-from simgap.gap.redrawn_noise import noise_gained, redrawn
-from simgap.gap.scatter import Scatter, scatters
-from simgap.gap.wrist_gap import not_compared, of_wrist, shown, shown_forms
+from simgap.gap.problem import (
+    Fitted,
+    Problem,
+    Start,
+    columns_of,
+    evaluated,
+    fit,
+    limits,
+    neutral,
+    problem,
+    rebased,
+    slots,
+    world_without,
+)
 from simgap.progress import Progress, silent
+
+# Every candidate effect fitted by itself: all starts of its shape parameters screened, the best refined.
+
+SCREEN = 2  # numerics: steps before the best start of a form is chosen
+LEADERS = 3  # numerics: starts screened
+PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
+
+
+def candidate_names(rig: Rig, excluded: Sequence[str] = (), forced: Sequence[str] = ()) -> list[str]:
+    """The effects to choose from, decoys included, or that are `forced`: a Cartesian hand has no joints."""
+    chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced} | decoys()
+    return [n for n, e in chosen.items() if n not in excluded and (rig.jointed or e.acts_on != "kinematics")]
+
+
+def shifting(names: Sequence[str]) -> list[str]:
+    """Keys of all forms of those effects that shift signals (the others only scatter them)."""
+    return [key for n in names if fitted()[n].correct is not None for key in forms_of(n)]
+
+
+def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
+    """Starts of one form of an effect, from other coordinates `base` (all columns)."""
+    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
+    grids = [
+        [(slot.start + j, p.coordinate(value)) for value in p.starts]
+        for j, p in enumerate(slot.effect.parameters)
+        if p.gridded and p.name in free_parameters(key)
+    ]
+    out = []
+    for chosen in itertools.product(*grids):
+        u = base.copy()
+        for column, value in chosen:
+            u[column] = value
+        out.append(Start((key,), u))
+    return out
+
+
+def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
+    """The best fit of one form of an effect, properties refitted; not refined where that promises nothing.
+
+    Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
+    what swings with it has no size.
+    """
+    every = starts(given, key, healthy.u)
+    ranked = sorted(((*_ranked(given, start), start) for start in every), key=lambda r: r[0])
+    if healthy.cost - ranked[0][0] < PROMISING:
+        return fit(given, ranked[0][2], 0)
+    leading = [start for _, start, _ in ranked[:LEADERS]]
+    if len(leading) > 1:
+        screened = sorted((fit(given, s, SCREEN) for s in leading), key=lambda f: f.cost)
+        leading = [Start((key,), screened[0].u)]
+    return fit(given, leading[0])
+
+
+def _ranked(given: Problem, start: Start) -> tuple[float, Start]:
+    """A start's cost after a linear step of all but its gridded parameters, and the start there."""
+    (key,) = start.effects
+    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
+    fixed = [
+        slot.start + j
+        for j, p in enumerate(slot.effect.parameters)
+        if p.gridded and p.name in free_parameters(key)
+    ]
+    low, high = limits(given)
+    columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
+    u = start.u.copy()
+    u[columns] = np.clip(u[columns], low[columns], high[columns])
+    now = evaluated(given, start.effects, u, columns, [])
+    bend = given.product(now.push, now.push) + np.eye(columns.size)
+    pull = -given.product(now.push, now.residual) - u[columns]
+    step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
+    there = u.copy()
+    there[columns] = np.clip(u[columns] + step, low[columns], high[columns])
+    left = now.residual + now.push @ (there[columns] - u[columns])
+    own = there[: given.num_properties]
+    cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
+    return cost, Start(start.effects, there)
+
+
+# Align again with an effect taken out: late or softened forces displace the boundaries themselves.
+
+
+def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bool = False) -> AlignedTrials:
+    """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
+    frame, rig, trials = given.frame, given.frame.rig, [a.trial for a in aligned.trials]
+    world = world_without(given, found.effects, found.u)
+    (position, velocity), force = tips(world), world.force
+    rows = []
+    for r, trial in enumerate(trials):
+        n = frame.lengths[r]
+        names = [f"{kind}{axis}{i}" for kind in ("", "v", "f") for i in (1, 2) for axis in "xy"]
+        columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
+        small, _ = thinned(trial, rig)
+        rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
+    again = align(trials, frame.task, _hand(rig, world), all_fit, rows)
+    return replace(again, rig=rig)
+
+
+def _hand(rig: Rig, world) -> Rig:
+    """The rig with the pads that the candidate gives it."""
+    give = {
+        "normal_stiffness": float(np.mean(world.give_normal)),
+        "shear_stiffness": float(np.mean(world.give_shear)),
+    }
+    pads = {k: 1 / v for k, v in give.items() if v > 1e-7}
+    return rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
+
+
+def moved(before: AlignedTrials, after: AlignedTrials) -> float:
+    """Largest shift of a boundary [s]; infinite where a trial no longer fits its task."""
+    shifts = []
+    for a, b in zip(before.trials, after.trials, strict=True):
+        if not b.segmentation.complete:
+            return float("inf")
+        shifts += [
+            abs(p.quantile(0.5) - q.quantile(0.5)) for p, q in zip(a.boundaries, b.boundaries, strict=True)
+        ]
+    return max(shifts)
+
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
 ROUNDS = 2  # numerics: times at most

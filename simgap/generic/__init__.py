@@ -1,1 +1,1 @@
-"""Diagnosis of real against given simulated trials of a plain ordered task, without a contact model."""
+"""Diagnosis of real against given simulated trials of an ordered task, without a contact model."""

@@ -16,8 +16,8 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import segment
 from simgap.effects import effect_named
 from simgap.effects.base import KINEMATICS, Performance
-from simgap.gap.synthetic import carried, recorded, scene_of
-from simgap.gap.synthetic import performed as perform
+from simgap.gap.twins import carried, recorded, scene_of
+from simgap.gap.twins import performed as perform
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks, read_properties
 from simgap.world.replay import Replay, replay

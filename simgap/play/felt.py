@@ -12,7 +12,7 @@ from hmmseg.io.rig import Rig
 from simgap.effects import catalogue
 from simgap.effects.base import Effect, Performance
 from simgap.world.properties import Block, Blocks
-from simgap.world.scene import Surroundings, finite_stiffness
+from simgap.world.virtual_model import Surroundings, finite_stiffness
 
 OFTEN = 3.0  # look: prior standard deviations of a sensor's effect: strong enough to be seen
 

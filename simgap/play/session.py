@@ -13,11 +13,9 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, parse_task
 from simgap.play.world import STIFFNESS, PlayedWorld
-from simgap.world.layout import lay_out
-from simgap.world.performance import CONTROL_PERIOD
-from simgap.world.properties import Blocks
-from simgap.world.sensors import record
-from simgap.world.writing import scene_files, trial_csv
+from simgap.world.dynamics import CONTROL_PERIOD
+from simgap.world.properties import Blocks, lay_out
+from simgap.world.simulate import record, scene_files, trial_csv
 
 RATE = 100.0  # look: Hz of the recording where the rig says none
 CLEARANCE = 0.012  # look: m that the open hand is wider than the widest block

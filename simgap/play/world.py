@@ -10,7 +10,7 @@ import numpy as np
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from simgap.play.felt import scene_with, sensed
-from simgap.world.performance import CONTROL_PERIOD
+from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.properties import Blocks
 from simgap.world.virtual_model import VirtualModel
 

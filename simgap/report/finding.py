@@ -41,6 +41,8 @@ PARTS = {
     "joint.stribeck": ("friction that falls with speed", "Turn {0} slowly, then fast; note the torques."),
     "joint.quadratic_drag": ("drag by the speed squared", "Run {0} at several speeds; note the torques."),
     "joint.direction_friction": ("friction larger one way", "Turn {0} slowly both ways; note the torques."),
+    "joint.elasticity": ("gears that give under load", "Hold {0}'s motor still and press on the link."),
+    "drive.gravity_compensation": ("drives that carry the weight", "Look it up in the drives."),
     "joint.load_friction": ("friction by the load", "Turn {0} with a load and without; note the torques."),
     "body.mass": ("mass", "Weigh {0}."),
     "body.com": ("centre of mass", "Balance {0} on an edge and measure where it rests."),

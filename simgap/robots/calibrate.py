@@ -17,8 +17,8 @@ import numpy as np
 from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
-from simgap.robots.borne_out import folds_of
 from simgap.robots.fit import FINEST, Whiten, moved_to
+from simgap.robots.heldout import folds_of
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
@@ -321,9 +321,7 @@ def _held_out(composed: Composed, nominal: Point, found: Point) -> tuple[dict[st
 
 def folds_of_logs(composed: Composed) -> np.ndarray:
     """The fold (N,) of each row: whole logs."""
-    return folds_of(
-        linearise(composed, {}, [], {}), len(composed.recordings), range(len(composed.recordings))
-    )
+    return folds_of(composed.rows, len(composed.recordings), range(len(composed.recordings)))
 
 
 def _rms(composed: Composed, left: np.ndarray) -> dict[str, float]:

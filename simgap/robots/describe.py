@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from simgap.attribution.document import entries, rows
-from simgap.attribution.posterior import Forms, Model, coordinates, fitted
+from simgap.attribution.verdict import entries, rows
 from simgap.robots.diagnose import RobotDiagnosis
-from simgap.robots.explained import SEEN
+from simgap.robots.search import Settled
+
+SEEN = 3.0  # chosen: standard deviations of noise's squares: a smaller gap of a phase is none
+NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
 
 
 def body(found: RobotDiagnosis) -> dict[str, Any]:
@@ -20,14 +22,15 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
     rest = v.remainder
     p_value = None if v.verdict == "none" else rest.p_value
     out = entries(v, v.detection, (rest.share, p_value, rows(rest.where)), attribution, rows(v.where))
-    out["remainder"]["regimes"] = dict(v.left)
     out["remainder"]["rms_over_noise"] = v.over_noise
     return out | {
+        "explanation": {"effects": list(v.explanation), "doubts": list(v.doubts)},
+        "calibrated": None if found.calibrated is None else found.calibrated.body(),
         "numerics": _fitted(found, numeric=True),
-        "stands_in": {c: [o.name for o in v.stand_ins if o.place == c] for c in v.causes},
+        "stands_in": {c: list(others) for c, others in v.stands_in.items()},
         "effects": _effects(found),
-        "fitted": _fitted(found),
-        "discrepancy": dict(found.discrepancy),
+        "fitted": _fitted(found, numeric=False),
+        "discrepancy": dict(found.best.discrepancy.scale),
         "identifiability": found.identifiable.body(),
         "shrinkage": _shrinkage(found),
         "next_experiment": None
@@ -40,70 +43,86 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
     }
 
 
-def parameters(
-    found: RobotDiagnosis, f: Forms, model: Model, effects: tuple[str, ...]
-) -> dict[str, dict[str, Any]]:
-    """Of a set's effects: short name, or effect and short name where there are several, to its posterior."""
-    out: dict[str, dict[str, Any]] = {}
-    variance = np.maximum(np.diag(model.covariance), 0.0)
-    for j, mine in coordinates(f, model.effects).items():
-        c = f.gap.candidates[j]
-        if c.name not in effects:
-            continue
-        mean, sd = c.neutral + c.scale * model.x[mine], c.scale * np.sqrt(variance[mine])
-        for k, short in enumerate(c.parameters):
-            key = short if len(effects) == 1 else f"{c.name}.{short}"
-            own = found.composed.effects[c.name].parameters[short]
-            m, s = float(mean[k]), float(sd[k])
-            low, high = max(m - 1.645 * s, float(c.low[k])), min(m + 1.645 * s, float(c.high[k]))
-            out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": own.unit}
-            out[key]["nominal"] = own.nominal
-    return out
-
-
 def _effects(found: RobotDiagnosis) -> dict[str, Any]:
-    """The set of causes together, each of them, and those that could take a cause's place."""
-    v, f = found.verdict, found.forms
-    names = [c.name for c in f.gap.candidates]
-    plain = fitted(f, ())
+    """The best set together, each of it, and those that could take a cause's place, each at its best."""
+    v, search = found.verdict, found.search
     out: dict[str, Any] = {}
-
-    def entry(effects: tuple[str, ...], model: Model, f: Forms = f) -> dict[str, Any]:
-        gain = found.shrinkage
-        return {
-            "parameters": parameters(found, f, model, effects),
-            "log_evidence": model.score - plain.score,
-            "heldout_score": 0.0
-            if gain is None or effects != v.causes
-            else 0.5 * (gain.before - gain.after) * found.linear.residual.size,
-            "property_shift": {},
-        }
-
     if v.causes:
-        out["+".join(v.causes)] = entry(v.causes, v.model)
-        for name in v.causes if len(v.causes) > 1 else ():
-            out[name] = entry((name,), v.model)
-    for one in v.stand_ins:
-        out[one.name] = entry((one.name,), one.model, one.forms)
+        names = v.causes
+        out["+".join(names)] = _entry(found, found.best, names)
+        for name in names if len(names) > 1 else ():
+            out[name] = _entry(found, found.best, (name,))
+    elif v.explanation:
+        for name in v.explanation:
+            out[name] = _entry(found, found.best, (name,))
     for name in v.indistinguishable:
-        if name in names and name not in out:
-            out[name] = entry((name,), fitted(f, (names.index(name),)))
+        having = [s for s in search.known.values() if name in s.names]
+        if having:
+            out[name] = _entry(found, max(having, key=lambda s: s.score), (name,))
     return out
 
 
-def _fitted(found: RobotDiagnosis, numeric: bool = False) -> dict[str, Any]:
-    """What was fitted along: before (nothing else acts) and with the causes; the simulation's own numbers
+def _entry(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, Any]:
+    far = found.shrinkage
+    told = far is not None and one is found.best and effects == found.verdict.causes
+    return {
+        "parameters": parameters(found, one, effects),
+        "log_evidence": one.score - found.search.known[frozenset()].score,
+        "heldout_score": 0.5 * (far.before - far.after) * one.linear.residual.size if told else 0.0,
+        "property_shift": {},
+    }
+
+
+def parameters(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Of a set's effects: short name, or effect and short name where there are several, to its posterior.
+
+    Standard deviations are at least what leaving out folds shows (the jackknife of Quenouille and Tukey), and
+    hold what the parameter is in other sets that were fitted, by their weight.
+    """
+    mean, sd = _posterior(found, one)
+    out: dict[str, dict[str, Any]] = {}
+    for name in effects:
+        for short, p in found.composed.effects[name].parameters.items():
+            m, s = mean[name, short], sd[name, short]
+            low, high = max(m - NORMAL_90 * s, p.low), min(m + NORMAL_90 * s, p.high)
+            key = short if len(effects) == 1 else f"{name}.{short}"
+            out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": p.unit, "nominal": p.nominal}
+    return out
+
+
+def _posterior(
+    found: RobotDiagnosis, one: Settled
+) -> tuple[dict[tuple[str, str], float], dict[tuple[str, str], float]]:
+    effects, names = found.composed.effects, one.names
+    keys = [(n, short) for n in names for short in effects[n].parameters]
+    fit = one.sets.fit(names, 0)
+    own = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))[-len(keys) :] if keys else np.zeros(0)
+    left_out = one.sets.jackknife(names, 0)[:, -len(keys) :] if keys else np.zeros((0, 0))
+    if len(left_out) > 2:
+        own = np.maximum(own, np.sqrt((len(left_out) - 1) * left_out.var(0)))
+    usual = np.array([effects[n].parameters[s].sd for n, s in keys])
+    mean = {key: float(one.point[key[0]][key[1]]) for key in keys}
+    sd = dict(zip(keys, (own * usual).tolist(), strict=True))
+    for key in keys:
+        rivals = [s for s in found.search.known.values() if key[0] in s.names]
+        weight = np.exp(np.minimum([s.score - one.score for s in rivals], 0.0))
+        apart = np.array([s.point[key[0]][key[1]] - mean[key] for s in rivals])
+        sd[key] = float(np.sqrt(sd[key] ** 2 + weight @ apart**2 / weight.sum()))
+    return mean, sd
+
+
+def _fitted(found: RobotDiagnosis, numeric: bool) -> dict[str, Any]:
+    """What was fitted along: before (nothing else acts) and with the best set; the simulation's own numbers
     apart."""
     out = {}
     for name, before in found.plain.point.items():
         if found.composed.numeric(name) is not numeric:
             continue
         for short, value in before.items():
-            parameter = found.composed.effects[name].parameters[short]
             out[name if len(before) == 1 else f"{name}.{short}"] = {
                 "before": value,
                 "after": found.linear.point[name][short],
-                "unit": parameter.unit,
+                "unit": found.composed.effects[name].parameters[short].unit,
             }
     return out
 
@@ -132,20 +151,20 @@ def _by_phase(found: RobotDiagnosis, units: dict[str, str]) -> dict[str, Any]:
     far, rows = found.shrinkage, found.composed.rows
     if far is None:
         return {}
-    known, phase = np.isfinite(far.squares).all(0), found.phases.of(rows)
+    seen, phase = np.isfinite(far.squares).all(0), found.phases.of(rows)
     out: dict[str, Any] = {}
     for number, name in enumerate(found.phases.names):
-        mine = known & (phase == number)
+        mine = seen & (phase == number)
         if not mine.any():
             continue
         before, after = far.squares[:, mine].sum(1)
         gap = before - mine.sum()
-        seen = gap > SEEN * np.sqrt(2 * mine.sum())
         left = {}
         for c, channel in enumerate(rows.channels):
             here = mine & (rows.channel == c)
             if here.any():
                 was, now = (float(np.sqrt(np.mean(r[here] ** 2))) for r in (far.plain, far.residual))
                 left[channel] = {"before": was, "after": now, "unit": units[channel]}
-        out[name] = {"fraction": float((before - after) / gap) if seen else None, "rms": left}
+        stands_out = gap > SEEN * np.sqrt(2 * mine.sum())
+        out[name] = {"fraction": float((before - after) / gap) if stands_out else None, "rms": left}
     return out

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.invariance import residual_left
-from simgap.attribution.posterior import Forms, fitted
-from simgap.attribution.verdict import Verdict
+from simgap.robots.search import Search, Settled
+from simgap.robots.verdict import RobotVerdict
 
 
 @dataclass(frozen=True)
@@ -21,27 +19,24 @@ class NextLog:
     gain: float
 
 
-def next_log(f: Forms, verdict: Verdict, logs: Sequence[str]) -> NextLog | None:
-    """For a set: of its members' best fits, the log along which the closest two differ most, whitened.
+def next_log(search: Search, best: Settled, verdict: RobotVerdict) -> NextLog | None:
+    """For a set: of the sets that were fitted with one of its members each, the log along which the closest
+    two differ most, whitened.
 
     None where nothing is to be separated, or no motion is expected to gain a nat.
     """
     if verdict.verdict != "set":
         return None
-    names = [c.name for c in f.gap.candidates]
-    causes = tuple(sorted(names.index(n) for n in verdict.causes))
-    best = f.spectrum.columns[:, 0] - residual_left(f, fitted(f, causes))
-    gains = np.zeros(len(logs))
-    trial = f.gap.rows.trial
-    smallest = np.inf
-    for rival in verdict.indistinguishable:
-        for out in causes:
-            other = tuple(sorted({*(j for j in causes if j != out), names.index(rival)}))
-            apart = best - (f.spectrum.columns[:, 0] - residual_left(f, fitted(f, other)))
-            each = 0.5 * np.bincount(trial, apart**2, len(logs))
-            if each.sum() < smallest:
-                smallest, gains = float(each.sum()), each
+    logs = search.composed.recordings
+    gains, smallest = np.zeros(len(logs)), np.inf
+    for one in search.known.values():
+        if not {*one.names} & {*verdict.indistinguishable}:
+            continue
+        apart = best.whiten(np.nan_to_num(best.linear.residual - one.linear.residual))
+        each = 0.5 * np.bincount(best.linear.rows.log, apart**2, len(logs))
+        if each.sum() < smallest:
+            smallest, gains = float(each.sum()), each
     at = int(gains.argmax())
     if gains[at] < 1.0:
         return None
-    return NextLog(logs[at], (*verdict.causes, *verdict.indistinguishable), float(gains[at]))
+    return NextLog(logs[at].name, (*verdict.causes, *verdict.indistinguishable), float(gains[at]))

@@ -9,7 +9,6 @@ import numpy as np
 
 from simgap.bounded import least
 from simgap.progress import say
-from simgap.robots.blocks import NONE, Discrepancy
 from simgap.robots.linear import STEP, Base, Linear, base_at, vary
 from simgap.robots.model import Composed, Point
 
@@ -27,12 +26,10 @@ FINEST = 1e-4  # numerics: usual sizes: the least one
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a set fits best, what that `gained` over where the fit began [nats], and the `discrepancy` that
-    it leaves, where that was learned."""
+    """Where a set fits best, and what that `gained` over where the fit began [nats]."""
 
     point: Point
     gained: float
-    discrepancy: Discrepancy = NONE
 
 
 def moved_to(
@@ -78,14 +75,6 @@ def moved_to(
         if gained < CLOSE * (1 + CLOSE * cost):
             break
     return Fit({**point, **squares.at(x)}, first - cost)
-
-
-def reached(composed: Composed, linear: Linear, whiten: Whiten, point: Point) -> Point:
-    """The start that `moved_to` has for a point, as far as straight lines from the linear model's lead."""
-    if not any(point.values()):
-        return point
-    squares = _Squares(composed, linear, whiten, {}, point)
-    return squares.at(squares.reached())
 
 
 @dataclass

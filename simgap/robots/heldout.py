@@ -1,4 +1,4 @@
-"""How far the gap shrinks on stretches of logs that took no part."""
+"""What logs that took no part say of a set: how far the gap shrinks on them, and which logs are held out."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from simgap.attribution.heldout import fraction_gone
-from simgap.attribution.posterior import forms
-from simgap.attribution.search import sought
-from simgap.robots.borne_out import EVEN, borne_out
 from simgap.robots.fit import moved_to
-from simgap.robots.linear import Linear, base_at, linearise
+from simgap.robots.linear import base_at, linearise
 from simgap.robots.model import Composed, Point
-from simgap.robots.proposals import nearest, point_of
-from simgap.robots.search import LEADERS, Found
-from simgap.robots.settle import settled
-from simgap.robots.whiten import Whitener, covariances
+from simgap.robots.rows import Rows
+from simgap.robots.search import Settled
+from simgap.robots.whiten import covariances
+
+FOLDS = 6  # numerics: parts that are held out in turn; each fit keeps five sixths
 
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """Mean squares of whitened residuals of held-out stretches `before` and `after` (noise's own: 1), and
-    the gap's `fraction` that is gone with its 90 % interval by fold. `rms`: by channel before and after, in
-    its unit; `found` by fold; `plain`, `residual` (N,): what both leave of the rows, and `squares` (2, N)
-    of these whitened, NaN where one is not known."""
+    """Mean squares of whitened residuals of held-out stretches `before` and `after` (noise's own:
+    `noise_floor`), and the gap's `fraction` that is gone with its 90 % interval by fold.
+
+    `rms`: by channel before and after, in its unit; `plain`, `residual` (N,): what both leave of the rows,
+    and `squares` (2, N) of these whitened, NaN where one is not known.
+    """
 
     before: float
     after: float
@@ -33,117 +33,69 @@ class Shrinkage:
     fraction: float
     interval_90: tuple[float, float]
     rms: dict[str, tuple[float, float]]
-    found: tuple[tuple[str, ...], ...]
     plain: np.ndarray
     residual: np.ndarray
     squares: np.ndarray
 
 
-def shrinkage(
-    composed: Composed,
-    found: Found,
-    plain: Linear,
-    sensor: Whitener,
-    fold: np.ndarray,
-    causes: Sequence[str],
-    forced: bool = False,
-) -> Shrinkage | None:
-    """Nested: every fold is predicted by a search and a fit that saw the others alone, about the point where
-    the search ended. To be told, a cause must be borne out; to predict by, it need only be the better bet.
-    `plain`: the linear model where only what is fitted along is; `causes` are taken where they are `forced`.
-    """
-    rows, index = found.linear.rows, np.flatnonzero(np.isfinite(found.linear.residual))
-    gap = found.forms.gap
-    before, after = plain.residual.copy(), np.full(rows.log.size, np.nan)
-    kept_sets = []
-    whole_logs = all(np.unique(fold[rows.log == log]).size == 1 for log in np.unique(rows.log))
+def folds_of(rows: Rows, num_logs: int, groups: Sequence[int] | None = None) -> np.ndarray:
+    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches. With
+    `groups` (num_logs,), logs of one number are held out together."""
+    if groups is not None:
+        return np.unique(np.asarray(groups)[rows.log], return_inverse=True)[1]
+    if num_logs >= 3:
+        return rows.log % min(num_logs, FOLDS)
+    stretches = max(2, FOLDS // num_logs)
+    out = np.zeros(rows.log.size, int)
+    for log in range(num_logs):
+        mine = rows.log == log
+        window = rows.window[mine]
+        first, count = int(window.min()), int(np.ptp(window)) + 1
+        out[mine] = log * stretches + (window - first) * stretches // count
+    return np.unique(out, return_inverse=True)[1]
+
+
+def shrinkage(best: Settled, nothing: Settled, composed: Composed, fold: np.ndarray) -> Shrinkage | None:
+    """Every fold predicted by the set fitted exactly to the others, and by what is fitted along alone; None
+    where there is no gap to shrink. What each log has of its own is fitted to itself, for nothing else tells
+    it."""
+    rows = composed.rows
+    before, after = np.full(rows.log.size, np.nan), np.full(rows.log.size, np.nan)
     for number in np.unique(fold):
         inside = fold == number
-        seen = ~inside[index]
-        train = forms(gap.taken(seen))
-        if forced:
-            kept = tuple(j for j, n in enumerate(found.names) if n in causes)
-        else:
-            near = {*nearest([train], found.best)[:LEADERS], *found.best}
-            best = sought(train, among=[j for j, n in enumerate(found.names) if n in near])[0]
-            kept = borne_out(gap.taken(seen), best.effects, fold[index][seen], EVEN)
-        kept_sets.append(tuple(found.names[j] for j in kept))
-        point = point_of(composed, train, kept, found.linear.point)
-        if whole_logs:
-            point = _refitted(composed, found, point, np.unique(rows.log[~inside]).tolist())
-        logs = np.unique(rows.log[inside])
-        part, mine = composed.along(logs.tolist()), np.isin(rows.log, logs)
-        if whole_logs:
-            point = _own(composed, found, point, logs.tolist())
-            bare = _plain(composed, plain.point, np.unique(rows.log[~inside]).tolist())
-            bare = _own(composed, found, bare, logs.tolist())
-            before[mine] = rows.observed[mine] - base_at(part, bare).rows
-        predicted = base_at(part, point).rows
-        after[mine] = np.where(inside[mine], rows.observed[mine] - predicted, after[mine])
-    return _measured(found.linear, before, after, sensor, fold, tuple(kept_sets))
-
-
-def _plain(composed: Composed, point: Point, logs: Sequence[int]) -> Point:
-    """What is fitted along, without any cause, by least squares on some logs: the least that it leaves."""
-    if not point:
-        return point
-    part = composed.along(logs)
-    linear = linearise(part, point, list(point))
-    return moved_to(part, linear, covariances(part, linear).whitener(), point).point
-
-
-def _measured(
-    linear: Linear,
-    before: np.ndarray,
-    after: np.ndarray,
-    sensor: Whitener,
-    fold: np.ndarray,
-    kept_sets: tuple[tuple[str, ...], ...],
-) -> Shrinkage | None:
-    usable = np.isfinite(after) & np.isfinite(before) & np.isfinite(linear.residual)
-    numbers = np.unique(fold)
+        windows = [np.unique(rows.window[m]).tolist() for m in (~inside, inside)]
+        test = composed.among(windows[1])
+        for one, left in ((nothing, before), (best, after)):
+            point = _fitted(composed.among(windows[0]), one, one.point)
+            own = [n for n in point if composed.effects[n].by_log]
+            point = _fitted(test, one, point, own) if own else point
+            left[inside] = rows.observed[inside] - base_at(test, point).rows
+    usable = np.isfinite(after) & np.isfinite(before) & ~np.isin(rows.window, list(best.wide))
+    sensor = best.covariances.whitener()
     white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (before, after)]
-    square = np.array(
-        [
-            [float(np.sum(w[(fold == n) & usable])) for w in white] + [float(np.sum((fold == n) & usable))]
-            for n in numbers
-        ]
-    )
+    floor = best.covariances.floor() / max(np.isfinite(best.linear.residual).sum(), 1)
+    square = np.array([[*(w[usable & (fold == n)].sum() for w in white), floor * np.sum(usable & (fold == n))]
+                       for n in np.unique(fold)])  # fmt: skip
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]
     if there.sum() <= 0:
         return None
     rms = {}
-    for c, name in enumerate(linear.rows.channels):
-        mine = usable & (linear.rows.channel == c)
+    for c, name in enumerate(rows.channels):
+        mine = usable & (rows.channel == c)
         if mine.any():
-            rms[name] = tuple(float(np.sqrt(np.mean(r[mine] ** 2))) for r in (before, after))
-    total = square.sum(0)
-    return Shrinkage(
-        total[0] / total[2],
-        total[1] / total[2],
-        1.0,
-        *fraction_gone(gone, there),
-        rms,
-        kept_sets,
-        before,
-        after,
-        np.where(usable, white, np.nan),
-    )
+            rms[name] = (
+                float(np.sqrt(np.mean(before[mine] ** 2))),
+                float(np.sqrt(np.mean(after[mine] ** 2))),
+            )
+    mean = square.sum(0) / usable.sum()
+    fraction, interval = fraction_gone(gone, there)
+    return Shrinkage(float(mean[0]), float(mean[1]), float(mean[2]), fraction, interval, rms, before, after,
+                     np.where(usable, white, np.nan))  # fmt: skip
 
 
-def _own(composed: Composed, found: Found, point: Point, logs: Sequence[int]) -> Point:
-    """The point with what these logs have of their own fitted to them, for nothing else tells it."""
-    by_log = [n for n in point if composed.effects[n].by_log]
-    return _refitted(composed, found, point, logs, by_log) if by_log else point
-
-
-def _refitted(
-    composed: Composed, found: Found, point: Point, logs: Sequence[int], only: Sequence[str] | None = None
-) -> Point:
-    """The point fitted to some of the logs alone, exactly."""
-    part = composed.along(logs)
-    linear = linearise(part, found.linear.point, [])
-    cov = covariances(part, linear)
-    whiten = cov.whitener(found.discrepancy)
-    there = moved_to(part, linear, whiten, point, only).point
-    return there if only is not None else settled(part, there, whiten=whiten).point
+def _fitted(part: Composed, one: Settled, point: Point, only: Sequence[str] | None = None) -> Point:
+    """The point fitted to some of the windows alone, by the discrepancy that all of them leave."""
+    if not point:
+        return point
+    linear = linearise(part, point, [])
+    return moved_to(part, linear, covariances(part, linear).whitener(one.discrepancy), point, only).point

@@ -40,17 +40,16 @@ class Identifiability:
         }
 
 
-def identifiability(names: Sequence[str], columns: np.ndarray) -> Identifiability:
-    """From sensitivities (n, p), whitened, each for a change of one usual size.
+def identifiability(names: Sequence[str], product: np.ndarray) -> Identifiability:
+    """From inner products (p, p) of sensitivities, whitened, each for a change of one usual size.
 
     A parameter is alike the fewest others that make up its sensitivity, found one by one (orthogonal
     matching pursuit: Pati, Rezaiifar and Krishnaprasad 1993).
     """
-    length = np.linalg.norm(columns, axis=0)
+    length = np.sqrt(np.diag(product))
     unseen = length < UNSEEN
     seen = np.flatnonzero(~unseen)
-    unit = columns[:, seen] / length[seen]
-    gram = unit.T @ unit  # all that follows needs inner products alone
+    gram = product[np.ix_(seen, seen)] / np.outer(length[seen], length[seen])
     found: dict[frozenset[int], Alike] = {}
     for j in range(seen.size):
         chosen, own = _makers(gram, j)

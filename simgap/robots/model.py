@@ -119,16 +119,18 @@ class Composed:
 
     def moved(self, point: Point) -> Composed:
         """The same, with what the simulator's own numbers do as it is at this point."""
-        return replace(self, about={n: v for n, v in point.items() if not self.numeric(n)}, _slopes={})
+        return replace(self, about=dict(point), _slopes={})
 
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """True channels of every window from these starts; None where a rollout diverged."""
+        there = {n: v for n, v in self.about.items() if self.numeric(n)}
         plain = {n: v for n, v in point.items() if not self.numeric(n)}
-        out = self._rolled(plain, self.windows, starts)
+        out = self._rolled({**plain, **there}, self.windows, starts)
         for name, theta in point.items():
-            if name not in plain:
+            if self.numeric(name):
+                from_there = {**self.effects[name].neutral(), **there.get(name, {})}
                 for short, value in theta.items():
-                    out = self.stepped(out, name, short, value - self.effects[name].parameters[short].nominal)
+                    out = self.stepped(out, name, short, value - from_there[short])
         return out
 
     def stepped(
@@ -145,8 +147,9 @@ class Composed:
         new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
         if new:
             known = self.effects[name].parameters[short]
-            step = known.sd if known.nominal + known.sd <= known.high else -known.sd
-            there = {**self.about, name: {**self.effects[name].neutral(), short: known.nominal + step}}
+            now = {**self.effects[name].neutral(), **self.about.get(name, {})}
+            step = known.sd if now[short] + known.sd <= known.high else -known.sd
+            there = {**self.about, name: {**now, short: now[short] + step}}
             both = [self._rolled(p, new, [w.start for w in new]) for p in (self.about, there)]
             for w, here, moved in zip(new, *both, strict=True):
                 change = {} if here is None or moved is None else _sum(moved, here, -1.0)

@@ -1,246 +1,384 @@
-"""Which effects act: search about a point, move the point to what was found, and search again there.
+"""Which effects act: sets proposed in closed form about a point, fitted exactly, proposed anew where the best
+is.
 
-Each round is exact at its point (all effects found so far at their values) and linear about it. Straight
-lines promise what an exact fit may not keep: a set is gone on with if it scores better where it settles than
-the one before did, so that scores rise and no sets take turns. Where there are many windows, a search of
-some of them tells which candidates come near, and before it ends all are asked again where it would end.
+About the point of the best set so far every candidate is rolled out once; sets near it (one more, one less,
+one exchanged, two more) are ranked by their evidence in closed form, and those that lead are fitted exactly,
+each with the discrepancy that it leaves. When none is better, every cause in turn is taken out, and what
+could take its place is proposed about the point without it: a straight line from where one hysteresis acts to
+where another would is no measure of either. What was fitted exactly on the way makes the posterior over sets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.special import gammaln
+from scipy.stats import t as student
 
-from simgap.attribution.posterior import Forms, Model, fitted
-from simgap.attribution.verdict import LEAST
 from simgap.progress import Progress, say
-from simgap.robots.asked import ROUNDS, Asked, Step
-from simgap.robots.blocks import NONE, Discrepancy
-from simgap.robots.borne_out import BORNE_OUT, EVEN, chance_of, held_out_scores
-from simgap.robots.discrepancy import learned
-from simgap.robots.fit import Fit, reached
-from simgap.robots.gap import fitted_along
-from simgap.robots.judged import Judge, Judged
-from simgap.robots.kept import NOWHERE, Kept
-from simgap.robots.linear import Linear, linearise
-from simgap.robots.model import Point
-from simgap.robots.proposals import leaders, nearest, one_more, point_of, two_more
-from simgap.robots.settle import SETTLED, settled
-from simgap.robots.whiten import Covariances, Whitener, covariances
+from simgap.robot_effects.base import RobotEffect
+from simgap.robots.fit import moved_to, prior_cost
+from simgap.robots.identifiable import Identifiability, identifiability
+from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary
+from simgap.robots.model import Composed, Point
+from simgap.robots.sets import Names, Sets, cancelling, log_odds, neighbours, pairs, point_of, without
+from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
+from simgap.simulators.protocol import Parameter
 
-LEADERS = 24  # numerics: candidates that a search goes on with
-PROPOSED = 4  # numerics: sets by each scale that are judged by the discrepancy that they leave
-TRIED = 3  # numerics: sets that are fitted exactly until one is better
+LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
+TRIED = 4  # numerics: sets that are fitted exactly about one point
+LEADERS = 16  # numerics: candidates that are rolled out where they fit best
+RESETS = 3  # numerics: fits of the simulator's own numbers, each about where the last one ended
+USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
+CANCEL = 24  # numerics: pairs that nearly cancel, rolled out along their difference
+LEAVES = (
+    2.0  # numerics: squares over the noise's; a set that leaves more may be better begun from the calibration
+)
+SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
+JOINED = " against "
+NEAR = 10.0  # numerics: nats by which straight lines may be wrong of what takes a cause's place
+FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
+BETTER = 2.0  # numerics: nats by which a set must be better to be gone on with
+ROUNDS = 12  # numerics: of an iteration that settles sooner
+BORNE_OUT = 0.05  # chosen: chance of held-out gains as good without any
+MANY = 80  # numerics: candidates of which all pairs are tried
 
 
 @dataclass(frozen=True)
-class Found:
-    """Where a search ended: the linear model there, its whitener and discrepancies, the best set first."""
+class Settled:
+    """A set where it fits best: its point, the gap linear about it in its own effects, the discrepancy that
+    it leaves, its log evidence, and the log density (folds,) of each fold given the others."""
 
+    names: Names
+    point: Point
     linear: Linear
-    whiten: Whitener
     covariances: Covariances
     discrepancy: Discrepancy
-    forms: Forms
-    models: tuple[Model, ...]
-    best: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Candidates by number."""
-        return tuple(c.name for c in self.forms.gap.candidates)
-
-
-def search(ask: Asked, tell: Progress, kept: Kept = NOWHERE, begin: Step | None = None) -> Found:
-    """Search until the best set stays: where there are many windows in some of them first, from which all are
-    gone on with. `begin`: a set to go on from, found in some of the windows."""
-    few = ask.few
-    start = Step(ask.plain.point) if begin is None else begin
-    if not ask.forced and few is not ask:
-
-        def ended() -> Step:
-            last = _searched(few, start, tell, kept.of("some windows"))[1]
-            there = settled(ask.composed, last.point, ask.factor, begin=last.off)
-            return Step(there.point, last.best, field=last.field, whole=False, off=there.discrepancy)
-
-        start, ask = kept("some windows", ended), replace(ask, last=True)
-    return _searched(ask, start, tell, kept)[0]
-
-
-def exchanged(ask: Asked, point: Point, held: Sequence[str]) -> Step | None:
-    """What to go on from once held-out logs have taken effects out of a set: with others in the place of one
-    of those that are left, if that is better."""
-    return _exchanged(_Place.of(ask.few, point, held, ask.candidates), ask.candidates)
-
-
-def _searched(ask: Asked, step: Step, tell: Progress, kept: Kept) -> tuple[Found, Step]:
-    """Rounds until the best set stays. A round that was kept is made again only if it is the last."""
-    found: Found | None = None
-
-    def made() -> Step:
-        nonlocal found
-        found, after = _round(ask, step, number)
-        return after
-
-    for number in range(ROUNDS):
-        found = None
-        tell(f"round {number + 1}")
-        after = kept(f"round {number + 1}", made)
-        tell(f"round {number + 1}: {' + '.join(after.best) or 'nothing'}")
-        if after.ended:
-            break
-        step = after
-    return _round(ask, step, number)[0] if found is None else found, after
-
-
-def _round(ask: Asked, step: Step, number: int) -> tuple[Found, Step]:
-    """One round: the sets that promise most about the step's point, and where the first that keeps what it
-    promised settles."""
-    asked = ask.asked(step, number)
-    place = _Place.of(ask, step.point, ask.forced or step.best, asked, step.off)
-    found = place.found()
-    if not {*place.held} <= {*step.point}:
-        there = place.settled(place.here)
-        return found, Step(there.point, place.held, off=there.discrepancy)
-    if not ask.forced and number < ROUNDS - 1:
-        better = _better(place, place) or _exchanged(place, asked)
-        if better is not None:
-            return found, better
-    # Whatever a set has gained or lost changes what comes near beside it.
-    if len(asked) < len(ask.candidates):
-        return found, replace(step, whole=True)
-    field = {*place.names, *nearest(place.every, place.held)[:LEADERS]}
-    return found, replace(step, ended=True, field=tuple(sorted(field)))
-
-
-def _better(place: _Place, now: _Place) -> Step | None:
-    """A set that promises more than the place's own, and that scores better than what is held now where it
-    settles.
-
-    What comes one by one is judged again when the search has ended, and held-out logs need only be for it
-    sooner than against it. Two at once, or others in the place of one, they must bear out: where the model is
-    off by itself there are many such sets.
-    """
-    tried: set[tuple[str, ...]] = {place.held}
-    for proposals in ((one_more,), (two_more,)) if place is now else ((one_more, two_more),):
-        sets = set().union(*map(place.proposed, proposals))
-        promising = sorted(map(place.judge, sorted(sets - tried)), key=lambda one: -one.score)
-        for one in [p for p in promising if p.score > place.here.score + SETTLED][:TRIED]:
-            say(f"trying {' + '.join(one.names) or 'nothing'}")
-            there = place.settled(one)
-            score, held_out = place.tried(there, one.names)
-            most = EVEN if place is now and one_more in proposals else BORNE_OUT
-            if score > now.here.score + SETTLED and chance_of(held_out - now.held_out) < most:
-                return Step(there.point, one.names, off=there.discrepancy)
-        tried |= sets
-        if not place.here.discrepancy:  # nothing is left for what helps only together
-            break
-    return None
-
-
-def _exchanged(place: _Place, asked: Sequence[str]) -> Step | None:
-    """A set with others in the place of one effect, if that is better: sought about the point without it, for
-    what it does to the model changes what others seem to do. What is small is not told where something is
-    left, whatever is in its place."""
-    ask = place.ask
-    if ask.last or not place.here.discrepancy:
-        return None
-    for out in place.large:
-        rest = tuple(n for n in place.held if n != out)
-        left = {n: values for n, values in place.linear.point.items() if n != out}
-        there = settled(ask.composed, left, ask.factor, begin=place.here.discrepancy)
-        others = [n for n in asked if n != out]
-        better = _better(_Place.of(ask, there.point, rest, others, there.discrepancy), place)
-        if better is not None:
-            return better
-    return None
-
-
-@dataclass(frozen=True)
-class _Place:
-    """A set where it has settled, `held`, judged `here`, and the gap linear about there: by two `scales`,
-    that of the discrepancy that is left and of the sensors' noise alone, `every` candidate, and the `names`
-    of those that come near."""
-
-    ask: Asked
-    linear: Linear
-    scales: tuple[Whitener, ...]
-    every: tuple[Forms, ...]
-    names: tuple[str, ...]
-    held: tuple[str, ...]
-    judge: Judge
-    here: Judged
-
-    @classmethod
-    def of(
-        cls, ask: Asked, point: Point, held: Sequence[str], asked: Sequence[str], begin: Discrepancy = NONE
-    ) -> _Place:
-        """About a point, with these candidates; `begin`: about what discrepancy is left there."""
-        linear = ask.linearised(point, asked)
-        usable = [n for n in asked if n in linear.moved]
-        cov = covariances(ask.composed, linear, ask.factor)
-        off = learned(cov, linear.residual, begin=begin)
-        # What a cause does is hidden by the discrepancy that is left without it, and what is none of the
-        # causes' doing misleads without one: what comes near by either is asked.
-        scales = tuple(cov.whitener(d) for d in ((off, NONE) if off else (NONE,)))
-        every = tuple(ask.forms(linear, whiten, usable) for whiten in scales)
-        linear, names = leaders(ask.composed, linear, every, held, LEADERS)
-        there = tuple(n for n in names if n in held)
-        judge = Judge(ask.composed, ask.phases, linear, cov, off, every[0].log_odds)
-        return cls(ask, linear, scales, every, tuple(names), there, judge, judge(there))
-
-    @property
-    def large(self) -> tuple[str, ...]:
-        """Those of the set without which more comes back than an error in the largest one's form would be."""
-        sensor, left = self.judge.covariances.whitener(), np.nan_to_num(self.linear.residual)
-        shift = {n: np.nan_to_num(self.linear.moved[n].shift) for n in self.held}
-        lost = {n: np.sum(sensor(left + rows) ** 2) - np.sum(sensor(left) ** 2) for n, rows in shift.items()}
-        return tuple(n for n in self.held if lost[n] >= LEAST * max(lost.values()))
-
-    def found(self) -> Found:
-        """What is known there, the set the best."""
-        f = self.ask.forms(self.linear, self.here.whiten, self.names)
-        model = fitted(f, tuple(self.names.index(n) for n in self.held))
-        cov, off = self.judge.covariances, self.here.discrepancy
-        return Found(self.linear, self.here.whiten, cov, off, f, (model,), self.held)
-
-    def proposed(self, propose: Callable[[Forms, Sequence[int]], list[Model]]) -> set[tuple[str, ...]]:
-        """Other sets that promise most, by each scale."""
-        own, found = [self.names.index(n) for n in self.held], set()
-        for whiten in self.scales:
-            models = propose(self.ask.forms(self.linear, whiten, self.names), own)[:PROPOSED]
-            found |= {tuple(self.names[j] for j in m.effects) for m in models}
-        return found
-
-    def settled(self, one: Judged) -> Fit:
-        """Where a set settles that was judged here."""
-        f = self.ask.forms(self.linear, one.whiten, one.names)
-        begin = point_of(self.ask.composed, f, tuple(range(len(one.names))), self.linear.point)
-        first = reached(self.ask.composed, self.linear, one.whiten, begin)
-        return settled(self.ask.composed, first, self.ask.factor, begin=one.discrepancy)
+    wide: dict[int, float]
+    whiten: Whitener
+    sets: Sets
+    score: float
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Log likelihood of each fold's rows (folds,), fitted to the others."""
-        return self._held_out(self.linear, self.here)
+        """Log density (folds,) of each fold given the others."""
+        return self.sets.held_out(self.names, 0)
 
-    def tried(self, there: Fit, names: tuple[str, ...]) -> tuple[float, np.ndarray]:
-        """Of a set where it has settled its score, minus infinity where the simulator diverges more than it
-        did, and its log likelihood of each fold's rows (folds,)."""
-        ask = self.ask
-        linear = linearise(ask.composed, there.point, [*fitted_along(ask.composed), *names])
-        if linear.dropped > self.linear.dropped or linear.diverged:
-            return -np.inf, np.zeros(np.unique(ask.fold).size)
-        cov = covariances(ask.composed, linear, ask.factor)
-        off = learned(cov, linear.residual, begin=there.discrepancy)
-        one = Judge(ask.composed, ask.phases, linear, cov, off, self.judge.log_odds)(names)
-        return one.score, self._held_out(linear, one)
+    @cached_property
+    def squares(self) -> np.ndarray:
+        """Squares (N,) of what is left, whitened by the sensors' noise and the starts alone."""
+        return self.covariances.whitener()(np.nan_to_num(self.linear.residual)) ** 2
 
-    def _held_out(self, linear: Linear, one: Judged) -> np.ndarray:
-        f, fold = self.ask.forms(linear, one.whiten, one.names), self.ask.fold
-        every = tuple(range(len(one.names)))
-        score = held_out_scores(f.gap, [every], fold[np.isfinite(linear.residual)])[:, 0]
-        return score - one.whiten.half_log_dets(np.unique(fold, return_inverse=True)[1])
+
+@dataclass
+class Search:
+    """Sets of candidates along windows; `fold` (N,) of each row. `known`: sets that were fitted, each at its
+    best."""
+
+    composed: Composed
+    wanted: Names
+    fold: np.ndarray
+    calibrated: Point = field(default_factory=dict)
+    known: dict[frozenset[str], Settled] = field(default_factory=dict)
+    starts: dict = field(default_factory=dict)
+    against: dict[str, float] = field(default_factory=dict)
+    identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
+    diverged: tuple[str, ...] = ()
+
+    @cached_property
+    def along(self) -> Names:
+        """Effects that are fitted along with every cause."""
+        return tuple(n for n, e in self.composed.effects.items() if e.fitted)
+
+    @property
+    def log_odds(self) -> float:
+        """Prior log odds of one candidate to act."""
+        return log_odds(len(self.wanted))
+
+    def run(self, tell: Progress) -> Settled:
+        """The best set: from nothing on, and where that leaves more than calibration does, from there
+        back."""
+        best = self._from(self.nothing(), tell)
+        if best.squares.sum() < LEAVES * best.covariances.floor():
+            return best
+        tell("from the calibration")
+        other = self._calibrated()
+        if other is not None and other.squares.sum() < best.squares.sum():
+            other = self._from(other, tell)
+            best = other if self._is_better(other, best) else best
+        return best
+
+    def _from(self, best: Settled, tell: Progress) -> Settled:
+        """The best set that steps lead to."""
+        for number in range(ROUNDS):
+            tell(f"round {number + 1}: {' + '.join(best.names) or 'nothing'}")
+            better = self._better(best, best) or self._exchanged(best)
+            if better is None:
+                break
+            best = better
+        return best
+
+    def _calibrated(self) -> Settled | None:
+        """Of what calibration moved as much as is needed: taken back one by one where the whole acts, in
+        closed form."""
+        moved = {n: v for n, v in self.calibrated.items() if n in self.wanted and self._off(n, v)}
+        if not moved:
+            return None
+        names = tuple(moved)
+        begin = {n: self.calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
+        whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
+        sets, levels, effects = self.place(whole, names)
+        score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(levels)))
+        while names:
+            fewer = [tuple(n for n in names if n != out) for out in names]
+            scores = sets.scores(fewer, level)
+            if scores.max() < score:
+                break
+            names, score = fewer[int(scores.argmax())], float(scores.max())
+        begin = point_of(effects, sets.fit(names, level), names, self.along)
+        return self.settled(names, begin, [whole.whiten, levels[-1]])
+
+    def _off(self, name: str, values: Mapping[str, float]) -> bool:
+        known = self.composed.effects[name].parameters
+        return any(abs(v - known[n].nominal) > SMALL * known[n].sd for n, v in values.items())
+
+    def forced(self, names: Names) -> Settled:
+        """A given set at its best, and those with one less."""
+        nothing = self.nothing()
+        sets, levels, effects = self.place(nothing, self.wanted)
+        scores = [sets.scores([names], level)[0] for level in range(len(levels))]
+        level = int(np.argmax(scores))
+        begin = point_of(effects, sets.fit(names, level), names, self.along)
+        found = self.settled(names, begin, [levels[k] for k in {level, len(levels) - 1}])
+        for out in names if len(names) > 1 else ():
+            rest = tuple(n for n in names if n != out)
+            self.settled(rest, without(found.point, out), [found.whiten])
+        return found
+
+    def nothing(self) -> Settled:
+        """What is fitted along, alone; the simulator's own numbers are straight lines about where they are
+        then."""
+        point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
+        last = -np.inf
+        for _ in range(RESETS if any(map(self.composed.numeric, self.along)) else 1):
+            self.composed, self.known = self.composed.moved(point), {}
+            linear = linearise(self.composed, point, self.along)
+            self.starts = dict(linear.starts)
+            found = self.settled((), point, [covariances(self.composed, linear).whitener()])
+            if found.score < last + BETTER:
+                break
+            point, last = found.point, found.score
+        return found
+
+    def settled(self, names: Names, begin: Point, scales: Sequence[Whitener]) -> Settled:
+        """A set at its best, from a start: by each of these scales, and once more by what that leaves."""
+        say(f"fitting {' + '.join(names) or 'nothing'}")
+        found = [self._judged(names, begin)] if frozenset(names) not in self.known else []
+        for whiten in scales:
+            found.append(self._judged(names, self._moved(begin, whiten)))
+        best = max(found, key=lambda one: one.score)
+        again = self._judged(names, self._moved(best.point, best.whiten))
+        best = max((best, again), key=lambda one: one.score)
+        key = frozenset(names)
+        if key not in self.known or self.known[key].score < best.score:
+            self.known[key] = best
+        return self.known[key]
+
+    def _moved(self, begin: Point, whiten: Whitener) -> Point:
+        linear = linearise(self.composed, begin, [], self.starts)
+        return moved_to(self.composed, linear, whiten, begin).point
+
+    def _judged(self, names: Names, point: Point) -> Settled:
+        composed = self.composed
+        linear = linearise(composed, point, [*self.along, *names], self.starts)
+        cov = covariances(composed, linear)
+        left = np.nan_to_num(linear.residual)
+        off = cov.learned(left)
+        whiten = cov.whitener(off)
+        if wide := cov.off_alone(whiten, left):
+            off = cov.learned(left, wide)
+            whiten = cov.whitener(off, wide)
+        sets = Sets.of(
+            composed.effects,
+            linear,
+            [whiten],
+            [n for n in names if n in linear.moved],
+            self.fold,
+            self.log_odds,
+        )
+        score = -np.inf
+        if not linear.diverged:
+            white = whiten(left)
+            fit = sets.fit(names, 0)
+            loose = np.diag(fit.covariance)[len(fit.x) - sum(sets.size) :] > 0
+            score = -0.5 * float(white @ white) - whiten.half_log_det - prior_cost(composed, point)
+            score += 0.5 * loose.sum() * np.log(2 * np.pi) + len(names) * self.log_odds
+            inside = np.diag(fit.covariance) > 0
+            score += 0.5 * float(np.linalg.slogdet(fit.covariance[np.ix_(inside, inside)])[1])
+            score += _prior_constants(sets.size)
+            score += len(wide) * ALONE - 1e3 * linear.dropped
+        return Settled(names, point, linear, cov, off, wide, whiten, sets, score)
+
+    def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener], dict[str, RobotEffect]]:
+        """All candidates about a point, by the discrepancy there and less of it.
+
+        Those that do not act yet are secants of their usual size: a joint that sticks follows no small
+        change.
+        """
+        composed, point, held = self.composed, at.point, at.names
+        linear = linearise(composed, point, [*self.along, *held], self.starts)
+        base, more = base_at(composed, point), {}
+        for name in names:
+            if name not in held:
+                say(f"what {name} would do")
+                size = np.full(len(composed.effects[name].parameters), USUAL)
+                one = vary(composed, base, linear.starts, name, step=size)
+                more |= {} if one is None else {name: one}
+        linear = linear.with_moved(more)
+        cov = covariances(composed, linear)
+        scales = [Discrepancy({n: s * k for n, s in at.discrepancy.scale.items()}) for k in LEVELS]
+        scales = scales if at.discrepancy else []
+        levels = [cov.whitener(d, at.wide) for d in (*scales, NONE)]
+        usable = [n for n in names if n in linear.moved]
+        sets = Sets.of(composed.effects, linear, levels, usable, self.fold, self.log_odds)
+        if not held:
+            self.identifiable = identifiability(*sets.product())
+            self.diverged = tuple(n for n in names if n not in linear.moved)
+        linear = self._where_they_act(base, linear, sets, held)
+        linear, both = self._together(base, linear, sets, held)
+        effects, every = {**composed.effects, **both}, [*usable, *both]
+        return Sets.of(effects, linear, levels, every, self.fold, self.log_odds), levels, effects
+
+    def _together(
+        self, base: Base, linear: Linear, sets: Sets, held: Names
+    ) -> tuple[Linear, dict[str, RobotEffect]]:
+        """Pairs of candidates that nearly cancel, as one each: in their difference what counts is how each
+        bends, which no straight line has. They are rolled out along it."""
+        more, both = {}, {}
+        for one, other, against in cancelling(sets)[:CANCEL]:
+            if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
+                continue
+            for sign in (1.0, -1.0):
+                point = dict(base.point)
+                for name, size in ((one, sign), (other, sign * against)):
+                    ((short, p),) = self.composed.effects[name].parameters.items()
+                    point[name] = {short: p.nominal + size * p.sd}
+                    if not p.low <= point[name][short] <= p.high:
+                        break
+                else:
+                    break
+            else:
+                continue
+            rows = base_at(self.composed, point).rows
+            if np.isfinite(rows[np.isfinite(base.rows)]).all():
+                name = f"{one}{JOINED}{other}"
+                more[name] = Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
+                both[name] = RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
+                self.against[name] = against
+        return linear.with_moved(more), both
+
+    def _where_they_act(self, base: Base, linear: Linear, sets: Sets, held: Names) -> Linear:
+        """The candidates that come near, rolled out where they fit best: what kinks or saturates is a
+        straight line from there only."""
+        first: dict[str, dict[str, float]] = {}
+        for level in dict.fromkeys((0, sets.gram.shape[0] - 1)):
+            others = [n for n in sets.names if n not in held]
+            score = sets.scores([(*held, n) for n in others], level)
+            for k in np.argsort(-score)[:LEADERS]:
+                name = others[k]
+                found = point_of(
+                    self.composed.effects, sets.fit((*held, name), level), (*held, name), self.along
+                )
+                first.setdefault(name, dict(found[name]))
+        more = {}
+        for name, at in first.items():
+            known = self.composed.effects[name].parameters
+            far = {n: FAR * p.sd for n, p in known.items()}
+            near = {n: float(np.clip(v, p.nominal - far[n], p.nominal + far[n]))
+                    for (n, p), v in zip(known.items(), at.values(), strict=True)}  # fmt: skip
+            if all(abs(near[n] - p.nominal) < 1e-3 * p.sd for n, p in known.items()):
+                near = {
+                    n: p.nominal + (p.sd if p.nominal + p.sd <= p.high else -p.sd) for n, p in known.items()
+                }
+            one = vary(self.composed, base, linear.starts, name, near)
+            if one is not None:
+                more[name] = one
+        return linear.with_moved(more)
+
+    def _better(self, at: Settled, best: Settled) -> Settled | None:
+        """A set that is better than the best where it is fitted, proposed about where another is."""
+        sets, levels, effects = self.place(at, self.wanted)
+        names = [n for n in sets.names if JOINED not in n]
+        near = neighbours(at.names, sets.names)
+        if len(names) <= MANY:
+            near += pairs(at.names, names)
+        score = np.stack([sets.scores(near, level) for level in range(len(levels))])
+        own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
+        level = [int(k) for k in score.argmax(0)]
+        promised = score.max(0) - own + at.score - best.score
+        found = []
+        for k in np.argsort(-promised):
+            if len(found) >= TRIED or promised[k] < (BETTER if at is best else -NEAR):
+                break
+            begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
+            one = self._apart(near[k], begin)
+            if frozenset(one) in self.known or (at is not best and {*best.names} < {*one}):
+                continue
+            found.append(self.settled(one, begin, [levels[i] for i in {level[k], len(levels) - 1}]))
+        good = [s for s in found if self._is_better(s, best)]
+        return max(good, key=lambda s: s.score, default=None)
+
+    @staticmethod
+    def _is_better(one: Settled, best: Settled) -> bool:
+        """Whether to go on from a set: likelier, and so by logs that took no part, unless it only does
+        without."""
+        if one.score <= best.score + BETTER:
+            return False
+        return {*one.names} < {*best.names} or chance(one.held_out - best.held_out) < BORNE_OUT
+
+    def _apart(self, names: Names, point: dict) -> Names:
+        """The set with pairs taken apart, and its point likewise, in place."""
+        out: list[str] = []
+        for name in names:
+            if name not in self.against:
+                out.append(name)
+                continue
+            size = point.pop(name)["size"]
+            for one, by in zip(name.split(JOINED), (size, size * self.against[name]), strict=True):
+                ((short, p),) = self.composed.effects[one].parameters.items()
+                point[one] = {short: float(np.clip(p.nominal + by * p.sd, p.low, p.high))}
+                out.append(one)
+        return tuple(dict.fromkeys(out))
+
+    def _exchanged(self, best: Settled) -> Settled | None:
+        """A better set with others in the place of one of the best's."""
+        for out in best.names:
+            rest = tuple(n for n in best.names if n != out)
+            less = self.known.get(frozenset(rest)) or self.settled(
+                rest, without(best.point, out), [best.whiten]
+            )
+            there = self._better(less, best)
+            if there is not None:
+                return there
+        return None
+
+
+def _prior_constants(sizes: Sequence[int]) -> float:
+    """Constants of the slabs' densities, a multivariate Cauchy's of so many parameters each."""
+    return float(sum(gammaln((1 + k) / 2) - gammaln(0.5) - 0.5 * k * np.log(np.pi) for k in sizes))
+
+
+def chance(gain: np.ndarray) -> float:
+    """Chance of gains (folds,) [nats] on held-out folds as good without any: one-sided t test.
+
+    Gains beyond a nat count by their logarithm: one log in which a cause shows a hundred times as much as in
+    the others must not make the others' agreement look like scatter.
+    """
+    if gain.size < 2:
+        return 0.0
+    gains = np.arcsinh(gain)
+    sd = max(float(gains.std(ddof=1)), 1e-9) / np.sqrt(gains.size)
+    return float(student.sf(gains.mean() / sd, gains.size - 1))

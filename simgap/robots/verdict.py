@@ -1,125 +1,195 @@
-"""The verdict on a robot's logs: what held-out rows bore out, judged by what it leaves where it acts."""
+"""The verdict on a robot's logs, read off the sets that were fitted exactly.
+
+There is a gap if some set, or a discrepancy alone, is likelier than the sensors' noise. Causes are known if
+they explain most of the whole gap, of all channels together, in logs that took no part, at values that robots
+can have.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from simgap.attribution.cells import Cell, significant
-from simgap.attribution.detection import Detection, detected, statistic
-from simgap.attribution.findings import Remainder
-from simgap.attribution.invariance import residual_left
-from simgap.attribution.posterior import Forms, Model, fitted
-from simgap.attribution.search import weights
-from simgap.attribution.shares import Shares
-from simgap.attribution.verdict import LEAST, MOST, Explanation, Verdict, acting, conclude, known
-from simgap.robots.explained import Explained
-from simgap.robots.scatter import scattering
-from simgap.robots.stand_ins import StandIn
+from simgap.attribution.attribute import Remainder
+from simgap.attribution.problem import BANDS, cosines
+from simgap.attribution.problem import Rows as GapRows
+from simgap.attribution.search import Detection
+from simgap.attribution.verdict import (
+    LEAST,
+    RULED_OUT,
+    Cell,
+    Explanation,
+    Shares,
+    Verdict,
+    acting,
+    conclude,
+    known,
+    significant,
+)  # fmt: skip
+from simgap.robot_effects.base import RobotEffect
+from simgap.robots.heldout import Shrinkage
+from simgap.robots.phases import Phases
+from simgap.robots.search import BORNE_OUT, Search, Settled, chance
+from simgap.robots.whiten import ALONE, Whitener
 
 OPEN = 0.1  # chosen: share of what is left without a small cause that may be left with it
+MATTERS = 1.1  # chosen: mean squares over the noise's; a smaller gap that nothing explains is told as none
+SEVERAL = 3.0  # chosen: times the noise; causes that leave more, and a part of the gap, are not known
+PART = 0.1  # chosen: that part
+HEAVY = {"kg": 3.0, "kg m^2": 10.0}  # chosen: factors on what a model states that no robot is off by
 
 
 @dataclass(frozen=True)
 class RobotVerdict(Verdict):
     """The verdict, and what it rests on: the gap's `detection`, what is left (`remainder`), `where` the gap
-    is; `left`: share of it that is left, by regime."""
+    is.
+
+    `shares` of the whole gap by effect of `shared`; `chance` of each candidate to act; `over_noise`: rms of
+    what is left in units of the noise; `stands_in`: cause to what logs do not tell from it; `doubts`: why an
+    explanation that leaves little is not believed; `explanation`: the best set, known or not.
+    """
 
     detection: Detection
     remainder: Remainder
     where: tuple[Cell, ...]
     shares: Shares
-    left: dict[str, float]
-    shared: tuple[str, ...]  # effects that the shares are of, in their order
-    model: Model  # of all that was borne out, too small to be told or not, discrepancies whitened
-    chance: dict[str, float]  # of each candidate to act
-    over_noise: float  # rms of what is left, in units of the noise's
-    stand_ins: tuple[StandIn, ...] = ()  # what held-out logs do not tell from a cause, each at its best
-
-
-def rivals(f: Forms, causes: Sequence[int]) -> list[Model]:
-    """The set of causes, those with one left out or exchanged, and none."""
-    every = range(len(f.gap.candidates))
-    fewer = [tuple(j for j in causes if j != out) for out in causes]
-    sets = {tuple(sorted(causes)), (), *fewer}
-    sets |= {tuple(sorted({*kept, j})) for kept in fewer for j in every}
-    return sorted((fitted(f, effects) for effects in sorted(sets)), key=lambda m: -m.score)
+    shared: tuple[str, ...]
+    chance: dict[str, float]
+    over_noise: float
+    stands_in: dict[str, tuple[str, ...]]
+    doubts: tuple[str, ...]
+    explanation: tuple[str, ...]
 
 
 def verdict_on(
-    f: Forms,
-    sensor: Forms,
-    causes: tuple[int, ...],
-    twins: Sequence[float],
-    rng: np.random.Generator,
-    explains: Explained,
-    every: Forms,
-    fold: np.ndarray,
-    forced: bool = False,
-    large_alone: tuple[int, ...] = (),
+    search: Search, best: Settled, far: Shrinkage | None, phases: Phases, seed: int, forced: bool
 ) -> RobotVerdict:
-    """The verdict. `f`: the gap with discrepancies in its whitening, `sensor` with the sensors' noise alone;
-    `causes` were borne out by held-out rows, and explain what `explains` says, in that order; `every` is the
-    gap of all windows, asked or not, and has these causes among its candidates; `twins` are healthy twins'
-    statistics; `fold` (n,) of each row; those of `large_alone` are no causes where they are small.
-
-    A cause is known where it acts: in some regime (flight, rest, motion in contact) little is left of the
-    channels that it moves, and the gap of these is the one that it explains. What is left in others is the
-    remainder, which is told."""
-    names = [c.name for c in f.gap.candidates]
-    models = rivals(f, causes)
-    least = open_where(explains, np.array([j not in large_alone for j in causes], bool))
-    kept = causes if forced else tuple(j for j, s in zip(causes, least, strict=True) if s <= MOST)
-    left = max((float(s) for j, s in zip(causes, least, strict=True) if j in kept), default=1.0)
-    detection = detected(statistic(sensor, [fitted(sensor, causes), fitted(sensor, ())]), twins or None)
-    sets = [
-        _explanation(names, m, float(w), causes, kept, known(left, explains.gone))
-        for m, w in zip(models, weights(models), strict=True)
-    ]
-    mine = tuple(sorted(names[j] for j in kept))
-    verdict = conclude(sets, detection.p_value, forced=mine if forced else (), chosen=mine)
-    rows, band, sd = every.gap.rows, every.spectrum.band, np.ones(every.gap.rows.channel.size)
-    named = tuple(j for j, c in enumerate(every.gap.candidates) if c.name in verdict.causes)
-    gap = verdict.verdict != "none"
-    parts = explains.shares(rng)
-    return RobotVerdict(
-        **vars(verdict),
-        detection=detection,
-        remainder=Remainder(
-            parts.remainder if named else float(gap),
-            detected(statistic(every, [fitted(every, named)], named)).p_value,
-            significant(rows, band, residual_left(every, fitted(every, named)), sd) if gap else (),
-        ),
-        where=significant(rows, band, residual_left(every, fitted(every, ())), sd) if gap else (),
-        shares=replace(parts, each=parts.each[:, [causes.index(j) for j in kept]]),
-        left=dict(zip(explains.regimes, explains.left.tolist(), strict=True)) if named else {},
-        shared=tuple(names[j] for j in kept),
-        model=scattering(f, fitted(f, causes), fold),
-        chance=dict.fromkeys(names, 0.0) | acting(sets, detection.p_value),
-        over_noise=explains.over_noise,
+    """The verdict, from the best set and all others that a search has fitted."""
+    nothing = search.known[frozenset()]
+    fine = np.isfinite(best.linear.residual) & ~np.isin(best.linear.rows.window, list(best.wide))
+    floor = best.covariances.floor() * fine.sum() / max(np.isfinite(best.linear.residual).sum(), 1)
+    before, after = float(nothing.squares[fine].sum()), float(best.squares[fine].sum())
+    over_noise = float(np.sqrt(after / max(floor, 1e-9)))
+    without = {out: search.known.get(frozenset({*best.names} - {out})) for out in best.names}
+    lost = np.array([max(float(s.squares[fine].sum()) - after, 0.0) if s else 0.0 for s in without.values()])
+    shares = Shares.of(before, min(after, before), floor, lost, np.random.default_rng(seed))
+    gap = _gap(best, nothing)
+    large = lost >= LEAST * max(lost.sum(), 1e-12)
+    open_left = max(after - floor, 0.0) + np.sqrt(2 * floor)
+    large |= open_left / (open_left + np.maximum(lost, 1e-12)) <= OPEN
+    causes = best.names if forced else tuple(n for n, big in zip(best.names, large, strict=True) if big)
+    left = shares.remainder if far is None else max(1.0 - far.fraction, 0.0)
+    doubts = _absurd(search.composed.effects, best, causes)
+    if over_noise > SEVERAL and left > PART:
+        doubts = (*doubts, f"{over_noise:.3g} times the noise is left")
+    right = 0.0 if doubts else known(left, 1.0 - left)
+    others = _alternatives(search, best)
+    # What is too small to be told, and what takes its place, is no cause and stands in for none.
+    small = {*best.names} - {*causes}
+    small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
+    sets = _explanations(others, best, small - {*causes}, right)
+    matters = bool(causes) or before > MATTERS * floor
+    verdict = conclude(
+        sets, gap.p_value, matters, tuple(sorted(causes)) if forced else (), tuple(sorted(causes))
     )
+    named, stands_in = verdict.causes, dict[str, tuple[str, ...]]()
+    for cause in named:
+        rivals = [
+            {*s.causes} for s in sets if s.causes and cause not in s.causes and len(s.causes) <= len(causes)
+        ]
+        stands_in[cause] = tuple(sorted(set().union(*rivals) - {*causes}))
+    rest = Remainder(shares.remainder if named else float(verdict.verdict != "none"), _alone(best), ())
+    told = verdict.verdict != "none"
+    where = _where(search, nothing, phases) if told else ()
+    rest = Remainder(rest.share, rest.p_value, _where(search, best, phases) if told and best.names else where)
+    return RobotVerdict(
+        **vars(verdict), detection=gap, remainder=rest, where=where, shares=shares, shared=best.names,
+        chance=dict.fromkeys(search.wanted, 0.0) | acting(sets, gap.p_value), over_noise=over_noise,
+        stands_in=stands_in, doubts=doubts, explanation=best.names,
+    )  # fmt: skip
 
 
-def open_where(explains: Explained, small_too: np.ndarray) -> np.ndarray:
-    """Share (J,) of its gap that is left where each cause acts, 1 where it is too small to be told;
-    `small_too` (J,): which may be told though they are small.
-
-    Where most of a gap is left, what a cause takes of it may stand in for anything: no cause rests on it. A
-    small one may stand in for an error in the form of a large one, unless it takes nearly all that there is
-    besides: what stands in leaves much."""
-    large = (explains.part >= LEAST) | (small_too[:, None] & (explains.open_without <= OPEN))
-    return np.where(large, explains.where_it_acts, 1.0).min(1) if small_too.size else np.zeros(0)
+def _gap(best: Settled, nothing: Settled) -> Detection:
+    """A set, or a discrepancy alone, against the sensors' noise: by Markov's inequality noise makes such odds
+    with a probability of their inverse at most."""
+    value = max(best.score, nothing.score) - _by_noise(nothing)
+    return Detection(value, float(np.exp(-max(value, 0.0))), 0.0)
 
 
-def _explanation(
-    names: Sequence[str], model: Model, weight: float, borne: tuple[int, ...], kept: tuple[int, ...],
-    chance: float,
-) -> Explanation:  # fmt: skip
-    """A set as the verdict sees it: `chance` to be the cause, `kept` of those `borne` out are told."""
-    # What takes the place of an effect that is too small to be told is none of the causes either.
-    holds = bool(kept) and {*kept} <= {*model.effects}
-    causes = kept if holds else {*model.effects} - ({*borne} - {*kept})
-    named = tuple(sorted(names[j] for j in causes))
-    return Explanation(tuple(names[j] for j in model.effects), weight, named, chance if kept else 0.0)
+def _by_noise(one: Settled) -> float:
+    """Log evidence by the sensors' noise alone."""
+    if not one.discrepancy:
+        return one.score
+    left = np.nan_to_num(one.linear.residual)
+    wide = one.covariances.off_alone(one.covariances.whitener(), left)
+    plain = one.covariances.whitener(None, wide)
+    value = [-0.5 * float(np.sum(w(left) ** 2)) - w.half_log_det for w in (plain, one.whiten)]
+    return one.score + value[0] - value[1] + ALONE * (len(wide) - len(one.wide))
+
+
+def _alone(one: Settled) -> float:
+    """The chance of what is left to be noise."""
+    if not one.discrepancy:
+        return 1.0
+    return float(np.exp(-max(one.score - _by_noise(one), 0.0)))
+
+
+def _alternatives(search: Search, best: Settled) -> list[Settled]:
+    """Sets that are not told from the best: not ruled out by their evidence, nor, where the model is off by
+    itself so that evidence of all rows is no judge of small differences, by logs that took no part."""
+    out, most = [], best.squares.sum() + PART * search.known[frozenset()].squares.sum()
+    for one in search.known.values():
+        if one is best or {*best.names} < {*one.names}:
+            continue
+        alike = one.score > best.score - np.log(RULED_OUT)
+        if best.discrepancy and one.names and one.squares.sum() < most:
+            alike = alike or chance(best.held_out - one.held_out) >= BORNE_OUT
+        if alike:
+            out.append(one)
+    return out
+
+
+def _explanations(
+    others: Sequence[Settled], best: Settled, small: set[str], right: float
+) -> list[Explanation]:
+    """The sets that are left, by weight, without what is small."""
+    score = np.array([best.score, *(max(s.score, best.score - np.log(RULED_OUT)) for s in others)])
+    weight = np.exp(score - np.logaddexp.reduce(score))
+    each = [tuple(sorted({*s.names} - small)) for s in (best, *others)]
+    return [
+        Explanation(mine, float(w), mine, right if mine else 0.0)
+        for mine, w in zip(each, weight, strict=True)
+    ]
+
+
+def _absurd(effects: Mapping[str, RobotEffect], best: Settled, causes: Sequence[str]) -> tuple[str, ...]:
+    """Values that no robot has: at a bound, or of what a model states many times more or less."""
+    out = []
+    for name in causes:
+        for short, value in best.point[name].items():
+            p = effects[name].parameters[short]
+            at_bound = any(
+                np.isfinite(b) and b != p.nominal and abs(value - b) < 1e-3 * p.sd for b in (p.low, p.high)
+            )
+            most = HEAVY.get(p.unit, np.inf)
+            far = p.nominal > 0 and not 1 / most <= max(value, 1e-300) / p.nominal <= most
+            if at_bound or far:
+                out.append(
+                    f"{name} {short} {value:.3g} {p.unit}".replace(" 1", "") + " is no value of a robot's"
+                )
+    return tuple(out)
+
+
+def _where(search: Search, one: Settled, phases: Phases) -> tuple[Cell, ...]:
+    """Cells in which what a set leaves stands out of the noise."""
+    composed, rows = search.composed, one.linear.rows
+    whiten: Whitener = one.covariances.whitener()
+    white = whiten(np.nan_to_num(one.linear.residual))
+    names = tuple(r.name for r in composed.recordings)
+    mine = GapRows(
+        rows.log, rows.channel, phases.of(rows), rows.time, names, rows.channels, phases.names, BANDS
+    )
+    left, (band,) = cosines(mine, white[:, None])
+    return significant(mine, band, left[:, 0], np.ones(white.size))

@@ -22,38 +22,115 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
+from scipy.fft import dct
+from scipy.linalg import lapack
+from scipy.optimize import minimize
 
-from simgap.robots.blocks import NONE, Block, Discrepancy, Source
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed
-from simgap.robots.tied import Tied
-from simgap.robots.triangular import factored, solved_by
-from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
+from simgap.robots.windows import DOUBT, FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
+
+dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
+dtrtrs: Any = lapack.dtrtrs  # type: ignore[attr-defined]
+dtrtri: Any = lapack.dtrtri  # type: ignore[attr-defined]
 
 TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
 ENOUGH = 40  # numerics: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
+SMOOTH = 12  # numerics: cosines of a channel in a block, of which what is smooth consists
+ALONE = -4.0  # prior: log odds of a window to be off for reasons of its own
+WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
+# numerics: log variances are found to a hundredth of a nat
+CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """`scale`: s by channel [unit / s^2, unit / s or unit]."""
+
+    scale: Mapping[str, float]
+
+    def __bool__(self) -> bool:
+        return bool(self.scale)
+
+
+NONE = Discrepancy({})
+
+
+@dataclass(frozen=True)
+class Source:
+    """A discrepancy's covariance (k, k) at s = 1, or its variances (k,) where it ties no rows, and which rows
+    of the block it is of (k,)."""
+
+    rows: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def trace(self) -> float:
+        """The sum of its variances."""
+        own = self.covariance
+        return float(own.sum() if own.ndim == 1 else np.trace(own))
+
+    def add(self, total: np.ndarray, variance: float) -> None:
+        """Add it to a block's covariance, in place."""
+        total[self._where] += variance * self.covariance
+
+    @property
+    def _where(self) -> tuple:
+        if self.covariance.ndim == 1:
+            return self.rows, self.rows
+        first, end = int(self.rows[0]), int(self.rows[-1]) + 1
+        if end - first == self.rows.size:  # rows ascend: a part of the matrix, which needs no copy
+            return slice(first, end), slice(first, end)
+        return self.rows[:, None], self.rows
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows (n,) of one window that belong together.
+
+    The noise's `variance` (n,); `start` (n, S): by how much each state of the uncertain start moves them at
+    one standard deviation; sources of discrepancy by name; the rows' `channel` (n,); `repeats`: in how many
+    logs the same motion is made.
+    """
+
+    rows: np.ndarray
+    window: int
+    variance: np.ndarray
+    start: np.ndarray
+    sources: Mapping[str, Source]
+    channel: np.ndarray
+    repeats: int = 1
+
+    def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
+        """The rows' covariance (n, n)."""
+        out = np.diag(self.variance) + self.start @ self.start.T
+        for name, s in discrepancy.scale.items():
+            if name in self.sources:
+                self.sources[name].add(out, s**2)
+        return out
 
 
 @dataclass(frozen=True)
 class Whitener:
-    """Lower Cholesky factors of blocks of rows; by block half the log determinant of their covariance, and
-    the mean square of a row, whitened: less than 1 where repeats tell one thing together."""
+    """Inverse lower Cholesky factors of blocks of rows; by block half the log determinant of their
+    covariance, and the mean square of a row, whitened: less than 1 where repeats tell one thing together."""
 
     blocks: tuple[np.ndarray, ...]
-    factors: tuple[np.ndarray, ...]
+    inverses: tuple[np.ndarray, ...]
     half_logs: tuple[float, ...]
     told: tuple[float, ...]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Rows (N,) or columns (N, k), whitened; rows of diverged windows become 0."""
         out = np.zeros_like(values, float)
-        for block, factor in zip(self.blocks, self.factors, strict=True):
-            out[block] = solved_by(factor, values[block])
+        for block, inverse in zip(self.blocks, self.inverses, strict=True):
+            out[block] = inverse @ values[block]
         return out
 
     @property
@@ -85,22 +162,76 @@ class Covariances:
         return tuple(dict.fromkeys(n for b in self.blocks for n in b.sources))
 
     @cached_property
-    def tied(self) -> Tied:
-        """What discrepancies are learned from: blocks, evenly chosen, of as many rows as about ENOUGH large
-        ones have."""
+    def _smooth(self) -> _Smooth:
         rows = sum(b.rows.size for b in self.blocks) / max(len(self.blocks), 1)
         every = max(1, int(len(self.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
-        return Tied.of(self.blocks[::every], self.names)
+        return _Smooth.of(self.blocks[::every], self.names)
 
-    def whitener(self, discrepancy: Discrepancy = NONE) -> Whitener:
-        """The whitener of all rows."""
-        made = [_whitened(block, discrepancy) for block in self.blocks]
+    def floor(self) -> float:
+        """The expected squares of whitened rows if there is noise alone, of which starts are read too."""
+        total = 0.0
+        for block in self.blocks:
+            factor = _factored(block.covariance())
+            sure = np.column_stack([np.diag(np.sqrt(block.variance)), block.start / DOUBT])
+            total += float(np.sum(solved_by(factor, sure) ** 2))
+        return total
+
+    def learned(self, residual: np.ndarray, wide: Mapping[int, float] | None = None) -> Discrepancy:
+        """The discrepancy of a residual (N,) by maximum likelihood; sources for which it gains less than
+        WORTH have none. `wide`: windows whose variance is larger, by which factor."""
+        smooth, names = self._smooth, self.names
+        left = smooth.projected(residual, wide or {})
+        kept = list(range(len(names)))
+        x = smooth.first_guess(left)
+        plain = smooth.cost(np.zeros(0), left, [])[0]
+        while kept:
+            bounds = [(v - 20.0, v + 12.0) for v in x]
+            done = minimize(
+                smooth.cost, x, (left, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE
+            )
+            without = [
+                smooth.cost(np.delete(done.x, i), left, kept[:i] + kept[i + 1 :])[0] - done.fun
+                for i in range(len(kept))
+            ]
+            least = int(np.argmin(without))
+            if plain - done.fun >= WORTH and without[least] >= WORTH:
+                return Discrepancy(
+                    {names[k]: float(np.exp(v / 2)) for k, v in zip(kept, done.x, strict=True)}
+                )
+            kept, x = kept[:least] + kept[least + 1 :], np.delete(done.x, least)
+        return NONE
+
+    def whitener(
+        self, discrepancy: Discrepancy | None = None, wide: Mapping[int, float] | None = None
+    ) -> Whitener:
+        """The whitener of all rows; `wide`: by window the factor of a variance that is larger there."""
+        made = [_whitened(block, discrepancy or NONE) for block in self.blocks]
+        factor = [1.0 if wide is None else wide.get(block.window, 1.0) for block in self.blocks]
         return Whitener(
             tuple(block.rows for block in self.blocks),
-            tuple(factor for factor, _, _ in made),
-            tuple(half for _, half, _ in made),
+            tuple(dtrtri(one, lower=1)[0] / f**0.5 for (one, _, _), f in zip(made, factor, strict=True)),
+            tuple(
+                h + 0.5 * b.rows.size * np.log(f)
+                for (_, h, _), b, f in zip(made, self.blocks, factor, strict=True)
+            ),
             tuple(told for _, _, told in made),
         )
+
+    def off_alone(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
+        """Windows in which a residual (N,) is larger than noise and discrepancy make it, each by which factor
+        of its variance: a start misread where a joint came to rest moves all that follows, and no model is to
+        explain it. Beforehand one in a few dozen is."""
+        square, count = dict[int, float](), dict[int, int]()
+        white = whiten(residual) ** 2
+        for block in self.blocks:
+            square[block.window] = square.get(block.window, 0.0) + float(white[block.rows].sum())
+            count[block.window] = count.get(block.window, 0) + block.rows.size
+        found = {}
+        for window, n in count.items():
+            factor = square[window] / n
+            if factor > 1 and 0.5 * (square[window] - n - n * np.log(factor)) > -ALONE:
+                found[window] = factor
+        return found
 
 
 def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float, float]:
@@ -112,15 +243,108 @@ def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float
     """
     again = block.repeats if discrepancy else 1
     shared = Discrepancy({n: s * again**0.5 for n, s in discrepancy.scale.items()})
-    factor = factored(block.covariance(shared))
+    factor = _factored(block.covariance(shared))
     half = float(np.log(np.diag(factor)).sum())
     if again == 1:
         return factor, half, 1.0
     plain = block.covariance()
-    apart = factored(plain)
+    apart = _factored(plain)
     own = float(np.sum(solved_by(factor, apart) ** 2)) / len(plain)
     share = 1 / again
     return factor, share * half + (1 - share) * float(np.log(np.diag(apart)).sum()), share + (1 - share) * own
+
+
+@dataclass(frozen=True)
+class _Smooth:
+    """Blocks in their channels' first cosines, in which a discrepancy is, padded to one size: covariances
+    without one (B, m, m) and of each source at s = 1 (K, B, m, m); `basis` by block (n, m)."""
+
+    rows: tuple[np.ndarray, ...]
+    windows: tuple[int, ...]
+    basis: tuple[np.ndarray, ...]
+    plain: np.ndarray
+    source: np.ndarray
+
+    @classmethod
+    def of(cls, blocks: tuple[Block, ...], names: tuple[str, ...]) -> _Smooth:
+        """Of these blocks and sources."""
+        basis = tuple(_cosines(block) for block in blocks)
+        size = max((b.shape[1] for b in basis), default=0)
+        plain = np.tile(np.eye(size), (len(blocks), 1, 1))
+        source = np.zeros((len(names), len(blocks), size, size))
+        for i, (block, b) in enumerate(zip(blocks, basis, strict=True)):
+            m = b.shape[1]
+            plain[i, :m, :m] = b.T @ block.covariance() @ b
+            for k, name in enumerate(names):
+                if name in block.sources:
+                    one = np.zeros((block.rows.size, block.rows.size))
+                    block.sources[name].add(one, 1.0)
+                    source[k, i, :m, :m] = b.T @ one @ b
+        return cls(tuple(b.rows for b in blocks), tuple(b.window for b in blocks), basis, plain, source)
+
+    def projected(self, residual: np.ndarray, wide: Mapping[int, float]) -> np.ndarray:
+        """A residual (N,) in the blocks' cosines (B, m), in units as if no window were `wide`."""
+        out = np.zeros(self.plain.shape[:2])
+        for i, (rows, b) in enumerate(zip(self.rows, self.basis, strict=True)):
+            out[i, : b.shape[1]] = b.T @ residual[rows] / wide.get(self.windows[i], 1.0) ** 0.5
+        return out
+
+    def first_guess(self, left: np.ndarray) -> np.ndarray:
+        """Log variances (K,): each such that all of them together make up the squares."""
+        trace = np.einsum("kbii->kb", self.source)
+        squares = np.sum(left**2, 1)
+        out = []
+        for mine in trace:
+            there = mine > 0
+            share = np.median(squares[there] / mine[there]) if there.any() else 1e-26
+            out.append(np.log(max(float(share), 1e-30) / max(len(trace), 1)))
+        return np.array(out)
+
+    def cost(self, x: np.ndarray, left: np.ndarray, kept: list[int]) -> tuple[float, np.ndarray]:
+        """Minus the log likelihood at log variances (k,) of the sources that are kept, and its gradient."""
+        variance = np.exp(x)
+        whole = self.plain + np.tensordot(variance, self.source[kept], 1) if kept else self.plain
+        inverse = np.linalg.inv(whole)
+        pull = np.einsum("bij,bj->bi", inverse, left)
+        value = 0.5 * float(np.linalg.slogdet(whole)[1].sum() + np.sum(pull * left))
+        slope = (
+            [
+                0.5 * float(np.sum(inverse * s) - np.einsum("bi,bij,bj->", pull, s, pull))
+                for s in self.source[kept]
+            ]
+            if kept
+            else []
+        )
+        return value, variance * np.array(slope)
+
+
+def _cosines(block: Block) -> np.ndarray:
+    """The first cosines of each channel of a block (n, m)."""
+    out = []
+    for c in np.unique(block.channel):
+        mine = np.flatnonzero(block.channel == c)
+        whole = np.zeros((block.channel.size, min(mine.size, SMOOTH)))
+        whole[mine] = dct(np.eye(mine.size), axis=0, norm="ortho").T[:, :SMOOTH]
+        out.append(whole)
+    return np.concatenate(out, 1)
+
+
+def _factored(matrix: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor, by LAPACK itself: of many small matrices most time would go into checks."""
+    factor, fault = dpotrf(matrix, lower=1, clean=1)
+    if fault:
+        raise np.linalg.LinAlgError("not positive definite")
+    return factor
+
+
+def solved_by(factor: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """L^-1 columns (n, k) of a lower factor L (n, n)."""
+    if not columns.size:
+        return np.zeros(columns.shape)
+    out, fault = dtrtrs(factor, columns, lower=1)
+    if fault:
+        raise np.linalg.LinAlgError("singular")
+    return out
 
 
 def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = None) -> Covariances:
@@ -137,7 +361,9 @@ def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = 
             start = np.array(moved).reshape(-1, rows.size).T
             variance = linear.rows.variance[rows] * scale**2
             sources = _sources(linear, rows, kinds, free)
-            blocks.append(Block(rows, number, variance, start, sources, repeats[number]))
+            blocks.append(
+                Block(rows, number, variance, start, sources, linear.rows.channel[rows], repeats[number])
+            )
     return Covariances(tuple(blocks))
 
 
@@ -169,16 +395,15 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
         if regime == RESTS and name in linear.starts:
             out[f"{name}, {LIES}"] = Source(np.flatnonzero(mine), np.ones((t.size, t.size)))
             continue
+        key = name if regime == FLIES else f"{name}, {regime}"
         if rate is not None and regime == STRIKES:
             response = _propagated(t, since, channel, rate[block])
             moved = every if response.any() else every[:0]
-            response = response[moved]
+            forces = np.exp(-np.abs(t[:, None] - t) / TAU)
+            out[key] = Source(moved, response[moved] @ forces @ response[moved].T)
         else:
-            moved, response = np.flatnonzero(mine), np.eye(t.size)
-            for _ in range(INTEGRALS[kinds[name]] if free else 0):
-                response = _integral(t) @ response
-        key = name if regime == FLIES else f"{name}, {regime}"
-        out[key] = Source(moved, response @ np.exp(-np.abs(t[:, None] - t) / TAU) @ response.T)
+            times = INTEGRALS[kinds[name]] if free else 0
+            out[key] = Source(np.flatnonzero(mine), _integrated(t.tobytes(), times))
     if linear.wobble is not None and regime == STRIKES:
         out[CONTACTS] = Source(every, linear.wobble[block] @ linear.wobble[block].T)
     out[CLOCK] = Source(every, linear.rates[block] ** 2)
@@ -194,6 +419,16 @@ def _propagated(t: np.ndarray, since: np.ndarray, channel: np.ndarray, kick: np.
         mine = channel == c
         late = since[mine][:, None] - t
         out[mine] = np.where(late > 0, np.interp(late, since[mine], kick[mine]), 0.0) * step
+    return out
+
+
+@lru_cache(maxsize=512)
+def _integrated(since: bytes, times: int) -> np.ndarray:
+    """Covariance (n, n) of unmodelled accelerations, integrated so many times; windows are mostly alike."""
+    t = np.frombuffer(since)
+    out = np.exp(-np.abs(t[:, None] - t) / TAU)
+    for _ in range(times):
+        out = _integral(t) @ out @ _integral(t).T
     return out
 
 

@@ -1,6 +1,6 @@
 """An operator who performs any block task: motions, grip, dwell, wander and tremor of a person.
 
-Plans in commanded fingertip positions; the compliant hand (`simgap.world.performance`) turns what is
+Plans in commanded fingertip positions; the compliant hand (`simgap.world.dynamics`) turns what is
 commanded beyond a contact into grip and pressing. Motions are minimum-jerk (Flash & Hogan,
 J. Neurosci. 5, 1985), superposed where one begins before another ends (Flash & Henis, J. Cogn.
 Neurosci. 3, 1991); physiological tremor lies at 6-12 Hz.
@@ -18,10 +18,9 @@ from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
 from hmmseg.io.schema import read_toml
 from hmmseg.io.task import BlockTask, Move
-from simgap.world.layout import Table, lay_out
-from simgap.world.performance import CONTROL_PERIOD
-from simgap.world.properties import Blocks
-from simgap.world.scene import finite_stiffness
+from simgap.world.dynamics import CONTROL_PERIOD
+from simgap.world.properties import Blocks, Tabletop, lay_out
+from simgap.world.virtual_model import finite_stiffness
 
 Range = tuple[float, float]
 TREMOR_BAND = (6.0, 12.0)  # cited: Hz
@@ -159,7 +158,7 @@ class _Coordinate:
 class _Performer:
     """One performance being planned: the commanded coordinates, the table and the clock [s]."""
 
-    def __init__(self, rig: Rig, blocks: Blocks, table: Table, settings: OperatorSettings,
+    def __init__(self, rig: Rig, blocks: Blocks, table: Tabletop, settings: OperatorSettings,
                  rng: np.random.Generator) -> None:  # fmt: skip
         self.blocks, self.table, self.settings, self.rng = blocks, table, settings, rng
         self.pace = self.draw("pace")

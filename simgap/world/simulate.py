@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,23 +12,83 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tomlkit
 from jax import Array
 
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
+from hmmseg.hand.kinematics import inverse, joint_velocity, require_reach
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import Trial
+from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.spans import Segmentation, known, spans_table
 from hmmseg.tables import Tabled
-from simgap.world.dynamics import Physics, State, resting_state
+from simgap.world.dynamics import (
+    BUCKET,
+    CONTROL_PERIOD,
+    Impedance,
+    Physics,
+    Record,
+    State,
+    perform,
+    resting_state,
+)
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
-from simgap.world.performance import BUCKET, CONTROL_PERIOD, Impedance, Record, perform
-from simgap.world.properties import Blocks, blocks_table
-from simgap.world.scene import Surroundings, physics, substeps_for
-from simgap.world.sensors import DEFAULT_RATE, record
+from simgap.world.properties import UNITS, Blocks, blocks_table
+from simgap.world.virtual_model import Surroundings, physics, substeps_for
+
+# What the hand's sensors record of a true motion: samples at a rate, with the rig's noise.
+
+DEFAULT_RATE = 20.0  # cited: Hz, the paper's
+# chosen: standard deviations of one sample where a rig leaves them to be learned
+# prior: rad, m, rad/s, N
+DEFAULT_NOISE = {"angle": 2e-4, "position": 3e-5, "velocity": 0.03, "force": 0.012}
+DEFAULT_CARTESIAN_VELOCITY = 0.004  # prior: m/s
+
+
+def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig,
+           rng: np.random.Generator | None, file: str) -> Trial:  # fmt: skip
+    """Trial sampled at times t (num_timesteps,) from tips (num_timesteps, 2 fingers, 2 axes).
+
+    Positions [m], velocities [m/s], forces [N] on the environment. Noise of the rig from `rng`,
+    none where that is None. InputError where a tip is out of the hand's reach.
+    """
+    channels: dict[str, np.ndarray] = {}
+    for i in (1, 2):
+        place, speed = position[:, i - 1], velocity[:, i - 1]
+        if rig.jointed:
+            finger = rig.finger(i)
+            require_reach(finger, i, place)
+            angles = inverse(finger, i, place)
+            rates = joint_velocity(finger, angles, speed)
+            for k in (0, 1):
+                channels[f"q{i}{k + 1}"] = _noisy(angles[:, k], rig, "angle", rng)
+                channels[f"dq{i}{k + 1}"] = _noisy(rates[:, k], rig, "velocity", rng)
+        else:
+            for k, axis in enumerate("xy"):
+                channels[f"{axis}{i}"] = _noisy(place[:, k], rig, "position", rng)
+                channels[f"v{axis}{i}"] = _noisy(speed[:, k], rig, "velocity", rng)
+        for k, axis in enumerate("xy"):
+            channels[f"f{axis}{i}"] = _noisy(force[:, i - 1, k], rig, "force", rng)
+    order = JOINT_CHANNELS if rig.jointed else CARTESIAN_CHANNELS
+    return Trial(file, t, {name: channels[name] for name in order})
+
+
+def noise_sd(rig: Rig, quantity: str) -> float:
+    """Standard deviation of one sample of `angle`, `position`, `velocity` or `force`."""
+    value = getattr(rig.noise, quantity)
+    if value is not None:
+        return value
+    if quantity == "velocity" and not rig.jointed:
+        return DEFAULT_CARTESIAN_VELOCITY
+    return DEFAULT_NOISE[quantity]
+
+
+def _noisy(values: np.ndarray, rig: Rig, quantity: str, rng: np.random.Generator | None) -> np.ndarray:
+    return values if rng is None else values + noise_sd(rig, quantity) * rng.standard_normal(values.shape)
+
 
 BATCH = 16  # numerics: trials integrated side by side
 MOVING = 2e-3  # physics: a definition: m/s; a slide begins and ends where the block's speed passes this
@@ -190,3 +251,42 @@ def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> li
 def _first(t: np.ndarray, there: np.ndarray) -> float:
     """Time of the first true entry; NaN where there is none."""
     return float(t[np.argmax(there)]) if there.any() else np.nan
+
+
+# Synthetic trials as texts of files: rig, task, actual properties, trials and their truth.
+
+DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals by a channel's first letter
+
+
+def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
+    """Texts of rig.toml, task.toml and actual.toml by file name."""
+    actual = {
+        name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
+        for name in task.objects
+    }
+    return {"rig.toml": tomlkit.dumps(rig.model_dump(exclude_none=True, exclude_defaults=True)),
+            "task.toml": tomlkit.dumps(task_table(task)), "actual.toml": tomlkit.dumps(actual)}  # fmt: skip
+
+
+def trial_files(number: int, trial: Trial, boundaries: np.ndarray, seed: int) -> dict[str, str]:
+    """Texts of one trial and its truth (boundaries [s], null where one never happened) by file name."""
+    times = [round(float(b), 6) if np.isfinite(b) else None for b in boundaries]
+    truth = json.dumps({"boundaries": times, "seed": int(seed)})
+    return {f"trial_{number:02d}.csv": trial_csv(trial), f"truth/trial_{number:02d}.json": truth + "\n"}
+
+
+def trial_csv(trial: Trial) -> str:
+    """A trial as CSV text: t and the hand's channels, rounded below the sensors' noise; empty if missing."""
+    rows = [f"{t:.6f}" for t in trial.t]
+    for name, values in trial.channels.items():
+        digits = DIGITS[name[0]]
+        cells = (f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values)
+        rows = [f"{row},{cell}" for row, cell in zip(rows, cells, strict=True)]
+    return "\n".join([",".join(["t", *trial.channels]), *rows]) + "\n"
+
+
+def task_table(task: BlockTask) -> dict[str, Any]:
+    """The table of `task.toml` that describes a task."""
+    moves = [{"object": m.object, "to": m.to} | ({"slide": True} if m.slide else {}) for m in task.moves]
+    table: dict[str, Any] = {} if task.repeat == 1 else {"repeat": task.repeat}
+    return table | {"objects": {name: {"on": on} for name, on in task.initial.items()}, "moves": moves}

@@ -6,7 +6,9 @@ steps of a haptic loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -26,15 +28,77 @@ from simgap.world.dynamics import (
     Scalar,
     State,
     Tips,
+    Values,
     energy,
     interact,
     resting_state,
     substep,
 )
-from simgap.world.layout import standing_heights
-from simgap.world.performance import Values
-from simgap.world.properties import Block, Blocks
-from simgap.world.scene import Surroundings, physics, substeps_for
+from simgap.world.properties import Block, Blocks, standing_heights
+
+# The calibrated scene: constants of the dynamics from a rig and blocks, and its fastest mode.
+
+RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pad by 0.03 mm
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a rig does not state: supports and the foam's damping.
+
+    Supports are stiff springs [N/m] with damping (ratio to critical, one block) and friction;
+    the foam's damping is its time constant [s], damping over stiffness; the ground's `tilt` [rad].
+    """
+
+    support_stiffness: float = 4e5
+    support_damping: float = 0.5
+    support_friction: float = 0.5
+    pad_time: float = 2e-3
+    tilt: float = 0.0
+
+
+def physics(rig: Rig, blocks: Sequence[Block], surroundings: Surroundings | None = None) -> Physics:
+    """Constants of the dynamics for blocks in order; a rigid pad becomes one of RIGID_PAD."""
+    around = surroundings or Surroundings()
+
+    def scalars(values: Sequence[float]) -> tuple[Array, ...]:
+        return tuple(jnp.asarray(v, float) for v in values)
+
+    pad = rig.fingertip
+    return Physics(
+        weight=scalars([b.weight for b in blocks]),
+        width=scalars([b.width for b in blocks]),
+        height=scalars([b.height for b in blocks]),
+        friction=scalars([b.friction for b in blocks]),
+        pad_normal=scalars([finite_stiffness(pad.normal_stiffness)] * 2),
+        pad_shear=scalars([finite_stiffness(pad.shear_stiffness)] * 2),
+        pad_time=jnp.asarray(around.pad_time, float),
+        support_stiffness=jnp.asarray(around.support_stiffness, float),
+        support_damping=jnp.asarray(around.support_damping, float),
+        support_friction=jnp.asarray(around.support_friction, float),
+        gravity=jnp.asarray(rig.gravity, float),
+        tilt=jnp.asarray(around.tilt, float),
+    )
+
+
+def finite_stiffness(stiffness: float) -> float:
+    """A pad's stiffness [N/m], with the substitute for a rigid one."""
+    return stiffness if math.isfinite(stiffness) else RIGID_PAD
+
+
+def substeps_for(constants: Physics, period: float) -> int:
+    """Substeps in a period [s] that keep the integration well inside its stability limit.
+
+    By Gershgorin no block oscillates faster than sqrt((4 supports + both pads) / mass), as in the
+    middle of a stack. The step is held to 1.1 over that frequency (the limit is 2), to 0.8 over the
+    pads' damping rate and to 0.25 ms; a power of two, so that few programs are compiled.
+    """
+    step = 2.5e-4
+    pads = max(sum(map(float, constants.pad_normal)), sum(map(float, constants.pad_shear)))
+    for w in constants.weight:
+        mass = float(w) / float(constants.gravity)
+        step = min(step, 1.1 / math.sqrt((4 * float(constants.support_stiffness) + pads) / mass))
+        step = min(step, 0.8 / max(pads * float(constants.pad_time) / mass, 1e-9))
+    return 2 ** max(0, math.ceil(math.log2(period / step) - 1e-9))
 
 
 class Rollout(NamedTuple):
@@ -187,3 +251,57 @@ def _row(state: State, loads: Loads) -> Array:
              zip(state.vx, state.vy, strict=True)]  # fmt: skip
     values = [value for part in pairs for pair in part for value in pair]
     return jnp.stack([*values, *loads.pads[0], *loads.pads[1], *loads.support])
+
+
+# Passivity of a haptic loop: an observer of the port's energy and a controller that damps.
+#
+# The device holds each rendered force for a whole period, and the force is a sample old: a stiff
+# virtual contact then returns more energy than it took. Port energy is counted exactly, as held
+# force times displacement, and whatever was returned too much is dissipated at once by damping
+# (passivity observer and controller: Hannaford & Ryu, IEEE Trans. Robotics Autom. 18, 2002).
+
+
+def stiffest_passive(damping: float, period: float, delay: float) -> float:
+    """Stiffness [N/m] up to which a sampled spring on a damped device is passive without control.
+
+    damping > stiffness (period / 2 + delay), the sampled-data condition of Colgate & Schenkel,
+    J. Robotic Systems 14 (1997), with the computation's delay [s] added to the hold's half period;
+    `damping` [N s/m] is the device's own.
+    """
+    return damping / (period / 2 + delay)
+
+
+class PassivityControl:
+    """Keeps what a virtual scene returns through the fingers below what it took.
+
+    Call `render` once a period with what the model asks for. `energy` [J] is what the scene has
+    taken up through the port so far; `allowed` [J] is what it may return beyond that (what blocks
+    and springs held at the start).
+    """
+
+    def __init__(self, period: float, allowed: float = 0.0, limit: float = 50.0) -> None:
+        self.period, self.allowed, self.limit = period, allowed, limit
+        self.energy = 0.0
+        self._held, self._moved = np.zeros(4), np.zeros(4)
+        self._place: np.ndarray | None = None
+
+    def render(self, force: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """Force (2, 2) [N] on the scene to hold for the next period; the device feels its opposite.
+
+        `force` (2, 2) [N] is the model's, `position` (2, 2) [m] the fingers' now. Damping brakes
+        with at most `limit` [N s/m], the device's own bound, beyond cancelling a push.
+        """
+        here = np.reshape(position, 4)
+        moved = np.zeros(4) if self._place is None else here - self._place
+        coming = 2 * moved - self._moved  # the fingers' next displacement if they keep accelerating
+        self._place, self._moved = here.copy(), moved
+        self.energy += float(self._held @ moved)
+        out = np.reshape(force, 4).astype(float)
+        expected = self.energy + float(out @ coming) + self.allowed
+        travel = float(coming @ coming)
+        if expected < 0.0 and travel > 0.0:
+            # Up to the device's own bound, or as much as takes away the push along the motion.
+            most = max(self.limit / self.period, -float(out @ coming) / travel)
+            out = out + min(-expected / travel, most) * coming
+        self._held = out
+        return out.reshape(2, 2)

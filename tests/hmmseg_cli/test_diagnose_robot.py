@@ -74,46 +74,28 @@ def test_what_does_not_go_together_is_said(logs, capsys, options, line):
     assert re.search(line, told) and "Traceback" not in told
 
 
-CURVE = """
-class Curve:
-    channels = {"u": {"unit": "rad", "kind": "command"},
-                "y": {"unit": "rad", "kind": "position", "noise": 1e-3}}
-    parameters = {"slope": {"nominal": 1.0, "sd": 0.1}, "bend": {"nominal": 0.0, "sd": 0.1}}
+@pytest.mark.slow
+def test_what_changed_since_healthy_logs_is_named(logs, tmp_path):
+    folder = tmp_path
+    for seed in range(3):
+        found = log(seed + 10, seconds=4.0)
+        rows = np.column_stack([found.t, found["torque"], found["angle"]])
+        np.savetxt(folder / f"old_{seed}.csv", rows, delimiter=",", header="t,torque,angle", comments="")
+    old = [str(folder / f"old_{seed}.csv") for seed in range(3)]
+    target, page = folder / "out.json", folder / "page.html"
+    options = ["--simulator", f"{SWING}:Swing", "--json", str(target), "--report", str(page), "--quiet"]
+    assert main(["diagnose", *logs, "--healthy", *old, *options]) == 0
+    found = json.loads(target.read_text())
+    assert found["verdict"] == "named" and found["causes"] == ["viscous"]
+    told = found["effects"]["viscous"]["parameters"]["viscous"]
+    assert told["interval_90"][0] < 0.004 < told["interval_90"][1] and told["old"] == 0.0
+    assert abs(sum(found["probabilities"].values()) - 1) < 1e-9
+    assert "iscous" in page.read_text()
+    assert main(["diagnose", old[0], "--healthy", *old[1:], *options]) == 0
+    assert json.loads(target.read_text())["verdict"] == "none"
 
-    def simulate(self, parameters, recording):
-        return {"y": parameters["slope"] * recording["u"] + parameters["bend"] * recording["u"] ** 2}
-"""
 
-
-def test_an_interrupted_run_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
-    import simgap.robots.diagnose as product
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "curve.py").write_text(CURVE)
-    t, rng = np.arange(0.0, 1.0, 0.02), np.random.default_rng(1)
-    files = []
-    for k in (1, 2, 3):
-        u = np.sin(k * t)
-        rows = np.column_stack([t, u, 1.2 * u + 1e-3 * rng.standard_normal(t.size)])
-        files.append(str(tmp_path / f"{k}.csv"))
-        np.savetxt(files[-1], rows, delimiter=",", header="t,u,y", comments="")
-    command = ["diagnose", *files, "--simulator", f"{tmp_path / 'curve.py'}:Curve", "--json"]
-    assert main([*command, str(tmp_path / "whole.json")]) == 0
-    assert not list((tmp_path / "cache").glob("hmmseg/robots/*"))
-    capsys.readouterr()
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(product, "explained", interrupted)
-        assert main([*command, str(tmp_path / "again.json")]) == 130
-    assert not (tmp_path / "again.json").exists()
-    told = capsys.readouterr().err
-    assert "the same command goes on from here" in told and "Traceback" not in told
-    searched = []
-    monkeypatch.setattr(product, "healthy_twins", lambda *_: searched.append(1))
-    assert main([*command, str(tmp_path / "again.json")]) == 0 and not searched
-    assert "going on where" in "".join(capsys.readouterr())
-    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
-    assert not list((tmp_path / "cache").glob("hmmseg/robots/*"))
+def test_an_effect_cannot_be_forced_of_a_change(logs, capsys):
+    options = ["--simulator", f"{SWING}:Swing", "--healthy", logs[1], "--effect", "viscous"]
+    assert main(["diagnose", logs[0], *options]) == 2
+    assert "--effect: does not go with --healthy and a model" in capsys.readouterr().err

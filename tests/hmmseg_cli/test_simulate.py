@@ -14,7 +14,7 @@ from hmmseg.io.task import read_task
 from hmmseg_cli.main import main
 from simgap.world.animation import FRAMES, Scene, Trace, animate
 from simgap.world.properties import PAPER_BLOCKS
-from simgap.world.writing import scene_files
+from simgap.world.simulate import scene_files
 
 TASK = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
 RIG = scene_files(STACK, HAND, PAPER_BLOCKS)["rig.toml"]

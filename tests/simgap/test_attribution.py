@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 from planted_gaps import gap_of, linear, rows_of
 
-from simgap.attribution.attribute import _predicting, _there, attribute
-from simgap.attribution.background import Background
-from simgap.attribution.cells import significant
-from simgap.attribution.detection import detected, leniently, statistic
+from simgap.attribution.attribute import _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import Heldout
-from simgap.attribution.noise import noise_of
-from simgap.attribution.posterior import fitted, forms
+from simgap.attribution.posterior import Background, fitted, forms
 from simgap.attribution.problem import Candidate, Gap, cosines
-from simgap.attribution.search import sought, weights
-from simgap.attribution.verdict import known
+from simgap.attribution.search import detected, leniently, sought, statistic, weights
+from simgap.attribution.verdict import known, significant
 
 
 def test_cosines_are_orthonormal_within_each_cell():

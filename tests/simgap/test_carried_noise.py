@@ -13,16 +13,12 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
-from simgap.attribution.noise_products import of_noise, products
-from simgap.attribution.posterior import fitted, forms
+from simgap.attribution.posterior import fitted, forms, of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Rows, spectrum
-from simgap.gap.assemble import SHOWN, gap_of
-from simgap.gap.fit import Start, fit
-from simgap.gap.frame import build
+from simgap.gap.assemble import SHOWN, SIZES, carried, gap_of, noise_gained, on_other, redrawn
+from simgap.gap.frame import build, without_dropouts
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import neutral, problem
-from simgap.gap.redrawn_noise import SIZES, carried, noise_gained, on_other, redrawn
-from simgap.gap.trial_arrays import without_dropouts
+from simgap.gap.problem import Start, fit, neutral, problem
 
 GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 

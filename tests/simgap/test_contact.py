@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from simgap.world.contact import FADE, friction, normal_force
+from simgap.world.dynamics import FADE, friction, normal_force
 
 K, C = jnp.asarray(4000.0), jnp.asarray(8.0)
 

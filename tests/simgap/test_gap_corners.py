@@ -8,9 +8,7 @@ import pytest
 from scipy.signal import lfilter, lsim
 
 from simgap.effects.base import LATE, SMOOTH, YIELDING
-from simgap.gap.between import doubt_between, shifted
-from simgap.gap.memory import sunk
-from simgap.gap.residuals import contact
+from simgap.gap.residuals import contact, doubt_between, shifted, sunk
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
 STEP = 0.05  # s

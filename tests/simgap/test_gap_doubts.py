@@ -9,9 +9,7 @@ from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
 from simgap.effects.geometry import play, within
-from simgap.gap.between import sensed
-from simgap.gap.grips import ANYWHERE, SLIDE, _followed
-from simgap.gap.memory import driven
+from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, driven, sensed
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
 

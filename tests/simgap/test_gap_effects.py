@@ -12,7 +12,7 @@ from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import FORCE_CHANNELS, Finger, Fingertip, Rig
 from simgap.effects import catalogue, decoys, effect_named, fitted
 from simgap.effects.base import Performance, World, flat, tips
-from simgap.gap.evaluation import STEP
+from simgap.gap.problem import STEP
 from simgap.gap.residuals import contact
 
 CONTRACT = {

@@ -9,15 +9,12 @@ from demo_recordings import RIG, TASK
 
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
-from simgap.gap.between import fivepoint
-from simgap.gap.evaluation import residual_at
-from simgap.gap.fit import Start, fit
-from simgap.gap.frame import build
-from simgap.gap.problem import neutral, problem
-from simgap.gap.scatter import scatters
-from simgap.gap.synthetic import performed, recorded
-from simgap.gap.trial_arrays import CHANNELS, _struck
-from simgap.gap.unresolved import kinks, of_a_kink, pushed, speed_jumps
+from simgap.gap.assemble import scatters
+from simgap.gap.frame import CHANNELS, _struck, build
+from simgap.gap.problem import Start, fit, neutral, problem, residual_at
+from simgap.gap.residuals import fivepoint
+from simgap.gap.sensor_noise import kinks, of_a_kink, pushed, speed_jumps
+from simgap.gap.twins import performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 from tests.simgap.test_gap_effects import as_jax, performance, world_of

@@ -14,13 +14,10 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.effects import effect_named
-from simgap.gap.assemble import gap_of, together
-from simgap.gap.evaluation import derivatives
-from simgap.gap.fit import Start, fit
+from simgap.gap.assemble import gap_of, scatters, together
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import neutral, problem, slots
-from simgap.gap.scatter import scatters
+from simgap.gap.problem import Start, derivatives, fit, neutral, problem, slots
 
 
 def read(folder, count=2):

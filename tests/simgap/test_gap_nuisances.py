@@ -17,14 +17,12 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
 from simgap.effects.base import tips
+from simgap.gap.assemble import _density, _likeliest, with_noise
 from simgap.gap.assemble import _turning as turned_variance
-from simgap.gap.frame import build
-from simgap.gap.marginal import Nuisances
-from simgap.gap.noise_model import _density, _likeliest, with_noise
+from simgap.gap.frame import CHANNELS, build
 from simgap.gap.nuisances import _late_rates, _settling, _turning
-from simgap.gap.problem import problem
+from simgap.gap.problem import Nuisances, problem
 from simgap.gap.residuals import residuals
-from simgap.gap.trial_arrays import CHANNELS
 
 
 def test_products_are_those_of_the_marginal_density():

@@ -15,10 +15,9 @@ from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
-from simgap.gap.frame import build
-from simgap.gap.grips import HELD, LOOSE, firmness
+from simgap.gap.frame import CHANNELS, build
+from simgap.gap.residuals import HELD, LOOSE, firmness
 from simgap.gap.sensor_noise import STARTING, UNSEEN, between_samples, channel_noise, sample_noise
-from simgap.gap.trial_arrays import CHANNELS
 
 DEMO = example_folder()
 MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)

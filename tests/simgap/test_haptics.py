@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.haptic_loop import squeeze
-from simgap.world.haptics import PassivityControl, stiffest_passive
+from simgap.world.virtual_model import PassivityControl, stiffest_passive
 
 
 def wall(stiffness: float, damping: float, controlled: bool, delay: int = 1) -> tuple[float, float]:

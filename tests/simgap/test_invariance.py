@@ -8,9 +8,8 @@ from planted_gaps import gap_of, linear, rows_of
 from scipy.stats import multivariate_normal
 
 from simgap.attribution.attribute import attribute
-from simgap.attribution.background import Background
-from simgap.attribution.invariance import WANDER, invariance, scatter_between
-from simgap.attribution.posterior import Forms, fitted, forms
+from simgap.attribution.heldout import WANDER, invariance, scatter_between
+from simgap.attribution.posterior import Background, Forms, fitted, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
 

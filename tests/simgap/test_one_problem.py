@@ -12,9 +12,8 @@ from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg.segmentation.align import align
 from simgap.api import diagnose
-from simgap.gap.fit import Start, fit
 from simgap.gap.frame import build
-from simgap.gap.problem import neutral, problem
+from simgap.gap.problem import Start, fit, neutral, problem
 from simgap.world.properties import Block
 from simgap.world.simulate import simulate_trials
 

@@ -10,14 +10,12 @@ from demo_recordings import RIG, TASK
 
 from hmmseg.hand.signals import task_space
 from hmmseg.segmentation.align import align
-from simgap.gap.frame import build
+from simgap.gap.frame import CHANNELS, build, thinned, without_dropouts
 from simgap.gap.sensor_noise import sensor_sd
-from simgap.gap.trial_arrays import CHANNELS, thinned, without_dropouts
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
-from simgap.world.repetition import plan_again
-from simgap.world.sensors import noise_sd
-from simgap.world.simulate import SimulatedTrial, simulate_plans, simulate_trials
+from simgap.world.replay import plan_again
+from simgap.world.simulate import SimulatedTrial, noise_sd, simulate_plans, simulate_trials
 
 BLOCKS = {name: Block(0.5, 0.02 + 0.004 * k, 0.018, 0.7) for k, name in enumerate(TASK.objects)}
 FORCES = ("fx1", "fy1", "fx2", "fy2")

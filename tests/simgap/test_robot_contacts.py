@@ -137,10 +137,9 @@ def test_flight_and_contact_are_told_apart(dropped):
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     """Windows that admit that each impact differs by a usual size: their weight on the scale is small."""
     from simgap.robot_effects.readout_scale import candidates
-    from simgap.robots.blocks import Discrepancy
     from simgap.robots.linear import linearise, wobbling
     from simgap.robots.model import Composed
-    from simgap.robots.whiten import CONTACTS, covariances
+    from simgap.robots.whiten import CONTACTS, Discrepancy, covariances
 
     simulator, log = dropped
     (scale,) = candidates(Setting(simulator, [log]))

@@ -7,18 +7,13 @@ import pytest
 from scipy import stats
 from simgap_swing import Swing, log
 
-from simgap.attribution.posterior import fitted, forms
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
-from simgap.robots.discrepancy import learned
 from simgap.robots.fit import _prior, _slope, moved_to
-from simgap.robots.gap import gap_of
-from simgap.robots.judged import Judge
-from simgap.robots.linear import base_at, linearise, vary
+from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises
-from simgap.robots.phases import phases_of
-from simgap.robots.settle import SETTLED, settled
+from simgap.robots.search import BETTER, Search
 from simgap.robots.whiten import covariances
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -60,10 +55,12 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
 
 
 def test_what_is_settled_stays(damped):
-    first = settled(damped, {"viscous": {"viscous": 0.0}})
-    assert first.gained > 100
-    again = settled(damped, first.point)
-    assert again.point == first.point and again.gained < SETTLED
+    search = Search(damped, tuple(damped.effects), damped.rows.log)
+    nothing = search.nothing()
+    first = search.settled(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
+    assert first.score > nothing.score + 100
+    again = search.settled(("viscous",), first.point, [first.whiten])
+    assert abs(again.score - first.score) < BETTER
 
 
 class Two:
@@ -89,31 +86,28 @@ def two(seed: int, **changed: float) -> Recording:
     sides = {}
     for number, side in enumerate("ab"):
         mine = {n[:-2]: v for n, v in changed.items() if n.endswith(f"_{side}")}
-        one = log(2 * seed + number, **mine)
+        one = log(2 * seed + number, seconds=3.0, **mine)
         sides |= {f"{n}_{side}": v for n, v in one.columns.items()}
     return Recording(f"log{seed}.csv", one.t, sides)
 
 
 def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     """By the discrepancy that is left without it, a cause seems to gain a third of what it does: what nothing
-    explains is as large as the cause's own doing. Once judged, none is left where it acts."""
+    explains is as large as the cause's own doing. Once fitted, none is left where it acts."""
     model = composed(Two(), [two(s, viscous_a=0.004, viscous_b=0.0005) for s in range(4)])
-    parts, names = phases_of(model.simulator, model.recordings), ["viscous_a", "viscous_b"]
-    linear = linearise(model, {}, names)
-    at = vary(model, base_at(model, {}), linear.starts, "viscous_a", {"viscous_a": 0.004})
-    assert at is not None
-    linear = linear.with_moved({"viscous_a": at})
-    cov = covariances(model, linear)
-    off = learned(cov, linear.residual)
-    assert {*off.scale} == {"angle_a", "angle_b"}
-    f = forms(gap_of(model, linear, cov.whitener(off), parts, names))
-    hidden = fitted(f, (0,)).score - fitted(f, ()).score
-    judge = Judge(model, parts, linear, cov, off, f.log_odds)
-    none, large, small, both = (judge(one) for one in ((), names[:1], names[1:], names))
-    assert large.score - none.score > 3 * hidden > 300
+    search, names = Search(model, tuple(model.effects), model.rows.log), ("viscous_a", "viscous_b")
+    none = search.nothing()
+    assert {*none.discrepancy.scale} >= {"angle_a", "angle_b"}
+    sets, levels, _ = search.place(none, names)
+    hidden = float(sets.scores([names[:1]], 0)[0] - sets.scores([()], 0)[0])
+    large, small, both = (
+        search.settled(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
+        for one in (names[:1], names[1:], names)
+    )
+    assert large.score - none.score > 2 * hidden > 300
     assert both.score > large.score + 100 > small.score + 200
     assert {*large.discrepancy.scale} == {"angle_b"} and {*small.discrepancy.scale} == {"angle_a"}
-    assert both.discrepancy.scale.get("angle_a", 0.0) < 0.01 * off.scale["angle_a"]
+    assert both.discrepancy.scale.get("angle_a", 0.0) < 0.01 * none.discrepancy.scale["angle_a"]
 
 
 def test_priors_are_cauchy_and_of_what_was_calibrated_normal():

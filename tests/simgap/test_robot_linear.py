@@ -11,13 +11,11 @@ from simgap_swing import Swing, log
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting, delayed
 from simgap.robot_effects.readout_lowpass import lowpass
-from simgap.robots.blocks import NONE
-from simgap.robots.discrepancy import learned
 from simgap.robots.identifiable import identifiability
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.noise import noises, resolution
-from simgap.robots.whiten import covariances
+from simgap.robots.whiten import NONE, covariances
 from simgap.robots.windows import REACH, smoothed
 from simgap.simulators.user import checked
 
@@ -132,16 +130,11 @@ def test_what_only_acts_together_is_said():
     _, jacobian, _ = whitened(model, {"viscous": {"viscous": 0.02}}, list(model.simulator.parameters))
     names = list(jacobian)
     scale = [model.simulator.parameters[n].sd for n in names]
-    found = identifiability(names, np.concatenate([jacobian[n] for n in names], 1) * np.array(scale))
+    columns = np.concatenate([jacobian[n] for n in names], 1) * np.array(scale)
+    found = identifiability(names, columns.T @ columns)
     assert any(a.own < 1e-3 and set(a.names) == set(names) for a in found.alike)
-    without = [n for n in names if n != "torque_scale"]
-    columns = np.concatenate([jacobian[n] for n in without], 1)
-    assert (
-        identifiability(
-            without, columns * np.array([model.simulator.parameters[n].sd for n in without])
-        ).alike
-        == ()
-    )
+    kept = [k for k, n in enumerate(names) if n != "torque_scale"]
+    assert not identifiability([names[k] for k in kept], columns[:, kept].T @ columns[:, kept]).alike
 
 
 def test_resolution_is_found_and_only_where_there_is_one():
@@ -154,11 +147,11 @@ def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
     model = composed([log(s) for s in range(3)])
     linear = linearise(model, {}, [])
     cov = covariances(model, linear)
-    assert learned(cov, linear.residual) == NONE
+    assert cov.learned(linear.residual) == NONE
     off = composed([log(s, viscous=0.01) for s in range(3)])
     linear = linearise(off, {}, [])
     cov = covariances(off, linear)
-    found = learned(cov, linear.residual)
+    found = cov.learned(linear.residual)
     assert set(found.scale) >= {"angle"} and found.scale["angle"] > 0.1
     white = cov.whitener(found)(linear.residual)
     assert 0.4 < np.mean(white**2) < 1.6 < np.mean(cov.whitener()(linear.residual) ** 2)

@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simgap.attribution.posterior import fitted, forms
-from simgap.robots.blocks import Discrepancy
-from simgap.robots.gap import gap_of
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.phases import phases_of
 from simgap.robots.repeats import motions
-from simgap.robots.whiten import TAU, covariances
+from simgap.robots.sets import Sets
+from simgap.robots.whiten import TAU, Discrepancy, covariances
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
@@ -60,9 +57,9 @@ def misses(seed: int, shared: bool, repeats: bool) -> float:
     made = made if repeats else replace(made, motion=())
     linear = linearise(made, {"size": {"size": 1.0}}, ["size"])
     whiten = covariances(made, linear).whitener(Discrepancy({"y": SIZE}))
-    f = forms(gap_of(made, linear, whiten, phases_of(made.simulator, made.recordings), ["size"]))
-    model = fitted(f, (0,))
-    return float(model.x[0] / np.sqrt(model.covariance[0, 0]))
+    sets = Sets.of(made.effects, linear, [whiten], ["size"], linear.rows.log, 0.0)
+    found = sets.fit(("size",), 0)
+    return float(found.x[0] / np.sqrt(found.covariance[0, 0]))
 
 
 @pytest.mark.parametrize("repeats", [True, False])

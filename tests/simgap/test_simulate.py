@@ -13,8 +13,7 @@ from hmmseg.io.rig import Finger, Noise, Rig, read_rig
 from hmmseg.io.task import GROUND, BlockTask, Move, read_task
 from simgap.world.operator import OperatorSettings, minimum_jerk
 from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
-from simgap.world.simulate import simulate_trial, simulate_trials
-from simgap.world.writing import scene_files, trial_files
+from simgap.world.simulate import scene_files, simulate_trial, simulate_trials, trial_files
 
 TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND}, (Move("a", GROUND), Move("b", "a"), Move("c", "b")))
 SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Move("b", "a")))

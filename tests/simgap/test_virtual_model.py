@@ -12,11 +12,9 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from simgap.world.properties import PAPER_BLOCKS, read_properties
-from simgap.world.replay import replay, residual_summary
-from simgap.world.scene import RIGID_PAD, physics, substeps_for
+from simgap.world.replay import replay, residual_summary, smooth
 from simgap.world.simulate import simulate_trial
-from simgap.world.smoothing import smooth
-from simgap.world.virtual_model import VirtualModel, rollout, standing
+from simgap.world.virtual_model import RIGID_PAD, VirtualModel, physics, rollout, standing, substeps_for
 
 STATES = [s.state for s in subtasks(STACK)]
 

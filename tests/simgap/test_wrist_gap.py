@@ -7,11 +7,9 @@ from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, 
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.segmentation.align import align
-from simgap.gap.candidates import candidate_names
 from simgap.gap.diagnose import diagnose
-from simgap.gap.frame import build
-from simgap.gap.trial_arrays import CHANNELS
-from simgap.gap.wrist_gap import as_from_wrist, shown, shown_forms
+from simgap.gap.frame import CHANNELS, as_from_wrist, build, shown, shown_forms
+from simgap.gap.search import candidate_names
 
 
 @pytest.fixture(scope="module")

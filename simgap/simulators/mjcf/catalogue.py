@@ -15,10 +15,17 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
-from simgap.simulators.mjcf.runs import HOLD
+from simgap.simulators.mjcf.runs import HOLD, LATE
 from simgap.simulators.mjcf.settable import setting_of
-from simgap.simulators.mjcf.setting import Setting, name_of, names_of
-from simgap.simulators.mjcf.state_friction import SHARE, sizes_of, state_friction
+from simgap.simulators.mjcf.settable_parts import body_setting, payload_place
+from simgap.simulators.mjcf.setting import Setting, name_of, names_of, object_id
+from simgap.simulators.mjcf.state_friction import (
+    SHARE,
+    elasticity,
+    gravity_compensation,
+    sizes_of,
+    state_friction,
+)  # fmt: skip
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
@@ -50,7 +57,8 @@ def offered(
     simulator.says = catalogue.says
     simulator.__post_init__()
     simulator.prepare(recordings)
-    return state_friction(simulator, recordings, motions, joints)
+    beyond = (state_friction, gravity_compensation, elasticity)
+    return [effect for family in beyond for effect in family(simulator, recordings, motions, joints)]
 
 
 class _Catalogue:
@@ -123,11 +131,24 @@ class _Catalogue:
                 self.add(f"{centre}_{axis}", SIZE * gyration, f"centre of mass of {name}", effect=centre)
             children = [c for c in range(m.nbody) if m.body_parentid[c] == b and c != b]
             if not any(m.body_jntnum[c] for c in children):
-                self.add(f"body:{name}.payload", SIZE * _largest(m), f"a load at {name}", low=0.0)
+                self._add_payload(name)
             first = int(m.body_jntadr[b])
             chained = m.body_jntnum[b] and int(m.jnt_type[first]) in HINGES and m.body_parentid[b] != 0
             if chained and np.linalg.norm(m.body_pos[b]) > 1e-6:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
+
+    def _add_payload(self, body: str) -> None:
+        """A load where the map says, or where one is likely to be."""
+        m, stated = self.model, self.simulator.map.payload_at.get(body)
+        at = payload_place(m, body)
+        if isinstance(stated, str):
+            at = m.site_pos[object_id(m, "site", stated)]
+        elif stated is not None:
+            at = np.array(stated)
+        where = ", ".join(f"{1e3 * x:.0f}" for x in at)
+        name = f"body:{body}.payload"
+        self.add(name, SIZE * _largest(m), f"a load on {body}, at {where} mm in its frame", low=0.0)
+        self.settings[name] = body_setting(m, body, "payload", np.array(at))
 
     def add_options(self) -> None:
         """Gravity's direction, and of the simulation its step, its solver and how it holds commands."""
@@ -139,6 +160,8 @@ class _Catalogue:
         if self.simulator.driven:
             says = "commands between samples: in steps (0), in lines (1, half a sample sooner), as late (-1)"
             self.add(HOLD, 0.5, says, low=-1.0, high=1.0)
+            says = "commands come later within the simulator's step, by this share of it"
+            self.add(LATE, 0.25, says, low=-0.5, high=0.5)
         if self.simulator.touching:
             says = "iterations of the simulator's solver: ten times as many"
             self.add("option.iterations", 0.3, says, low=0.0, high=1.0)

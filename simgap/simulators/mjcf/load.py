@@ -105,6 +105,11 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
             )
     for name in candidates:
         setting_of(plain, name)
+    for body, place in described.payload_at.items():
+        for kind, one in (("body", body), *((("site", place),) if isinstance(place, str) else ())):
+            if one not in names_of(plain, kind):
+                known = nearest(one, names_of(plain, kind))
+                raise InputError(f"{map_file}: payload_at.{body}", f"the model has no {kind} {one}", known)
     address = _add_sensors(mujoco, spec, described.columns)
     for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
         if hasattr(body, "simple"):

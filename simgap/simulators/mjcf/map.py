@@ -31,7 +31,7 @@ KINDS = {
     "site": ("position",),
 }
 KEYS = (*THINGS, "kind", "axis", "unit", "noise", "sign", "offset")
-TOP = ("columns", "time", "window", "keyframe", "uncertain", "sd")
+TOP = ("columns", "time", "window", "keyframe", "uncertain", "sd", "payload_at")
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class Mapped:
 @dataclass(frozen=True)
 class Map:
     """The columns, the `time` column with its factor to s, windows' `length` [s], the `keyframe` to start
-    what no column tells from; `uncertain`: patterns of what was never measured, `sd` by name of what was."""
+    what no column tells from; `uncertain`: patterns of what was never measured, `sd` by name of what was;
+    `payload_at`: by body the site at which it carries a load, or that place [m] in the body's frame."""
 
     file: str
     columns: Mapping[str, Mapped]
@@ -63,6 +64,7 @@ class Map:
     keyframe: str | None = None
     uncertain: tuple[str, ...] = ()
     sd: Mapping[str, float] = field(default_factory=dict)
+    payload_at: Mapping[str, str | tuple[float, ...]] = field(default_factory=dict)
 
 
 def read_map(path: Path) -> Map:
@@ -101,6 +103,7 @@ def read_map(path: Path) -> Map:
         keyframe,
         _patterns(raw.get("uncertain", []), f"{path}: uncertain"),
         _deviations(raw.get("sd", {}), f"{path}: sd"),
+        _places(raw.get("payload_at", {}), f"{path}: payload_at"),
     )
 
 
@@ -118,6 +121,21 @@ def _deviations(stated: Any, where: str) -> dict[str, float]:
         if sd <= 0:
             raise InputError(f"{where}.{name}", f"{sd:g}", "above 0")
     return found
+
+
+def _places(stated: Any, where: str) -> dict[str, str | tuple[float, ...]]:
+    if not isinstance(stated, dict):
+        raise InputError(where, "is no table", '{arm = "hand"} or {arm = [0.3, 0.0, 0.0]}')
+    out: dict[str, str | tuple[float, ...]] = {}
+    for body, place in stated.items():
+        numbers = isinstance(place, list) and len(place) == 3
+        if not isinstance(place, str) and not numbers:
+            raise InputError(f"{where}.{body}", f"{place!r:.40}", "the name of a site, or [x, y, z] in m")
+        keys = dict(enumerate(place)) if numbers else {}
+        out[body] = place if isinstance(place, str) else tuple(
+            _number({"place": keys[k]}, "place", f"{where}.{body}") for k in range(3)
+        )  # fmt: skip
+    return out
 
 
 def _mapped(column: str, entry: Any, where: str) -> Mapped:

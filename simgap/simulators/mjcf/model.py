@@ -15,7 +15,7 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
-from simgap.simulators.mjcf.runs import HOLD, Runs
+from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
 from simgap.simulators.mjcf.setting import Setting
 from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
@@ -144,7 +144,7 @@ class MjcfSimulator:
     @property
     def numerics(self) -> frozenset[str]:
         """Parameters of the simulation, not of the robot."""
-        return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n == HOLD)
+        return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n in (HOLD, LATE))
 
     @property
     def uncertain(self) -> tuple[str, ...]:

@@ -12,12 +12,13 @@ import numpy as np
 
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
-from simgap.simulators.mjcf.signals import Side, aligned
+from simgap.simulators.mjcf.signals import Held, Side, aligned
 from simgap.simulators.protocol import Channel, Channels
 from simgap.simulators.recording import Recording
 
 APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
 HOLD = "option.hold"  # the setting of how commands are held between samples
+LATE = "option.late"  # the setting of how late within a step they come
 BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
 KEPT = 1e8  # limit: bytes of the latest runs that are kept
 FAR = 1e9  # numerics: what reads beyond it has diverged
@@ -63,10 +64,12 @@ class Runs:
         parts = [(mine, [logs[i] for i in mine], applied) for (_, *applied), mine in alike.items()]
         sides = [self._side(own, times) for _, own, _ in parts]
         width = self.model.nu + (self.model.nv if any(applied for _, _, applied in parts) else 0)
-        control, line = np.zeros((len(logs), times.size, width)), dict(changed).get(HOLD, 0.0)
+        control = np.zeros((len(logs), times.size, width))
+        line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
         for (mine, own, applied), side in zip(parts, sides, strict=True):
             for column, place in {**self.driven, **{n: self._pushed(n) for n in applied}}.items():
-                control[mine, :, place] = side.held(np.array([log[column] for log in own]), line)
+                held = Held(side.held.since + late * h, times) if late else side.held
+                control[mine, :, place] = held(np.array([log[column] for log in own]), line)
         sensed = self._sensed(first, control, changed)
         out: list[Channels | None] = [None] * len(logs)
         for (mine, own, _), side in zip(parts, sides, strict=True):

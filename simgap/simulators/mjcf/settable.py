@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from simgap.simulators.mjcf.runs import HOLD
+from simgap.simulators.mjcf.runs import HOLD, LATE
 from simgap.simulators.mjcf.settable_parts import actuator_setting, body_setting, geom_setting, joint_setting
 from simgap.simulators.mjcf.setting import Setting, names_of
 
@@ -24,12 +24,13 @@ KNOWN = {
     "site": (),
     "equality": (),
 }
-OPTIONS = ("tilt_x", "tilt_y", "timestep", "iterations", "hold")
+OPTIONS = ("tilt_x", "tilt_y", "timestep", "iterations", "hold", "late")
 
 
 def option_setting(model: Any, attribute: str) -> Setting | None:
     """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), iterations (0: as it
-    is, 1: ten times), hold (of commands between samples; 0: in steps, 1: in lines to the next)."""
+    is, 1: ten times), hold (of commands between samples; 0: in steps, 1: in lines to the next), late (by
+    which share of a step they come later)."""
     down = np.array(model.opt.gravity)
     if attribute in ("tilt_x", "tilt_y"):
         axis = 0 if attribute == "tilt_x" else 1
@@ -51,6 +52,8 @@ def option_setting(model: Any, attribute: str) -> Setting | None:
         )
     if attribute == "hold":  # of the commands and not of the model: `Runs` has it
         return Setting(HOLD, "1", lambda m: 0.0, lambda m, value: None, False, None)
+    if attribute == "late":
+        return Setting(LATE, "1", lambda m: 0.0, lambda m, value: None, False, None)
     if attribute == "iterations":
         count = int(model.opt.iterations)
 

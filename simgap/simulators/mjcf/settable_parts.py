@@ -43,9 +43,9 @@ def joint_setting(model: Any, name: str, attribute: str) -> Setting | None:
     )
 
 
-def body_setting(model: Any, name: str, attribute: str) -> Setting | None:
-    """mass (inertia in proportion), com_x, com_y, com_z, payload (a point mass at the far end, 2 com), length
-    (of the body's offset from its parent, relative)."""
+def body_setting(model: Any, name: str, attribute: str, at: np.ndarray | None = None) -> Setting | None:
+    """mass (inertia in proportion), com_x, com_y, com_z, payload (a point mass `at` (3,) [m] in the body's
+    frame, or its `payload_place`), length (of the body's offset from its parent, relative)."""
     b = object_id(model, "body", name)
     mass, inertia = float(model.body_mass[b]), np.array(model.body_inertia[b])
     offset, com = np.array(model.body_pos[b]), np.array(model.body_ipos[b])
@@ -69,13 +69,16 @@ def body_setting(model: Any, name: str, attribute: str) -> Setting | None:
             f"body:{name}.{attribute}", "m", "body_ipos", (b, k), True, ("body", name, "ipos", k)
         )
     if attribute == "payload":
+        place = payload_place(model, name) if at is None else at
 
         def load(m: Any, value: float) -> None:
             total = mass + value
-            m.body_mass[b] = total
-            m.body_ipos[b] = com * (1 + value / total)  # between com and the far end, 2 com
-            # Both about the common centre (parallel axes), the axes of inertia taken as the frame's.
-            m.body_inertia[b] = inertia + mass * value / total * (com @ com - com**2)
+            away, turn = place - com, np.zeros(9)
+            mujoco.mju_quat2Mat(turn, m.body_iquat[b])
+            arm = turn.reshape(3, 3).T @ away  # in the axes of inertia
+            m.body_mass[b], m.body_ipos[b] = total, com + value / total * away
+            # Both about the common centre (parallel axes); the axes of inertia stay.
+            m.body_inertia[b] = inertia + mass * value / total * (arm @ arm - arm**2)
 
         return Setting(f"body:{name}.payload", "kg", lambda m: float(m.body_mass[b] - mass), load, True, None)
     if attribute == "length":
@@ -95,6 +98,17 @@ def body_setting(model: Any, name: str, attribute: str) -> Setting | None:
             ("body", name, "pos", None),
         )
     return None
+
+
+def payload_place(model: Any, name: str) -> np.ndarray:
+    """Where a body carries a load (3,) [m], in its frame: at its farthest site, where it has one, else at the
+    farthest centre of its geoms; at its centre of mass if it has none."""
+    b = object_id(model, "body", name)
+    for places, owner in ((model.site_pos, model.site_bodyid), (model.geom_pos, model.geom_bodyid)):
+        mine = np.array(places[np.asarray(owner) == b])
+        if len(mine):
+            return mine[int(np.argmax(np.linalg.norm(mine, axis=1)))]
+    return np.array(model.body_ipos[b])
 
 
 def geom_setting(model: Any, name: str, attribute: str) -> Setting | None:

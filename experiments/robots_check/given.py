@@ -1,0 +1,89 @@
+"""Cases that another generator made, diagnosed as a user would and scored.
+
+    python -m experiments.robots_check.given FOLDER [CASE...]    # results/robots_check_given.json
+
+A case is a folder with robot.xml, map.toml, train_*.csv (fitted), held_*.csv (never seen before the end) and
+truth.json: `right`, a list of causes, each as names of which any is right; none for a healthy robot;
+"unknown" for what no catalogue has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from resource import RUSAGE_CHILDREN, getrusage
+from typing import Any
+
+from experiments.saving import save
+
+OUT = Path(__file__).resolve().parents[1] / "results" / "robots_check_given.json"
+
+
+def diagnosed(case: Path) -> dict[str, Any]:
+    """The document, with processor seconds of the whole command."""
+    with tempfile.TemporaryDirectory() as place:
+        target = Path(place) / "found.json"
+        files = [str(p) for p in sorted(case.glob("train_*.csv"))]
+        model = ["--mjcf", str(case / "robot.xml"), "--map", str(case / "map.toml")]
+        command = [
+            sys.executable,
+            "-m",
+            "hmmseg_cli.main",
+            "diagnose",
+            *files,
+            *model,
+            "--json",
+            str(target),
+            "--quiet",
+        ]
+        before = getrusage(RUSAGE_CHILDREN)
+        subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+        after = getrusage(RUSAGE_CHILDREN)
+        found = json.loads(target.read_text(encoding="utf-8"))
+    return found | {"seconds": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+
+
+def right(found: dict[str, Any], truth: list[list[str]]) -> bool:
+    """Whether each true cause is told, or in the set, and nothing else is named."""
+    if not truth:
+        return found["verdict"] == "none"
+    if truth == [["unknown"]]:
+        return found["verdict"] == "unknown"
+    told = {*found["causes"], *found["indistinguishable"]}
+    allowed = {name for each in truth for name in each}
+    met = all(told & {*each} for each in truth)
+    return found["verdict"] in ("named", "set") and met and bool({*found["causes"]} & allowed)
+
+
+def main() -> None:
+    """Diagnose, score, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("cases", nargs="*")
+    parser.add_argument("--output", type=Path, default=OUT)
+    given = parser.parse_args()
+    out = {}
+    for truth in sorted(given.folder.glob("*/truth.json")):
+        case = truth.parent
+        if given.cases and case.name not in given.cases:
+            continue
+        found, wanted = diagnosed(case), json.loads(truth.read_text(encoding="utf-8"))["right"]
+        values = {
+            f"{cause}.{short}": p["mean"] for cause in found["causes"]
+            for short, p in found["effects"][cause]["parameters"].items()
+        }  # fmt: skip
+        out[case.name] = {
+            "right": right(found, wanted), "truth": wanted, "verdict": found["verdict"], "causes": values,
+            "indistinguishable": found["indistinguishable"], "seconds": round(found["seconds"], 1),
+            "over_noise": found["remainder"]["rms_over_noise"],
+        }  # fmt: skip
+        print(case.name, json.dumps(out[case.name]), flush=True)
+    save(given.output, out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,314 @@
+"""Real and simulated trials of one ordered task: cut into the same subtasks, and what of them is compared.
+
+A subtask begins with an event, and what follows at once (an impact, a snap) takes its own time: the first
+half second at most is compared second for second. The rest of the course follows the task's pace and is
+compared at equal shares of what remains of the subtask; of both, means of equal parts. What fluctuates has
+a clock of its own (a structure rings at its frequency however slowly the robot moves), so its spectrum is
+taken in seconds from the subtask's start, over a window that every trial fills. All features of a trial
+make one row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import dct
+from scipy.integrate import cumulative_trapezoid
+
+from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask, SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.align import align as align_blocks
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.model import SequenceModel
+from hmmseg.sequence.segment import segment_sequence
+
+SPREAD = (0.05, 0.95)  # chosen: quantiles whose distance is a channel's scale
+BINS = 16  # chosen: parts of a subtask whose means are compared, of which
+EARLY = 6  # chosen: lie in the time after its event,
+EVENT = 0.5  # chosen: s, or a quarter of the shortest
+SUB_BANDS = 8  # chosen: of fast power, evenly spaced in log frequency
+LOWEST = 6  # chosen: half periods in the window that fast power starts from
+FEWEST = 3  # chosen: coefficients of a sub-band; a window must give a band at least
+FLOOR = 1e-4  # chosen: of a channel's scale: power below this is no different from none
+SLOW, FAST, DURATION = range(3)
+TASK_SPACE = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A trial and the edges (K + 1,) [s] of its K subtasks. It may go on after the last one."""
+
+    trial: Trial
+    edges: np.ndarray
+
+
+@dataclass(frozen=True)
+class Ensembles:
+    """Cut trials of both kinds; `channels` are common to all, `subtasks` those that every trial shows."""
+
+    subtasks: tuple[str, ...]
+    channels: tuple[str, ...]
+    real: tuple[Cut, ...]
+    sim: tuple[Cut, ...]
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, cuts in (("real", self.real), ("simulated", self.sim)):
+            if not cuts:
+                raise InputError(f"{name} trials", "none shows the whole task", "at least one")
+        if len(self.real) + len(self.sim) < 3:
+            raise InputError("trials", "one real and one simulated",
+                             "more of one kind at least: how trials scatter must be known")  # fmt: skip
+
+
+def align(
+    real: Sequence[Trial],
+    sim: Sequence[Trial],
+    task: SequenceTask,
+    model: SequenceModel | None = None,
+    boundaries: Mapping[str, np.ndarray] | None = None,
+) -> Ensembles:
+    """Both kinds of trials cut at given boundaries [s] by file, or by the task's HMM.
+
+    Without a model one is learned from all trials together, every channel first brought to the median and
+    spread of its own kind: a bias or a gain between the kinds must not displace boundaries. InputError
+    where a kind has no complete trial or there are too few trials to know how trials scatter.
+    """
+    every, channels = [*real, *sim], _channels([*real, *sim], task)
+    if boundaries is not None:
+        cuts = [Cut(t, _edges(t, boundaries[t.file], task)) for t in every]
+        return Ensembles(tuple(task.sequence), channels, tuple(cuts[: len(real)]), tuple(cuts[len(real) :]))
+    both = [*_standardised(real, channels), *_standardised(sim, channels)] if model is None else every
+    given = model or fit_sequence(both, SequenceTask(task.sequence, channels, task.optional))
+    found = segment_sequence(both, given.task, given)
+    shown = [{s.subtask for s in each.spans} for each in found if each.complete]
+    seen = tuple(n for n in task.sequence if n not in task.optional or all(n in names for names in shown))
+    kinds: tuple[list[Cut], list[Cut]] = [], []
+    warnings = []
+    for k, (trial, segmentation) in enumerate(zip(every, found, strict=True)):
+        if not segmentation.complete:
+            warnings.append(f"{trial.name}: does not fit its task and is left out")
+            continue
+        spans = [s for s in segmentation.spans if s.subtask in seen]
+        kinds[k >= len(real)].append(Cut(trial, np.array([spans[0].start, *(s.end for s in spans)])))
+    return Ensembles(seen, channels, tuple(kinds[0]), tuple(kinds[1]), tuple(warnings))
+
+
+def align_block_trials(real: Sequence[Trial], sim: Sequence[Trial], task: BlockTask, rig: Rig) -> Ensembles:
+    """Trials of a block task in task space, cut at contact changes, each kind aligned by its own fit.
+
+    InputError where a kind has no complete trial.
+    """
+    kinds: tuple[list[Cut], list[Cut]] = [], []
+    warnings, names = [], ()
+    for kind, trials in zip(kinds, (real, sim), strict=True):
+        for one in align_blocks(trials, task, rig).trials:
+            trial, signal, found = one.trial, one.signals, one.segmentation
+            if not found.complete:
+                warnings.append(f"{trial.name}: does not fit its task and is left out")
+                continue
+            names = tuple(s.label for s in found.spans)
+            edges = np.array([found.spans[0].start, *(s.end for s in found.spans)])
+            channels = {c: np.asarray(getattr(signal, c)) for c in TASK_SPACE}
+            kind.append(Cut(Trial(trial.file, np.asarray(signal.t), channels), edges))
+        if not kind:
+            raise InputError(trials[0].file, "does not fit its task", "a recording that shows every subtask")
+    return Ensembles(names, TASK_SPACE, tuple(kinds[0]), tuple(kinds[1]), tuple(warnings))
+
+
+def _edges(trial: Trial, inner: np.ndarray, task: SequenceTask) -> np.ndarray:
+    whole = len(inner) == len(task.sequence)  # with the end of what is compared
+    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), [] if whole else trial.t[-1:]])
+    if edges.size != len(task.sequence) + 1 or not (np.diff(edges) > 0).all():
+        raise InputError(f"boundaries of {trial.file}", f"found {np.asarray(inner).tolist()}",
+                         f"{len(task.sequence) - 1} increasing times within the trial")  # fmt: skip
+    return edges
+
+
+def _channels(trials: Sequence[Trial], task: SequenceTask) -> tuple[str, ...]:
+    names = task.channels or tuple(n for n in trials[0].channels if all(n in t.channels for t in trials))
+    for trial in trials:
+        for name in names:
+            if name not in trial.channels:
+                raise InputError(f"{trial.file}: column {name}", "missing", ", ".join(names))
+    if not names:
+        raise InputError(trials[0].file, "shares no channel with the other trials", "a common column")
+    return names
+
+
+def _standardised(trials: Sequence[Trial], channels: tuple[str, ...]) -> list[Trial]:
+    """Trials whose channels have median 0 and spread 1 over all of them."""
+    out: list[dict[str, np.ndarray]] = [{} for _ in trials]
+    for name in channels:
+        values = np.concatenate([t.channels[name] for t in trials])
+        low, middle, high = np.nanquantile(values, (SPREAD[0], 0.5, SPREAD[1]))
+        for k, trial in enumerate(trials):
+            out[k][name] = (trial.channels[name] - middle) / (high - low or 1.0)
+    return [Trial(t.file, t.t, columns) for t, columns in zip(trials, out, strict=True)]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What each of F features is: arrays (F,) of `channel` (-1: a duration), `subtask`, `kind` and `width`
+    (DCT coefficients of a power).
+
+    `event` (K,) [s]: how long a subtask is compared second for second (0 for the first, which begins with
+    the recording); `window` (K,) [samples] of fast power; `coefficients[k]`: sub-bands as slices of its
+    DCT; `bins` (K,): parts of the course; `scale` (C,) of channels; `rate` [Hz] common to all.
+    """
+
+    ensembles: Ensembles
+    rate: float
+    scale: np.ndarray
+    event: np.ndarray
+    window: np.ndarray
+    coefficients: tuple[tuple[slice, ...], ...]
+    bins: np.ndarray
+    channel: np.ndarray
+    subtask: np.ndarray
+    kind: np.ndarray
+    width: np.ndarray
+
+    def where(self, kind: int, channel: int, subtask: int) -> np.ndarray:
+        """Indices of the features of one kind in a channel and subtask."""
+        return np.flatnonzero((self.kind == kind) & (self.channel == channel) & (self.subtask == subtask))
+
+    def of_channel(self, channel: int) -> np.ndarray:
+        """Indices of a channel's features: slow ones of all subtasks, then fast ones; of -1 the durations."""
+        every = range(len(self.window))
+        kinds = (SLOW, FAST) if channel >= 0 else (DURATION,)
+        return np.concatenate([self.where(kind, channel, k) for kind in kinds for k in every])
+
+
+def layout(given: Ensembles) -> Layout:
+    """Features that all trials have. Kinds recorded at different rates are compared at the lower one."""
+    rate = min(float(np.median([c.trial.rate for c in kind])) for kind in (given.real, given.sim))
+    durations = np.array([np.diff(c.edges) for c in (*given.real, *given.sim)])
+    shortest = durations.min(0)
+    spread = np.zeros(len(given.channels))
+    for kind in (given.real, given.sim):
+        values = [np.concatenate([c.trial.channels[n] for c in kind]) for n in given.channels]
+        spread = np.maximum(spread, [np.subtract(*np.nanquantile(v, SPREAD[::-1])) for v in values])
+    event = np.minimum(EVENT, shortest / 4)
+    event[(np.arange(event.size) == 0) | (event * rate < 2 * EARLY)] = 0.0
+    window = (shortest * rate).astype(int)
+    bins = np.clip(shortest * rate // 4, 1, BINS).astype(int)
+    lowest = np.maximum(LOWEST, np.ceil(window * bins / (shortest * rate)).astype(int))
+    subs = tuple(_sub_bands(int(low), int(n)) for low, n in zip(lowest, window, strict=True))
+    rows = []
+    for k in range(len(given.subtasks)):
+        for c in range(len(given.channels)):
+            rows += [(c, k, SLOW, 1)] * bins[k] + [(c, k, FAST, s.stop - s.start) for s in subs[k]]
+        rows.append((-1, k, DURATION, 1))
+    scale = np.where(spread > 0, spread, 1.0)
+    return Layout(given, rate, scale, event, window, subs, bins, *np.array(rows).T)
+
+
+def bin_edges(given: Layout, start: float, end: float, subtask: int) -> np.ndarray:
+    """Edges [s] of the parts of a subtask that lasts from start to end."""
+    count, early = int(given.bins[subtask]), float(given.event[subtask])
+    if not early or count < BINS:
+        return np.linspace(start, end, count + 1)
+    first = np.linspace(start, start + early, EARLY + 1)
+    return np.concatenate([first, np.linspace(first[-1], end, count - EARLY + 1)[1:]])
+
+
+def _sub_bands(low: int, window: int) -> tuple[slice, ...]:
+    """Up to SUB_BANDS slices of DCT coefficients from `low`, none of fewer than FEWEST."""
+    if window - low < FEWEST:
+        return ()
+    out, start = [], low
+    for edge in np.geomspace(low, window, SUB_BANDS + 1)[1:]:
+        stop = round(edge)
+        if window - stop < FEWEST:  # what would be left is too narrow
+            out.append(slice(start, window))
+            break
+        if stop - start >= FEWEST:
+            out.append(slice(start, stop))
+            start = stop
+    return tuple(out)
+
+
+def resampled(t: np.ndarray, values: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
+    """A signal with gaps at other times; averaged over 1 / rate where it was sampled much faster."""
+    known = np.isfinite(values)
+    if 1 / np.median(np.diff(t)) < 1.5 * rate:
+        return np.interp(times, t[known], values[known])
+    return means(t[known], values[known], times[:, None] + np.array([-0.5, 0.5]) / rate)[:, 0]
+
+
+def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Mean values of a linearly interpolated signal between neighbouring edges (along the last axis)."""
+    total = cumulative_trapezoid(values, t, initial=0.0)
+    # Between samples the integral of a straight line is a parabola.
+    k = np.clip(np.searchsorted(t, edges, side="right") - 1, 0, t.size - 2)
+    w = edges - t[k]
+    slope = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
+    integral = total[k] + w * (values[k] + 0.5 * w * slope)
+    return np.diff(integral) / np.diff(edges)
+
+
+def transformed(values: np.ndarray) -> np.ndarray:
+    """DCT coefficients (..., n) of windows (..., n) without their straight lines.
+
+    White noise of variance s² has s² in the square of every coefficient.
+    """
+    n = values.shape[-1]
+    at = np.arange(n) - (n - 1) / 2
+    slope = (values @ at) / max(at @ at, 1.0)
+    return np.asarray(dct(values - values.mean(-1, keepdims=True) - slope[..., None] * at, norm="ortho"))
+
+
+def windowed(
+    given: Layout, cut: Cut, channel: int, subtask: int, delay: int = 0, values: np.ndarray | None = None
+) -> np.ndarray:
+    """Samples (window,) of a channel from a subtask's start less `delay` samples on, or of `values` in its
+    stead. They never begin before the trial does."""
+    n, t = int(given.window[subtask]), cut.trial.t
+    if values is None:
+        values = cut.trial.channels[given.ensembles.channels[channel]]
+    first = int(np.searchsorted(t, cut.edges[subtask] - 0.5 / given.rate))
+    delay = min(delay, first)
+    first -= delay
+    inside = slice(first, first + n)
+    times = cut.edges[subtask] + (np.arange(n) - delay + 0.5) / given.rate
+    # Recorded samples as they are where they serve: between them noise would be smoothed.
+    if 0 <= first <= t.size - n and np.isfinite(values[inside]).all():
+        off = (t[inside] - t[first]) * given.rate - np.arange(n)
+        if np.abs(off).max() < 0.75:
+            return values[inside]
+    return resampled(t, values, np.clip(times, t[0], t[-1]), given.rate)
+
+
+def log_power(given: Layout, spectrum: np.ndarray, channel: int, subtask: int) -> np.ndarray:
+    """Log mean power of the sub-bands (..., B) of spectra (..., window)."""
+    parts = [spectrum[..., s].mean(-1) for s in given.coefficients[subtask]]
+    floor = (FLOOR * given.scale[channel]) ** 2
+    return np.log(np.stack(parts, -1) + floor) if parts else np.zeros((*spectrum.shape[:-1], 0))
+
+
+def features(given: Layout, cut: Cut) -> np.ndarray:
+    """All features (F,) of one trial: means in the channel's unit, log powers, log durations."""
+    out = np.zeros(given.kind.size)
+    for k in range(len(given.ensembles.subtasks)):
+        edges = bin_edges(given, cut.edges[k], cut.edges[k + 1], k)
+        out[given.where(DURATION, -1, k)] = np.log(edges[-1] - edges[0])
+        for c, name in enumerate(given.ensembles.channels):
+            values = cut.trial.channels[name]
+            known = np.isfinite(values)
+            out[given.where(SLOW, c, k)] = means(cut.trial.t[known], values[known], edges)
+            if given.coefficients[k]:
+                power = transformed(windowed(given, cut, c, k)) ** 2
+                out[given.where(FAST, c, k)] = log_power(given, power, c, k)
+    return out
+
+
+def both(given: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Features of the real trials (R, F) and of the simulated ones (S, F)."""
+    real, sim = (np.array([features(given, c) for c in kind])
+                 for kind in (given.ensembles.real, given.ensembles.sim))  # fmt: skip
+    return real, sim

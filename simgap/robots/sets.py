@@ -1,0 +1,260 @@
+"""Which candidates act together: evidence of sets of them in closed form, about one point.
+
+There the rows are linear in all parameters, x in prior standard deviations from neutral:
+
+    residual = sum over what is fitted along, N(0, 1), and over the set's effects, each a Cauchy slab,
+               of columns x  +  noise N(0, V),      V = V_0 + level^2 (discrepancy as it is at the point).
+
+A set's log evidence is Laplace's about its mode. Which discrepancy a set leaves is known once it is fitted:
+so there are several levels of it, of each the normal equations of all columns by fold, and a set has that
+which it is likeliest by. The log density of a fold given the others is the evidence of all less that of the
+others.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.special import gammaln
+
+from simgap.robot_effects.base import RobotEffect
+from simgap.robots.linear import Linear, Moved
+from simgap.robots.model import Point
+from simgap.robots.whiten import Whitener
+
+TURNS = 6  # numerics: of reweighted least squares
+ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and that are one
+SEEN = 1.0  # numerics: noise deviations that a usual size moves all rows by, together
+EXPECTED = 1.0  # prior: how many of all candidates act
+
+Names = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of a set by one level: its log evidence, the mode x (m,) of what is fitted along and of its effects'
+    parameters, and the covariance (m, m) there."""
+
+    score: float
+    x: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sets:
+    """Normal equations of all columns about a point, `gram` (levels, folds, M, M) with half the log
+    determinants (levels, folds). The first column is what is left with every effect neutral, then come those
+    that are fitted along, then of each candidate in `names` a constant and its derivatives."""
+
+    names: Names
+    gram: np.ndarray
+    half_log_det: np.ndarray
+    along: int
+    size: tuple[int, ...]  # parameters of each candidate
+    labels: tuple[str, ...]  # of all parameters
+    low: np.ndarray  # by column
+    high: np.ndarray
+    log_odds: float
+
+    @classmethod
+    def of(
+        cls,
+        effects: Mapping[str, RobotEffect],
+        linear: Linear,
+        levels: Sequence[Whitener],
+        names: Sequence[str],
+        fold: np.ndarray,
+        log_odds: float,
+    ) -> Sets:
+        """About the point of a linear model that has these candidates and what is fitted along; `fold`
+        (N,)."""
+        seen = np.isfinite(linear.residual)
+        along = [n for n, e in effects.items() if e.fitted]
+        columns, low, high = [np.nan_to_num(linear.residual)], [0.0], [0.0]
+        for name in along:
+            moved, known = linear.moved[name], list(effects[name].parameters.values())
+            for k, p in enumerate(known):
+                columns.append(np.nan_to_num(moved.jacobian[:, k]) * p.sd)
+                columns[0] = columns[0] + columns[-1] * (moved.at[k] - p.nominal) / p.sd
+                low.append((p.low - p.nominal) / p.sd)
+                high.append((p.high - p.nominal) / p.sd)
+        width = len(columns) - 1
+        for name in names:
+            mine, bounds = _columns(effects[name], linear.moved[name])
+            if name in linear.point:
+                columns[0] = columns[0] + np.nan_to_num(linear.moved[name].shift)
+            columns += mine
+            low += [0.0, *bounds[0]]
+            high += [0.0, *bounds[1]]
+        whole, numbers = np.where(seen[:, None], np.column_stack(columns), 0.0), np.unique(fold)
+        gram, half = [], []
+        for whiten in levels:
+            white = whiten(whole)
+            parts = [white[fold == n] for n in numbers]
+            gram.append([part.T @ part for part in parts])
+            half.append(whiten.half_log_dets(np.searchsorted(numbers, fold)))
+        size = tuple(len(effects[n].parameters) for n in names)
+        short = [(n, tuple(effects[n].parameters)) for n in names]
+        labels = tuple(n if len(own) == 1 else f"{n}.{s}" for n, own in short for s in own)
+        bounds = np.array(low), np.array(high)
+        return cls(tuple(names), np.array(gram), np.array(half), width, size, labels, *bounds, log_odds)
+
+    def scores(self, sets: Sequence[Names], level: int, without: int | None = None) -> np.ndarray:
+        """Log evidence of sets (len(sets),) by a level, `without` one fold."""
+        alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        for i, names in enumerate(sets):
+            alike[tuple(sorted(self._size(n) for n in names))].append(i)
+        out = np.zeros(len(sets))
+        for mine in alike.values():
+            found = self._evidence([sets[i] for i in mine], level, without)
+            out[mine] = found[0]
+        return out
+
+    def fit(self, names: Names, level: int) -> Evidence:
+        """One set's evidence by a level; parameters in the order of `names`."""
+        score, x, covariance = self._evidence([names], level, None, kept=True)
+        return Evidence(float(score[0]), x[0], covariance[0])
+
+    def held_out(self, names: Names, level: int) -> np.ndarray:
+        """Log density (folds,) of each fold given the others."""
+        whole = self.scores([names], level)[0]
+        return np.array([whole - self.scores([names], level, k)[0] for k in range(self.gram.shape[1])])
+
+    def jackknife(self, names: Names, level: int) -> np.ndarray:
+        """A set's modes (folds, m), each without one fold."""
+        folds = range(self.gram.shape[1])
+        return np.array([self._evidence([names], level, k, kept=True)[1][0] for k in folds])
+
+    def product(self) -> tuple[list[str], np.ndarray]:
+        """Candidates' parameters by name, and inner products (p, p) of their columns by the sensors'
+        noise."""
+        first = 1 + self.along + np.concatenate([[0], np.cumsum([1 + k for k in self.size])]).astype(int)
+        at = [first[j] + 1 + k for j, size in enumerate(self.size) for k in range(size)]
+        return list(self.labels), self.gram[-1].sum(0)[np.ix_(at, at)]
+
+    def _size(self, name: str) -> int:
+        return self.size[self.names.index(name)]
+
+    def _evidence(
+        self, sets: Sequence[Names], level: int, without: int | None, kept: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Scores (B,), modes (B, m) and covariances (B, m, m) of sets whose effects have as many
+        parameters."""
+        used = np.arange(self.gram.shape[1]) != without
+        gram, half = self.gram[level][used].sum(0), float(self.half_log_det[level][used].sum())
+        first = 1 + self.along + np.concatenate([[0], np.cumsum([1 + k for k in self.size])]).astype(int)
+        place = {n: first[j] for j, n in enumerate(self.names)}
+        ordered = [s if kept else tuple(sorted(s, key=self._size)) for s in sets]
+        free = np.array([
+            [*range(1, 1 + self.along), *(place[n] + 1 + k for n in s for k in range(self._size(n)))]
+            for s in ordered
+        ], int)  # fmt: skip
+        constant = np.array([[0, *(place[n] for n in s)] for s in ordered])
+        sign = np.array([1.0, *(-1.0 for _ in ordered[0])])
+        block = np.repeat(np.arange(len(ordered[0])), np.array([self._size(n) for n in ordered[0]], int))
+        square = np.einsum("i,bij,j->b", sign, gram[constant[:, :, None], constant[:, None, :]], sign)
+        pull = np.einsum("i,bij->bj", sign, gram[constant[:, :, None], free[:, None, :]])
+        bend = gram[free[:, :, None], free[:, None, :]]
+        low, high = self.low[free], self.high[free]
+        count, a = free.shape[1], self.along
+        size = np.bincount(block, minlength=len(ordered[0]))
+        prior, x = np.ones(free.shape), np.zeros(free.shape)
+        eye, held = np.eye(count), np.zeros(free.shape, bool)
+        for _ in range(TURNS):
+            at = np.where(
+                held, np.where(x < 0.5 * (np.maximum(low, -1e9) + np.minimum(high, 1e9)), low, high), 0.0
+            )
+            rest = np.where(held, at, pull - np.einsum("bij,bj->bi", bend, at))
+            loose = ~(held[:, :, None] | held[:, None, :])
+            matrix = np.where(loose, bend + prior[:, :, None] * eye, eye)
+            x = np.linalg.solve(matrix, rest[..., None])[..., 0]
+            outside = (x < low) | (x > high)
+            held |= outside
+            x = np.clip(x, low, high)
+            if block.size:
+                square_x = np.stack([np.sum(x[:, a:][:, block == j] ** 2, 1) for j in range(size.size)], 1)
+                prior[:, a:] = ((1 + size) / (1 + square_x))[:, block]
+        matrix = np.where(loose, bend + prior[:, :, None] * eye, eye)
+        energy = square - 2 * np.einsum("bi,bi->b", pull, x) + np.einsum("bi,bij,bj->b", x, bend, x)
+        score = -0.5 * np.maximum(energy, 0.0) - half - 0.5 * np.sum(x[:, :a] ** 2, 1)
+        if block.size:
+            score = score + np.sum(
+                gammaln((1 + size) / 2) - gammaln(0.5) - 0.5 * size * np.log(np.pi)
+                - 0.5 * (1 + size) * np.log1p(square_x), 1,
+            )  # fmt: skip
+        score += 0.5 * ((~held[:, a:]).sum(1)) * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(matrix)[1]
+        score += len(ordered[0]) * self.log_odds
+        covariance = np.linalg.inv(matrix) * loose if kept else np.zeros((0, 0, 0))
+        return score, x, covariance
+
+
+def _columns(effect: RobotEffect, moved: Moved) -> tuple[list[np.ndarray], tuple[list[float], list[float]]]:
+    """A candidate's constant part and derivatives by usual sizes, and their bounds in these."""
+    known = list(effect.parameters.values())
+    sd, neutral = np.array([p.sd for p in known]), np.array([p.nominal for p in known])
+    slope = np.nan_to_num(moved.jacobian) * sd
+    constant = np.nan_to_num(moved.shift) - slope @ ((moved.at - neutral) / sd)
+    bounds = [(p.low - p.nominal) / p.sd for p in known], [(p.high - p.nominal) / p.sd for p in known]
+    return [constant, *slope.T], bounds
+
+
+def neighbours(best: Names, names: Sequence[str]) -> list[Names]:
+    """Sets with one effect more, one left out, or one exchanged."""
+    fewer = [tuple(n for n in best if n != out) for out in best]
+    more = [(*kept, n) for kept in (best, *fewer) for n in names if n not in best]
+    return [*more, *fewer]
+
+
+def pairs(best: Names, names: Sequence[str]) -> list[Names]:
+    """Sets with two effects more."""
+    return [(*best, *two) for two in combinations([n for n in names if n not in best], 2)]
+
+
+def point_of(
+    effects: Mapping[str, RobotEffect], found: Evidence, names: Names, along: Sequence[str]
+) -> dict[str, Mapping[str, float]]:
+    """The parameters at a mode."""
+    out: dict[str, Mapping[str, float]] = {}
+    at = 0
+    for name in (*along, *names):
+        known = effects[name].parameters
+        values = found.x[at : at + len(known)]
+        out[name] = {
+            short: float(np.clip(p.nominal + p.sd * v, p.low, p.high))
+            for (short, p), v in zip(known.items(), values, strict=True)
+        }
+        at += len(known)
+    return out
+
+
+def log_odds(count: int) -> float:
+    """Prior log odds of one of so many candidates to act."""
+    share = min(EXPECTED / max(count, 1), 0.5)
+    return float(np.log(share / (1 - share)))
+
+
+def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
+    """A point with one effect neutral."""
+    return {n: v for n, v in point.items() if n != out}
+
+
+def cancelling(sets: Sets) -> list[tuple[str, str, float]]:
+    """Pairs of candidates of one parameter whose columns nearly cancel, those most alike first, and how much
+    of the second, in usual sizes, goes against one of the first."""
+    first = 1 + sets.along + np.concatenate([[0], np.cumsum([1 + k for k in sets.size])]).astype(int)
+    single = [j for j, k in enumerate(sets.size) if k == 1]
+    at = np.array([first[j] + 1 for j in single])
+    product = sets.gram[-1].sum(0)[np.ix_(at, at)]
+    length = np.sqrt(np.diag(product))
+    seen = length > SEEN
+    alike = product / np.where(np.outer(seen, seen), np.outer(length, length), np.inf)
+    found = []
+    for i, j in zip(*np.triu_indices(len(at), 1), strict=True):
+        if ALIKE < abs(alike[i, j]) < SAME:
+            against = -alike[i, j] * length[i] / length[j]
+            found.append((abs(alike[i, j]), sets.names[single[i]], sets.names[single[j]], float(against)))
+    return [one[1:] for one in sorted(found, reverse=True)]

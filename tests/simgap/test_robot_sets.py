@@ -1,0 +1,108 @@
+"""Evidence of sets in closed form against integrals, and what whitens rows against what it says it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+
+from simgap.robots.sets import Sets, cancelling, neighbours, pairs
+from simgap.robots.whiten import Block, Covariances, Discrepancy, Source
+
+NAMES = ("a", "b", "c")
+
+
+def sets_of(columns: np.ndarray, residual: np.ndarray, fold: np.ndarray, low: float = -np.inf) -> Sets:
+    """One thing fitted along, then three candidates of one parameter, white noise."""
+    each = [c for k in (1, 2, 3) for c in (0 * residual, columns[:, k])]
+    whole = np.column_stack([residual, columns[:, 0], *each])
+    gram = np.array([[whole[fold == n].T @ whole[fold == n] for n in np.unique(fold)]])
+    bounds = np.array([0.0, -np.inf, *(low if k % 2 else 0.0 for k in range(6))])
+    return Sets(NAMES, gram, np.zeros((1, 2)), 1, (1, 1, 1), NAMES, bounds, np.full(8, np.inf), -2.0)
+
+
+@pytest.fixture
+def drawn():
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((80, 4))
+    return columns, columns @ [0.5, 1.5, 0.0, 0.0] + rng.standard_normal(80), np.arange(80) % 2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_evidence_is_the_integral_over_the_slab(drawn, name):
+    columns, residual, _ = drawn
+    sets, k = sets_of(*drawn), 1 + NAMES.index(name)
+    inner = np.linalg.inv(np.eye(80) + np.outer(columns[:, 0], columns[:, 0]))
+    half = 0.5 * np.linalg.slogdet(np.linalg.inv(inner))[1]
+
+    def density(x: float) -> float:
+        left = residual - columns[:, k] * x
+        return float(np.exp(-0.5 * left @ inner @ left - half + 100) * stats.cauchy.pdf(x))
+
+    near = float(columns[:, k] @ inner @ residual / (columns[:, k] @ inner @ columns[:, k]))
+    exact = np.log(quad(density, near - 2, near + 2, limit=200)[0]) - 100 - 2.0
+    assert sets.scores([(name,)], 0)[0] == pytest.approx(exact, abs=0.05)
+
+
+def test_bounds_hold_and_many_sets_are_as_each_alone(drawn):
+    columns, residual, fold = drawn
+    bounded = sets_of(columns, -residual, fold, low=0.0)
+    assert bounded.fit(("a",), 0).x[1] == 0.0
+    sets = sets_of(*drawn)
+    every = [*neighbours(("a",), NAMES), *pairs((), NAMES)]
+    together = sets.scores(every, 0)
+    np.testing.assert_allclose(together, [sets.fit(e, 0).score for e in every], atol=1e-9)
+    assert {*every[int(together.argmax())]} >= {"a"}
+    own = [sets.fit(("a",), 0).score - sets.scores([("a",)], 0, k)[0] for k in (0, 1)]
+    np.testing.assert_allclose(sets.held_out(("a",), 0), own)
+    assert sets.held_out(("a",), 0).sum() > sets.held_out((), 0).sum() + 10
+
+
+def test_pairs_that_nearly_cancel_are_found(drawn):
+    columns, residual, fold = drawn
+    columns[:, 2] = -2.0 * columns[:, 1] + 0.1 * columns[:, 2]
+    ((one, other, against),) = cancelling(sets_of(columns, residual, fold))
+    assert (one, other) == ("a", "b") and against == pytest.approx(0.5, rel=0.05)
+
+
+def block(window: int) -> Block:
+    """Two channels, and a start that moves both."""
+    rng, time = np.random.default_rng(window), np.arange(40) / 40
+    smooth = np.exp(-np.abs(time[:, None] - time) / 0.3)
+    sources = {c: Source(np.arange(40) + 40 * k, smooth) for k, c in enumerate("pq")}
+    start = rng.standard_normal((80, 2))
+    return Block(np.arange(80) + 80 * window, window, np.full(80, 0.5), start, sources, np.repeat([0, 1], 40))
+
+
+def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_them():
+    rng, cov = np.random.default_rng(1), Covariances(tuple(block(k) for k in range(30)))
+    true = Discrepancy({"p": 0.7})
+    root = [np.linalg.cholesky(b.covariance(true)) for b in cov.blocks]
+    rows = np.concatenate([each @ rng.standard_normal(80) for each in root])
+    found = cov.learned(rows)
+    assert {*found.scale} == {"p"} and found.scale["p"] == pytest.approx(0.7, rel=0.2)
+    white = cov.whitener(found)(rows)
+    assert np.mean(white**2) == pytest.approx(1.0, rel=0.1)
+    assert cov.off_alone(cov.whitener(found), rows) == {}
+    rows[160:240] *= 3.0
+    wide = cov.off_alone(cov.whitener(cov.learned(rows)), rows)
+    assert {*wide} == {2} and wide[2] == pytest.approx(9.0, rel=0.4)
+
+
+def test_the_gradient_of_the_likelihood_is_its_slope():
+    smooth = Covariances(tuple(block(k) for k in range(3)))._smooth
+    left, x = np.random.default_rng(2).standard_normal(smooth.plain.shape[:2]), np.array([-0.5, 0.3])
+    slope = smooth.cost(x, left, [0, 1])[1]
+    for k in (0, 1):
+        step = 1e-5 * (np.arange(2) == k)
+        change = smooth.cost(x + step, left, [0, 1])[0] - smooth.cost(x - step, left, [0, 1])[0]
+        assert slope[k] == pytest.approx(change / 2e-5, rel=1e-5)
+
+
+def test_noise_leaves_the_floor():
+    rng, cov = np.random.default_rng(3), Covariances((block(0),))
+    one, sensor = cov.blocks[0], cov.whitener()
+    noise = np.sqrt(one.variance)[:, None] * rng.standard_normal((80, 2000))
+    left = np.sum(sensor(noise + one.start @ rng.standard_normal((2, 2000)) / 3) ** 2, 0)
+    assert cov.floor() == pytest.approx(np.mean(left), rel=0.02)
