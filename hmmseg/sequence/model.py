@@ -79,7 +79,7 @@ class SequenceModel(Tabled):
 
     def without_templates(self, trial: SequenceFeatures) -> SequenceModel:
         """The model that tells whether a trial fits: templates have no counterpart in free switching; where
-        no labels taught it, with evidence coarsened (hmmseg.sequence.naming)."""
+        no labels taught it, with evidence coarsened (hmmseg.sequence.courses)."""
         if self.detectors is not None:
             return replace(self, detectors=None)
         temper = self.emissions.temper
