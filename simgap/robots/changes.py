@@ -53,6 +53,7 @@ from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 STAGES = 8  # look: what a progress bar counts
+COMMON = 0.1  # prior: of usual sizes; what a model's error makes of all new logs, at most
 LEAST = 0.2  # numerics: of a log's own size over that of OLD's logs
 GROUPS, MANY = (
     10,
@@ -98,7 +99,8 @@ class Comparison:
         self.new.by(null.processes, null.tau, np.maximum(scale, LEAST))
         p, rows = len(null.theta.names), composed.rows
         self.loose = self.new.whiten(self.new.columns)
-        spread = np.diag(null.tau**2)  # NEW's logs have in common what a model's error makes of any of them
+        # NEW's logs have in common what a model's error makes of any of them, where that is known to be small
+        spread = np.diag(np.minimum(null.tau, COMMON) ** 2)
         spread[:p, :p] += null.covariance
         self.prior = np.linalg.inv(spread)
         self.inside = np.linalg.inv(self.loose.T @ self.loose + self.prior)
