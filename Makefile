@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch bench-solvers help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -46,13 +46,22 @@ golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ agai
 wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
 	$(BIN)/python .ci/check_wheel.py
 
-OLDEST := build/oldest
-oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares, in an environment of its own
+# Both ends of what pyproject.toml declares, each in an environment of its own; ArviZ 1 needs Python 3.12,
+# which NEWEST_PYTHON can name.
+NEWEST_PYTHON ?= $(BIN)/python
+oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares
+	$(call at_versions,oldest,$(BIN)/python,--resolution lowest-direct)
+
+newest: $(INSTALLED)  ## the demo with the newest versions there are
+	$(call at_versions,newest,$(NEWEST_PYTHON),--upgrade)
+
+define at_versions
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
-	$(BIN)/uv pip install --quiet --python $(OLDEST) --resolution lowest-direct '.[mujoco]'
-	$(OLDEST)/bin/hmmseg doctor
-	$(OLDEST)/bin/hmmseg demo --figures build/oldest_demo
+	$(BIN)/uv venv --quiet --clear --python $(2) build/$(1)
+	$(BIN)/uv pip install --quiet --python build/$(1) $(3) '.[mujoco]'
+	build/$(1)/bin/hmmseg doctor
+	build/$(1)/bin/hmmseg demo --figures build/$(1)_demo
+endef
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
 	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs
@@ -64,11 +73,6 @@ bench: $(INSTALLED)  ## alignment beside hmmlearn and dynamax, stages of the com
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m experiments.benchmarks.hmm
 	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
-	$(BIN)/python -m experiments.write_tables
-
-bench-solvers: $(INSTALLED)  ## optimistix and SciPy beside our own solver on the same problems; fills docs/benchmarks.md
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
-	$(BIN)/python -m experiments.benchmarks.solvers recordings/force_bias_1
 	$(BIN)/python -m experiments.write_tables
 
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
@@ -109,6 +113,10 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 	$(BIN)/python -m experiments.blind_check diagnose --cases $(SET)/cases --out $(SET)/results
 	$(BIN)/python -m experiments.blind_check score --sealed $(SET) --results $(SET)/results --json experiments/results/blind_check.json
 	$(BIN)/python -m paper_figs.gap_reliability
+	$(BIN)/python -m experiments.write_tables
+
+sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
+	$(BIN)/python -m experiments.real.sts3215 $(SET) --part judge --output experiments/results/sts3215.json
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)

@@ -29,8 +29,8 @@ from estimation.observations import CHANNELS, MIN_FREE, WeighedTrial
 from estimation.pads import MISSTATED, SLOPE_SD, unit_pads
 from estimation.posterior import NUM_CHANNELS, Posterior
 from estimation.sampler import CERTAIN, Draws
+from hmmseg.hand.plausibility import Finding, all_changed
 from hmmseg.hand.sensing import WHITE
-from hmmseg.io.plausibility import Finding, all_changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS

@@ -21,7 +21,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from estimation.pads import SLOPE_SD, UNSTATED, Slope, middle_share, slope_of_landing, slopes_within
+from estimation.pads import SLOPE_SD, UNSTATED, Slope, landing, middle_share, shear_give, slopes_within
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.roll import with_roll
@@ -300,9 +300,9 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
             groups = {k: np.asarray(best[i].any(axis=0)) for k, i in members.items() if k != "force"}
             slopes[m] = slopes_within(thinned, values, groups, scales, rig)
             if m in touched:
-                k, place = touched[m], grips[m]["place"].mean(axis=0)
-                net = values["force"] / factor
-                slopes[m] |= slope_of_landing(thinned, values, net, best[k], place, moments[k], scales, rig)
+                k, place, give = touched[m], grips[m]["place"].mean(axis=0), shear_give(thinned, rig)
+                found = landing(thinned.t, values["place"], give, place, moments[k], best[k], scales["place"])
+                slopes[m] |= {} if found is None else {"landing": found}
         if not squeezed:
             slopes = {m: {k: v for k, v in of.items() if k != "distance"} for m, of in slopes.items()}
         weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()), slopes)

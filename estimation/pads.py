@@ -229,27 +229,6 @@ def landing(
     return Slope(weights / change, variance / change**2, change=change)
 
 
-def first_push(
-    t: np.ndarray, net: np.ndarray, carry: np.ndarray, touch: tuple[float, float]
-) -> tuple[float, float]:
-    """Mean and sd of the touch [s] as forces have it, where that is before the boundary `touch`.
-
-    `net` (num_timesteps,) [N]: net vertical force in units of 1 + a / g, constant while carried. Where pads
-    yield, fingers go on after the touch as if they still carried; the support bears weight all the same.
-    """
-    held = net[carry & np.isfinite(net)]
-    if held.size < BEFORE:
-        return touch
-    level = float(np.median(held))
-    noise = robust_sd(held - level)
-    before = np.flatnonzero(np.isfinite(net) & (t <= touch[0]))
-    free = before[net[before] > level - max(SURE * noise, RELIEVED * abs(level))]
-    if not free.size or free[-1] == before[-1]:
-        return touch
-    last, first = t[free[-1]], t[before[before > free[-1]][0]]
-    return float(last + first) / 2, float(first - last) / 12**0.5
-
-
 def _extrapolation(t: np.ndarray, degree: int) -> np.ndarray:
     """Weights (n,) that make of readings at times t the least-squares polynomial's value at 0."""
     return np.linalg.pinv(np.vander(t, degree + 1))[-1]
@@ -290,17 +269,3 @@ def _rough(readings: np.ndarray) -> float:
     """White noise (sd) of readings (num_samples,), 0 of too few [m]."""
     there = readings[np.isfinite(readings)]
     return white_sd(there) if there.size >= MIN_SAMPLES else 0.0
-
-
-def slope_of_landing(
-    signals: Signals, values: Mapping[str, np.ndarray], net: np.ndarray, carry: np.ndarray,
-    place: np.ndarray, touch: tuple[float, float], scales: Mapping[str, float], rig: Rig,
-) -> dict[str, Slope]:  # fmt: skip
-    """What the landing of one grip says of the pads, if anything.
-
-    `net` (num_timesteps,) [N]: net vertical force in units of 1 + a / g; `carry`, `place` (num_timesteps,):
-    samples before it and weights of the place's mean; `touch`: mean and sd of the boundary [s].
-    """
-    give, moment = shear_give(signals, rig), first_push(signals.t, net, carry, touch)
-    found = landing(signals.t, values["place"], give, place, moment, carry, scales["place"])
-    return {} if found is None else {"landing": found}

@@ -46,18 +46,11 @@ SPECIAL: dict[str, tuple[Off, ...]] = {
     "blocks that hang askew": (
         ("hmmseg.segmentation.posteriors.corner_drops", lambda s, *a: (np.zeros(s.t.size), 0.0)),
     ),
-    "fingers that stand": tuple(
-        (f"hmmseg.segmentation.{m}.standing", lambda t, *a: np.zeros(t.size, bool))
-        for m in ("free_contacts", "align")
-    ),
-    "fingers astride": (("hmmseg.segmentation.align.astride", lambda *a: None),),
     "brief touches": (("hmmseg.segmentation.free_contacts._tapped", lambda *a: []),),
     "ringing loads": (("hmmseg.segmentation.pads.ringing", lambda *a: []),),
-    "abrupt ends": (("hmmseg.segmentation.changes._abruptness", lambda *a: 1e-9),),
     "disagreement of force and place": (("hmmseg.segmentation.changes._discrepancy", lambda *a: 0.0),),
     "slopes within grips": (("estimation.observations.slopes_within", lambda *a: {}),),
-    "landing": (("estimation.observations.slope_of_landing", lambda *a: {}),),
-    "first push": (("estimation.pads.first_push", lambda t, net, carry, touch: touch),),
+    "landing": (("estimation.observations.landing", lambda *a: None),),
 }
 
 

@@ -55,10 +55,10 @@ class Scene:
         """Read a damaged file as its kind is read."""
         from estimation.report import read_actual
         from hmmseg.contact.decompose import decompose
-        from hmmseg.io.inspect import inspect
+        from hmmseg.hand.inspect import inspect
+        from hmmseg.hand.read import read_trial
         from hmmseg.io.rig import read_rig
         from hmmseg.io.task import read_task
-        from hmmseg.io.trial import read_trial
         from hmmseg.sequence.model import load_model
         from simgap.world.properties import read_properties
 
@@ -157,7 +157,7 @@ def _lab() -> dict[str, bytes]:
 
 def _model(folder: Path, task: SequenceTask) -> bytes:
     """A model of a plain ordered task, written to its place."""
-    from hmmseg.io.trial import read_trial
+    from hmmseg.hand.read import read_trial
     from hmmseg.sequence.fit import fit_sequence
     from hmmseg.sequence.model import save_model
 

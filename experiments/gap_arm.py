@@ -19,9 +19,9 @@ from experiments.gap_recordings import summary
 from experiments.recordings import read_case
 from experiments.saving import save
 from experiments.table_text import load, markdown
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
-from hmmseg.io.trial import read_trial
 
 RESULT = Path(__file__).parent / "results" / "gap_arm.json"
 # What was done to each set, and so what a fair answer is.

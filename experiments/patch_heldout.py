@@ -16,9 +16,9 @@ from typing import Any
 
 from experiments.saving import save
 from experiments.table_text import RESULTS, load, markdown
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 from simgap.patch import files, reproduced

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from estimation.report import read_actual
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """What makes a choice among the changes of plain sequences probable: learned on drawn worlds.
 
 By maximum likelihood of the true boundaries, whose density is the mixture over courses and choices that
-`hmmseg segment` answers with (hmmseg.sequence.naming.Weighing): first without labels, then, for how far
+`hmmseg segment` answers with (hmmseg.sequence.courses.Weighing): first without labels, then, for how far
 boundaries lie off a change once labels have told by how much, of the other trials with one of them labelled.
 """
 
@@ -15,10 +15,17 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit
 
 from experiments.sequence_worlds import World
-from hmmseg.sequence.courses import COARSE_CELLS, Course, coarse, find_courses
+from hmmseg.sequence.courses import (
+    COARSE_CELLS,
+    Course,
+    Weighing,
+    coarse,
+    find_courses,
+    naming,
+    probabilities,
+)
 from hmmseg.sequence.features import feature_map, features
-from hmmseg.sequence.labels import shares
-from hmmseg.sequence.naming import Weighing, naming, probabilities
+from hmmseg.sequence.fit import shares
 
 START = (4.0, -3.0, 0.1, -5.0, -3.0)  # numerics: where the search begins, as `weighing_of` takes it
 

@@ -78,6 +78,26 @@ def draw(seed: int, alike: float | None = None) -> World:
     return World(SequenceTask(tuple(f"s{k}" for k in range(num_states))), trials, boundaries)
 
 
+def abrupt(seed: int) -> World:
+    """Levels that jump between two samples, with white noise; one state is brief."""
+    rng = np.random.default_rng(seed)
+    num_states, num_trials, num_channels = (int(rng.integers(*ends)) for ends in ((3, 7), (1, 5), (1, 4)))
+    rate, sd = float(rng.choice([50.0, 100.0, 200.0])), rng.choice([0.02, 0.05, 0.15, 0.3])
+    steps = rng.normal(size=(num_states, num_channels))
+    steps *= rng.uniform(1, 3, (num_states, 1)) / np.linalg.norm(steps, axis=1, keepdims=True)
+    levels, means = steps.cumsum(axis=0), rng.uniform(0.5, 3.0, num_states)
+    means[rng.integers(1, num_states - 1)] = rng.uniform(0.08, 0.25)
+    trials, boundaries = [], []
+    for i in range(num_trials):
+        ends = np.cumsum(means * rng.lognormal(0, 0.15, num_states))
+        t = np.arange(0, ends[-1], 1 / rate)
+        state = np.minimum(np.searchsorted(ends, t, side="right"), num_states - 1)
+        values = levels[state] + sd * rng.normal(size=(t.size, num_channels))
+        trials.append(Trial(f"trial_{i}.csv", t, {f"c{c}": values[:, c] for c in range(num_channels)}))
+        boundaries.append(ends[:-1])
+    return World(SequenceTask(tuple(f"s{k}" for k in range(num_states))), trials, boundaries)
+
+
 def _phases(rng: np.random.Generator) -> np.ndarray:
     """Shares of a state's duration that its phases take; mostly one."""
     return rng.dirichlet(np.full(rng.choice([1, 2, 3], p=[0.5, 0.3, 0.2]), 3.0))

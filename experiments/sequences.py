@@ -6,7 +6,7 @@
 `check` segments drawn worlds (experiments/sequence_worlds.py), and published snap assemblies and a simulated
 arm's wrist signals where their folders are given: without labels; with the one boundary that the tool asks
 for; with one labelled trial. Writes experiments/results/sequences.json. `learn` finds what weighs readings
-(hmmseg.sequence.naming.Weighing) by maximum likelihood on other drawn worlds.
+(hmmseg.sequence.courses.Weighing) by maximum likelihood on other drawn worlds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments.real import hiro_snap
 from experiments.saving import save
-from experiments.sequence_worlds import World, draw
+from experiments.sequence_worlds import World, abrupt, draw
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation, most_telling
@@ -46,11 +46,12 @@ class Case:
 
 
 def drawn(first: int, count: int) -> list[Case]:
-    """Worlds drawn anew."""
+    """Worlds drawn anew, of many kinds and of abrupt changes alone."""
     cases = []
-    for seed in range(first, first + count):
-        world = draw(seed)
-        cases.append(Case(f"world {seed}", "drawn", world, tuple(range(len(world.task.sequence) - 1))))
+    for group, make in (("drawn", draw), ("abrupt", abrupt)):
+        for seed in range(first, first + count):
+            world = make(seed)
+            cases.append(Case(f"{group} {seed}", group, world, tuple(range(len(world.task.sequence) - 1))))
     return cases
 
 
@@ -139,7 +140,7 @@ def score(case: Case, found: list[Segmentation], without: int | None = None) -> 
             told = [(p.time, p.probability) for p in span.alternatives] or [(span.start, 1.0)]
             near = [abs(time - truth[b]) <= 0.03 * length for time, _ in told]
             rows.append({
-                "error": (span.start - truth[b]) / length, "seconds": span.start - truth[b],
+                "error": (span.start - truth[b]) / length, "samples": (span.start - truth[b]) * trial.rate,
                 "in_90": bool(span.start_90[0] <= truth[b] <= span.start_90[1]),
                 "width": (span.start_90[1] - span.start_90[0]) / length,
                 "told": [[p, bool(n)] for (_, p), n in zip(told, near, strict=True)],
@@ -163,6 +164,7 @@ def summary(scores: list[dict]) -> dict:
             reliability.append({"said": said, "true": true, "count": int(inside.sum())})
     return {
         "boundaries": len(rows), "median": float(np.median(error)), "right": float((error <= 0.03).mean()),
+        "within_a_sample": float(np.mean([abs(row["samples"]) <= 1 for row in rows])),
         "coverage_90": float(np.mean([row["in_90"] for row in rows])),
         "width": float(np.median([row["width"] for row in rows])),
         "listed": float(np.mean([any(n for _, n in row["told"]) for row in rows])),

@@ -60,3 +60,22 @@ def check() -> str | None:
         f"Code of {found['made_by']}."
     )
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+
+
+def changed() -> str | None:
+    """What changed of a servo."""
+    found = load("sts3215")
+    if found is None:
+        return None
+    rows = []
+    for one in found["figures"]:
+        low, high = (100 * v for v in one["interval_90"])
+        share = f"{100 * one['hits'] / one['of']:.0f} % ({low:.0f} to {high:.0f})"
+        rows.append([one["figure"], f"{one['hits']} of {one['of']}", share, one["goal"]])
+    seconds = sorted(c["seconds"] for c in found["cases"])
+    note = (
+        f"{len(found['cases'])} cases, {found['drawn']} of a kind at most, of part `{found['part']}` of the "
+        f"configurations, seed {found['seed']}; in brackets 90 % intervals. Processor time a case: "
+        f"{seconds[len(seconds) // 2]:.0f} s. Code of {found['made_by']}."
+    )
+    return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"

@@ -142,30 +142,6 @@ def _draw_lengths(rows: list[dict]) -> None:
     plt.close(figure)
 
 
-def solvers() -> str | None:
-    """docs/benchmarks.md: which solver for which problem."""
-    found = load("benchmark_solvers")
-    if found is None:
-        return None
-    rows = []
-    for problem, of in found["problems"].items():
-        for name, row in of["solvers"].items():
-            rows.append([f"{problem} ({of['number']})", name, *(f"{row[k]:.3f} s" for k in TIMES),
-                         f"{row['above_best']:.1e}"])  # fmt: skip
-    head = [
-        "problem (how many)",
-        "solver",
-        "first call",
-        "from the disk's cache",
-        "warm",
-        "cost above the best",
-    ]
-    return markdown(head, rows) + f"\n\nRecording: {found['recording']}; code of {found['made_by']}."
-
-
-TIMES = ("first", "cached", "warm")
-
-
 def watch() -> str | None:
     """docs/watch.md: what `make bench-watch` measured."""
     found = load("watch")

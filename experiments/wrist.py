@@ -28,10 +28,10 @@ from experiments.scoring import (
 from experiments.table_text import RESULTS, load, markdown, milliseconds, percent
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import Rig, parse_rig, read_rig
 from hmmseg.io.table import Table
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 
 ARM = Path("../shared/panda")

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hmmseg.io.gripper import direction
-from hmmseg.io.rig import Rig, parse_rig
+from hmmseg.io.rig import Rig, direction, parse_rig
 from hmmseg.io.task import parse_task
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
@@ -29,7 +28,7 @@ TASK = parse_task({
 
 @dataclass(frozen=True)
 class Setup:
-    """How a lab has it: see hmmseg.io.gripper for the names."""
+    """How a lab has it: see hmmseg.io.rig for the names."""
 
     mass: float = 0.7
     reaction: bool = False

@@ -113,10 +113,10 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/benchmarks.md", "batch", table_speed.batch, "bench-batch"),
     ("docs/virtual_model.md", "haptic", table_speed.haptic, "bench-haptic"),
     ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
-    ("docs/benchmarks.md", "solvers", table_speed.solvers, "bench-solvers"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
     ("docs/robots_results.md", "minute", table_robots.minute, "bench-robot"),
     ("docs/robots_results.md", "robots_check", table_robots.check, "robots-check"),
+    ("docs/robots_results.md", "sts3215", table_robots.changed, "sts3215"),
     ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
     ("docs/sequences.md", "sequences", table_sequences.table, "sequences"),
 )

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hmmseg.errors import InputError
-from hmmseg_cli.memory import keep_freed_memory
+from hmmseg_cli.process import keep_freed_memory
 
 if TYPE_CHECKING:
     from hmmseg.io.rig import Rig
@@ -82,7 +82,7 @@ def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
 
 def segment_each(paths: Sequence[Path], task: Path, rig: Path) -> list[Segmented]:
     """Segmentations of recordings that have nothing to do with each other; runs in a worker."""
-    from hmmseg.io.trial import read_trial
+    from hmmseg.hand.read import read_trial
     from hmmseg.segmentation.align import segment
 
     description, hand = _lab(task, rig)
@@ -98,10 +98,10 @@ def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
     advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
-    """What `segment_each` finds, in the order of the paths; `advance` is told how many more are done.
+    """What `segment_each` finds, in the order of the paths; `advance` gets how many more are done.
 
     A recording whose worker is lost is segmented again by itself; if that worker is lost too it is left out,
-    and `tell` is told. InputError where a recording or the cluster is at fault; what has not begun then is
+    and `tell` says so. InputError where a recording or the cluster is at fault; what has not begun then is
     not begun.
     """
     left = [paths[i : i + CHUNK] for i in range(0, len(paths), CHUNK)]
@@ -129,7 +129,7 @@ def segment_apart(
 
 
 def _alone(path: Path, lab: tuple[Path, Path], tell: Callable[[str], None]) -> Segmented | None:
-    """A recording segmented in a process of its own; None, which `tell` is told, where that is lost too."""
+    """A recording segmented in a process of its own; None, which `tell` reports, where that is lost too."""
     with _executor(1, None) as executor:
         found = _unless_lost(executor.submit(segment_each, [path.absolute()], *lab))
     if found is None:

@@ -148,7 +148,7 @@ class Output:
         self._cleanup.close()
 
     def print(self, *renderables: Any, whole: bool = False) -> None:
-        """Show tables or text to people: standard output, or standard error beside `--json -`.
+        """Show tables or text to people: standard output, or standard error where `--json -` takes that.
 
         `whole`: lines are not wrapped, as somebody copies them.
         """
@@ -176,7 +176,7 @@ class Output:
     @contextlib.contextmanager
     def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
         """A progress bar on standard error; yields a function that advances it by so many steps, and says
-        what is going on where it is told."""
+        what is going on where that is known."""
         from rich.progress import Progress
 
         with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
@@ -271,7 +271,7 @@ TASK_KEYS = {"objects", "moves", "sequence"}  # without any of which there is no
 
 
 def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
-    """Task and rig of these trials: as given, else task.toml and rig.toml beside the first of them.
+    """Task and rig of these trials: as given, else task.toml and rig.toml in the folder of the first.
 
     InputError where there is no task, or where each is given as the other.
     """
@@ -281,7 +281,7 @@ def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tu
     if found[0] is None:
         raise InputError("--task", "missing", f"the task's description, or a task.toml in {folder}")
     as_task, as_rig = (_keys(path) for path in found)
-    if "sequence" in as_task:  # needs no hand, and another task's may lie beside its trials
+    if "sequence" in as_task:  # needs no hand, and another task's may lie in its folder
         found[1] = rig
     if as_task and not as_task & TASK_KEYS and (task is not None or as_rig & TASK_KEYS):
         swapped = f"; are --task and --rig {found[1]} swapped?" if as_rig & TASK_KEYS else ""
@@ -313,7 +313,7 @@ def _keys(path: Path | None) -> set[str]:
 
 def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any = None) -> list[Any]:
     """The trials of a command; what is unlikely about them is warned of."""
-    from hmmseg.io.trial import read_trial
+    from hmmseg.hand.read import read_trial
 
     found = [read_trial(path, rig, task) for path in paths]
     if rig is not None and rig.effects and out.command != "simulate":
@@ -367,7 +367,7 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
 
 
 def _publish(staged: dict[Path, Path]) -> None:
-    """Copy beside each destination first, then rename: nobody sees half a file, nor a copy after Ctrl-C."""
+    """Copy next to each destination first, then rename: nobody sees half a file, nor a copy after Ctrl-C."""
     beside: dict[Path, Path] = {}
     destination = Path()
     try:

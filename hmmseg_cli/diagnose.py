@@ -36,6 +36,7 @@ from hmmseg_cli.diagnose_robot import (
     OwnSimulator,
     PatchOption,
     SimulatorOption,
+    compare_robot,
     diagnose_robot,
 )
 from simgap.report.finding import plain_name, sentence, settles, tables
@@ -47,14 +48,16 @@ BLOCKS = "Blocks against the virtual model (what --task and --rig describe)"
 GIVEN = "Recordings against simulated trials of your own"
 EXAMPLES = """hmmseg diagnose trial_*.csv --report gap.html
 hmmseg diagnose log_*.csv --mjcf robot.xml --map map.toml --report gap.html --patch corrected/
+hmmseg diagnose new_*.csv --healthy old_*.csv --mjcf robot.xml --map map.toml
 hmmseg diagnose trial_*.csv --against simulated/trial_*.csv"""
 
 ActualOption = Annotated[Path | None, typer.Option(
     "--actual", metavar="A", rich_help_panel=BLOCKS,
     help="Properties measured apart from the trials (TOML).")]  # fmt: skip
 HealthyOption = Annotated[list[Path] | None, typer.Option(
-    "--healthy", metavar="TRIAL...", rich_help_panel=BLOCKS,
-    help="Recordings known to be healthy, the best null there is; healthy twins are simulated otherwise.",
+    "--healthy", metavar="TRIAL...",
+    help="Recordings known to be healthy, the best null there is; healthy twins are simulated otherwise. "
+    "With a model of a robot: its logs of before; what changed since is sought.",
 )]  # fmt: skip
 AgainstOption = Annotated[list[Path] | None, typer.Option(
     "--against", metavar="SIM...", rich_help_panel=GIVEN,
@@ -115,6 +118,10 @@ def diagnose(
         own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
+            if healthy:
+                refuse("does not go with --healthy and a model", {"--effect": effect, "--task": task})
+                compare_robot(out, paths, distinct_trials(healthy), own)
+                return
             diagnose_robot(out, paths, own, task, effect or [])
             return
         task, rig = described(paths, task, rig)
@@ -270,7 +277,7 @@ def _show(
     measured=None,
     shows: dict[str, str] | None = None,
 ) -> None:
-    """Figures where asked for, and the page, from the body alone; `signal` draws the recorded one."""
+    """Figures where wanted, and the page, from the body alone; `signal` draws the recorded one."""
     from hmmseg.contact.decompose import subtasks
     from hmmseg_cli.pages import Setting, page
     from simgap.report.figures import draw_all, draw_how_far

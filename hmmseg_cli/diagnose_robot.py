@@ -13,6 +13,7 @@ from rich.table import Table
 from hmmseg.errors import InputError
 from hmmseg_cli.console import Output, check_folder
 from simgap.report.finding import sentence
+from simgap.report.finding import tables as usual_tables
 
 if TYPE_CHECKING:
     from simgap.robots.diagnose import RobotDiagnosis
@@ -189,10 +190,86 @@ def diagnose_robot(
     out.finish(document)
 
 
+def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], own: OwnSimulator) -> None:
+    """What changed of a robot since its `healthy` logs: table, figure, page, patch and document."""
+    from simgap.progress import heard
+    from simgap.robot_effects import UNMEASURED, effects_of
+    from simgap.robots.changes import STAGES, changes
+
+    every = [*paths, *healthy]
+    if own.simulator is not None:
+        from simgap.simulators.recording import read_recording
+        from simgap.simulators.user import load_simulator
+
+        simulator = load_simulator(own.simulator)
+        commands = [n for n, c in simulator.channels.items() if c.kind == "command"]
+        logs = [read_recording(path, list(simulator.channels), commands=commands) for path in every]
+        effects = effects_of(simulator, logs)
+    else:
+        from simgap.simulators.mjcf.load import load_mjcf
+
+        assert own.mjcf is not None and own.map_file is not None
+        loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
+        logs, simulator = [loaded.read(path) for path in every], loaded.simulator
+        for warning in loaded.warnings:
+            out.warn(warning)
+        effects = effects_of(simulator, logs, loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
+    for warning in (w for log in logs for w in log.warnings):
+        out.warn(warning)
+    stage = "comparing"
+
+    def tell(text: str) -> None:
+        nonlocal stage
+        stage = text
+        advance(1, text)
+
+    with out.progress(stage, total=STAGES) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
+        found = changes(simulator, logs[len(paths) :], logs[: len(paths)], effects, tell=tell)
+    document = found.body()
+    for b in document["broken"]:
+        out.warn(f"{b['trial']}: {b['channel']} is {b['value']:.4g} at {b['time']:.3f} s, left out")
+    out.print(changed(document), *usual_tables(document))
+    if out.figures is not None or out.report is not None:
+        from hmmseg_cli.gap_figures import draw_changes
+
+        if out.figures is not None:
+            draw_changes(found, out.figure("changes.png"))
+        if out.report is not None:
+            from hmmseg_cli.pages import Setting, page
+
+            shows = {n: e.says for n, e in effects.items()}
+            setting = Setting(
+                [log.name for log in logs[: len(paths)]], ["all"], shows=shows, warnings=out.warnings
+            )
+            text = page(document, setting, lambda path: draw_changes(found, path("gap_signal.png")))
+            out.stage(out.report).write_text(text, encoding="utf-8")
+    if own.patch is not None:
+        from simgap.robots.patch import write_patch
+
+        folder, causes = own.patch, document["causes"]
+        point = {n: v for n, v in found.point().items() if not found.composed.numeric(n)}
+        write_patch(found.composed, point, document, causes, own.mjcf, lambda name: out.stage(folder / name))
+    out.finish(document)
+
+
+def changed(document: Mapping[str, Any]) -> str:
+    """The verdict on two sets of logs in a paragraph."""
+    p = document["detection"]["p_value"]
+    if document["verdict"] == "none":
+        return "Nothing changed that these logs can tell: the new ones are met as the old ones are."
+    if document["verdict"] == "unknown":
+        best = "".join(f" The best that is known, {text}, leaves too much." for text in document["changes"])
+        over = document["remainder"]["rms_over_noise"]
+        return f"Something changed that no known cause explains: {over:.2g} times what old logs leave.{best}"
+    lines = [f"Changed: {'; '.join(document['changes'])} (p = {p:.2g} that nothing did)."]
+    if document["verdict"] == "set":
+        others = ", ".join(document["indistinguishable"]) or "the same in other parts"
+        lines.append(f"These logs cannot tell it from a change of {others}.")
+    return " ".join(lines)
+
+
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
-    from simgap.report.finding import tables as usual
-
     out = []
     unseen = document["identifiability"]["unseen"]
     alike = document["identifiability"]["alike"]
@@ -204,7 +281,7 @@ def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
         if unseen:
             table.add_row(", ".join(unseen[:8]), "cannot be seen")
         out.append(table)
-    out += usual(dict(document))
+    out += usual_tables(dict(document))
     if document["shrinkage"] is not None:
         rms = Table(title=f"residual on {document['shrinkage']['evaluated_on']}, rms", title_justify="left")
         for head in ("channel", "before", "after", "noise"):

@@ -1,9 +1,16 @@
-"""`hmmseg fit`: learn the emissions and durations of a plain ordered task from trials."""
+"""`hmmseg fit`: learn the emissions and durations of a plain ordered task from trials.
+
+`--labels`, what is known of some boundaries of some trials, is a folder with NAME.json for trials,
+{"boundaries": [times in s, null where unknown]}; one JSON file, {NAME: {subtask: its start in s}}; or a CSV
+file with the columns trial, subtask and start.
+"""
 
 from __future__ import annotations
 
+import csv
+import json as jsonlib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -22,7 +29,6 @@ from hmmseg_cli.console import (
     distinct_trials,
     read_trials,
 )
-from hmmseg_cli.known import read_labels_given
 
 LabelsOption = Annotated[Path | None, typer.Option(
     "--labels", metavar="FILE|DIR",
@@ -45,7 +51,7 @@ def fit(
                              "a task with `sequence`")  # fmt: skip
         from hmmseg.sequence.fit import fit_sequence
         from hmmseg.sequence.model import save_model
-        from hmmseg.sequence.places import SURE
+        from hmmseg.sequence.segment import SURE
 
         hand = None
         if rig is not None:
@@ -70,3 +76,81 @@ def fit(
                 f"{', '.join(doubtful)}; hmmseg segment says where else, and which label would decide"
             )
         out.finish({"model": str(model), "trials": [str(p) for p in paths], "labelled": sorted(known)})
+
+
+COLUMNS = ("trial", "subtask", "start")
+
+
+def read_labels_given(where: Path, names: list[str]) -> dict[str, Any]:
+    """Labels by the names of trials, as hmmseg.sequence.fit takes them; InputError for what is amiss."""
+    if where.is_dir():
+        return _folder(where, names)
+    if not where.is_file():
+        raise InputError(f"--labels {where}", "no such file or folder", "a folder, a .json or a .csv file")
+    if where.suffix.lower() not in (".csv", ".json"):
+        raise InputError(f"--labels {where}", f"ends in {where.suffix!r}", ".csv, .json or a folder")
+    found = _csv(where) if where.suffix.lower() == ".csv" else _json(where)
+    stems = {Path(name).stem: name for name in names}
+    out: dict[str, Any] = {}
+    for given, known in found.items():
+        name = stems.get(given) or stems.get(Path(given).stem)
+        if name is None:
+            raise InputError(str(where), f"labels {given!r}, which is none of the trials",
+                             f"one of {', '.join(stems)}")  # fmt: skip
+        out[name] = known
+    return out
+
+
+def _folder(folder: Path, names: list[str]) -> dict[str, Any]:
+    paths = {name: folder / f"{Path(name).stem}.json" for name in names}
+    out = {name: _boundaries(path) for name, path in paths.items() if path.exists()}
+    if not out:
+        expected = ", ".join(path.name for path in list(paths.values())[:3])
+        raise InputError(f"--labels {folder}", "has labels for none of the trials", f"files like {expected}")
+    return out
+
+
+def _boundaries(path: Path) -> list[float | None]:
+    try:
+        given = jsonlib.loads(path.read_text(encoding="utf-8"))["boundaries"]
+        return [None if each is None else float(each) for each in given]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise InputError(str(path), "cannot be read", '{"boundaries": [times in s]}') from None
+
+
+def _json(path: Path) -> dict[str, Any]:
+    expected = '{"trial": {"subtask": start in s}}'
+    try:
+        given = jsonlib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(str(path), "cannot be read", expected) from None
+    if (
+        not isinstance(given, dict)
+        or not given
+        or not all(isinstance(v, dict | list) for v in given.values())
+    ):
+        raise InputError(str(path), "is no table of trials", expected)
+    return given
+
+
+def _csv(path: Path) -> dict[str, dict[str, float]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = list(csv.DictReader(file, skipinitialspace=True))
+    except (OSError, UnicodeDecodeError, csv.Error):
+        raise InputError(str(path), "cannot be read", "a table with trial, subtask, start") from None
+    missing = [name for name in COLUMNS if not rows or name not in rows[0]]
+    if missing:
+        found = "has no rows" if not rows else f"has no column {missing[0]}"
+        raise InputError(str(path), found, "the columns trial, subtask, start")
+    out: dict[str, dict[str, float]] = {}
+    for number, row in enumerate(rows, 2):
+        trial, subtask, start = ((row[name] or "").strip() for name in COLUMNS)
+        try:
+            time = float(start)
+        except ValueError:
+            raise InputError(f"{path}, line {number}", f"start {start!r}", "a time in s") from None
+        if subtask in out.setdefault(trial, {}):
+            raise InputError(f"{path}, line {number}", f"labels {subtask} of {trial} again", "one start each")
+        out[trial][subtask] = time
+    return out

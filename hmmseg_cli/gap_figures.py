@@ -15,7 +15,9 @@ from simgap.gap.diagnose import Diagnosis
 from simgap.gap.frame import CHANNELS
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.generic.trials import SLOW, bin_edges
+from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
+from simgap.robots.linear import base_at
 
 LABELS = {
     "x": "x [cm]",
@@ -140,7 +142,7 @@ def draw_robot(drawn: Drawn, path: Callable[[str], Path]) -> None:
 
 
 def draw_robot_page(drawn: Drawn, path: Callable[[str], Path]) -> None:
-    """Those that a page shows beside its own tables."""
+    """Those that a page shows next to its own tables."""
     draw_windows(drawn, path("gap_signal.png"))
     draw_before_after(drawn, path("gap_before_after.png"))
 
@@ -244,10 +246,7 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
     at = np.arange(len(logs))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
-        for place, residual, colour, name in (
-            (-0.2, before, RED, "before"),
-            (0.2, after, BLUE, "after"),
-        ):
+        for place, residual, colour, name in ((-0.2, before, RED, "before"), (0.2, after, BLUE, "after")):
             each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
             axes.bar(at + place, each, 0.4, color=colour, label=name)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
@@ -256,3 +255,22 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         axes.set_title("Held-out logs" if found.shrinkage is not None else "All logs")
+
+
+def draw_changes(found: Changes, path: Path) -> None:
+    """Recorded, the model of the old logs, and with what changed, in the new log that parts most."""
+    rows, point = found.composed.rows, found.null.point
+    runs = [base_at(found.composed, p).rows for p in (point, found.point())]
+    size = np.sqrt(rows.variance)
+    log = int(np.bincount(rows.log, ((rows.observed - runs[0]) / size) ** 2).argmax())
+    with canvas(path, height=1.2 + 1.5 * len(rows.channels)) as figure:
+        axes = np.atleast_1d(figure.subplots(len(rows.channels), 1, sharex=True))
+        for c, (name, ax) in enumerate(zip(rows.channels, axes, strict=True)):
+            mine = (rows.log == log) & (rows.channel == c)
+            ax.plot(rows.time[mine], rows.observed[mine], color="black", lw=1.2, label="recorded")
+            for run, colour, label in zip(runs, (RED, BLUE), ("as it was", "with what changed"), strict=True):
+                ax.plot(rows.time[mine], run[mine], color=colour, lw=0.8, label=label)
+            ax.set_ylabel(f"{name} [{found.composed.simulator.channels[name].unit}]")
+        axes[0].legend(fontsize=6.5)
+        axes[0].set_title(f"{_short(found.composed.recordings[log].name)}, run freely from its first sample")
+        axes[-1].set_xlabel("time [s]")

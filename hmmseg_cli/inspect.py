@@ -29,7 +29,7 @@ def inspect(
     seed: UnusedSeed = 0, quiet: QuietOption = False,
 ) -> None:  # fmt: skip
     """What is in a recording, and the [columns] or [topics] that would read it."""
-    from hmmseg.io.inspect import inspect as look
+    from hmmseg.hand.inspect import inspect as look
 
     with Output("inspect", json=json, seed=seed, quiet=quiet) as out:
         if write is not None:

@@ -35,8 +35,7 @@ from hmmseg_cli import (
     watch,
 )
 from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
-from hmmseg_cli.interrupts import heard
-from hmmseg_cli.memory import keep_freed_memory
+from hmmseg_cli.process import heard, keep_freed_memory
 
 # numerics: objects between two garbage collections: most are modules' and compilers', which stay anyway
 COLLECTED = 10_000

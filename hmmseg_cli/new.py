@@ -46,7 +46,7 @@ def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = No
         if mjcf is not None:
             out.finish({"files": [_map(out, folder / "map.toml", mjcf, source)], "hand": None})
             return
-        from hmmseg.io.inspect import inspect as look
+        from hmmseg.hand.inspect import inspect as look
 
         looked = None if source is None else look(source)
         targets = [folder / "rig.toml", folder / "task.toml"]
@@ -102,8 +102,8 @@ def _seen(hand: Hand | None, looked: Any) -> tuple[Hand, float]:
 
 
 def _map(out: Output, path: Path, mjcf: Path, source: Path | None) -> str:
-    """Lay out a map.toml: columns of a log beside the parts of a model whose names they hold."""
-    from hmmseg.io.inspect import inspect as look
+    """Lay out a map.toml: columns of a log with the parts of a model whose names they hold."""
+    from hmmseg.hand.inspect import inspect as look
     from simgap.simulators.mjcf.map import proposed_map
 
     if source is None:

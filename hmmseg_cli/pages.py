@@ -170,7 +170,7 @@ SHARES = (
 
 @dataclass(frozen=True)
 class Setting:
-    """What a page tells beside the body: recordings, subtasks in order, the rig's pads, what was measured,
+    """What a page shows besides the body: recordings, subtasks in order, the rig's pads, what was measured,
     and how each effect would show.
     """
 

@@ -8,14 +8,15 @@ from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.formats.delimited import units_of
+from hmmseg.io.formats.delimited import COMMENTS, SPACES, cells_of, separator_of, units_of
+from hmmseg.io.table import check_unique
 from hmmseg.io.units import LARGEST, LATEST, si_factor
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
 
 WHERE = "standard input"
-COMMENTS = (b"#", b"%", b"//")
+COMMENT = tuple(sign.encode() for sign in COMMENTS)
 
 
 def _text(line: bytes) -> str:
@@ -33,19 +34,18 @@ class Rows:
     """
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
-        from hmmseg.io.columns import Column, source_of
+        from hmmseg.io.units import Column, source_of
 
         self._stream, self._number = stream, 0
         header = _text(self._line()).strip()
         if not header:
             raise InputError(WHERE, "is empty", "a CSV header with a column t, then rows")
-        self._separator = max(",;\t", key=header.count)
+        self._separator = separator_of(header)
+        self._between = None if self._separator == SPACES else self._separator
         self._first = True
         self._start: datetime | None = None  # of ISO stamps
-        names = [name.strip().strip('"') for name in header.split(self._separator)]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"{WHERE}: column {name}", "appears twice", "one of each name")
+        names = [name.strip() for name in cells_of(header, self._separator)]
+        check_unique(names, WHERE)
         self._num, self._names, self._picked, self._scales = len(names), names, [], []
         self._unstated: list[int] = []  # of what the rig says no unit
         columns = watcher.filter.rig.columns
@@ -70,10 +70,10 @@ class Rows:
         line = self._line()
         if not line:
             return None
-        cells = line.decode("ascii", "replace").rstrip("\r\n").split(self._separator)
+        cells = line.decode("ascii", "replace").rstrip("\r\n").split(self._between)
         if self._first:
             self._first = False
-            if self._take_units(_text(line).rstrip("\r\n").split(self._separator)):
+            if self._take_units(cells_of(_text(line).rstrip("\r\n"), self._separator)):
                 return self.next()
         if len(cells) != self._num:
             raise InputError(
@@ -102,7 +102,7 @@ class Rows:
         """The next line that is no comment and not empty; nothing at the stream's end."""
         while line := self._stream.readline():
             self._number += 1
-            if line.strip() and not line.lstrip().startswith(COMMENTS):
+            if line.strip() and not line.lstrip().startswith(COMMENT):
                 break
         return line
 

@@ -148,15 +148,14 @@ def _segment_apart(
 
 def _on_disk(paths: Sequence[Path], task: BlockTask, rig: Rig) -> bool:
     """Whether recordings are of a repeated task and too long to be read at once."""
-    from hmmseg.io.long import is_long
+    from hmmseg.hand.read import is_long
 
     return task.repeat != 1 and rig.gripper is None and all(is_long(path) for path in paths)
 
 
 def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig) -> list[Segmentation]:
     """Each recording by itself, from disk; what cannot be is judged by its beginning."""
-    from hmmseg.hand.plausibility import check
-    from hmmseg.io.long import LongRecording
+    from hmmseg.hand.read import LongRecording, check
     from hmmseg.segmentation.align import segment_long
 
     found = []

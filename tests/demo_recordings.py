@@ -1,9 +1,9 @@
 """The recordings that come with the package, as tests read them: a rig, its task and four trials."""
 
 from hmmseg.example import example_folder
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import read_trial
 
 FOLDER = example_folder()
 RIG, TASK = read_rig(FOLDER / "rig.toml"), read_task(FOLDER / "task.toml")

@@ -6,9 +6,9 @@ import re
 import tomllib
 from pathlib import Path
 
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig, parse_rig, read_rig
-from hmmseg.io.trial import read_trial
 
 FOLDER = Path(__file__).resolve().parents[1] / "recordings/none_1"
 JOINTED = read_rig(FOLDER / "rig.toml")

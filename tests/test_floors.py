@@ -38,3 +38,18 @@ def test_an_upward_import_is_seen():
     assert upward("hmmseg", "def f():\n    from estimation.priors import x\n") == {"estimation"}
     assert upward("hmmseg", "import simgap.world.hand as h, hmmseg.io.task") == {"simgap"}
     assert upward("simgap", "from hmmseg import task\nimport estimation") == set()
+
+
+ROOMS = ("online", "sequence", "segmentation", "hand", "contact", "io")  # of hmmseg, from the top down
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_within_hmmseg_run_downwards(room):
+    """`Trial.read` alone looks up, to what judges a hand's recording: it is where users look for it."""
+    above = {f"hmmseg.{name}" for name in ROOMS[: ROOMS.index(room)]}
+    for path in sorted((ROOT / "hmmseg" / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                seen = ".".join(node.module.split(".")[:2])
+                allowed = path.name == "trial.py" and node.module == "hmmseg.hand.read"
+                assert seen not in above or allowed, f"{path.relative_to(ROOT)} imports {node.module}"

@@ -101,4 +101,4 @@ def test_what_is_imported_is_seen():
     assert top == {"numpy", "pillow"}
     assert anywhere == {"numpy", "pillow", "h5py"}
     assert requirement("dask[distributed]>=2024.8") == "dask"
-    assert requirement("arviz >=0.20,<1") == "arviz"
+    assert requirement("arviz >=0.20,<2") == "arviz"

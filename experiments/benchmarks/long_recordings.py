@@ -28,8 +28,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
+from hmmseg.hand.read import LongRecording
 from hmmseg.io.formats import kind_of, rows_of
-from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial

@@ -18,9 +18,9 @@ import numpy as np
 from estimation.report import Actual, read_actual
 from experiments.blind_check.sealing import code_digest
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.effects import name_of
 from simgap.gap.diagnose import Diagnosis, diagnose

@@ -505,6 +505,10 @@ def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str
     return f"no recorded move lifts {name} clear of its support"
 
 
+HIDDEN_GRIP = (
+    "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
+    "[gripper] would tell"
+)
 TOUCHED = "from the opening at which the pads touch, as what they give under the grip is not measured"
 
 
@@ -514,8 +518,6 @@ def revealed_by(found: Decomposition, rig: Rig) -> Decomposition:
     A fingertip hand reveals all; a gripper with a wrist sensor alone has the sum of both fingers' forces,
     which leaves weight, height and friction on a support as they are.
     """
-    from hmmseg.hand.wrist import HIDDEN_GRIP  # NumPy takes long to import
-
     if rig.gripper is None or rig.gripper.grip_known:
         return found
     properties = {}

@@ -1,7 +1,7 @@
 """The contact equations of a two-finger grip.
 
 Emissions, observations of properties and residuals of the gap are built from these. The inertia of a
-carried block alone is written again, where it is compiled: in `hmmseg.online` and `simgap.gap.residuals`.
+carried block alone is written again, where it is compiled: in `simgap.gap.residuals`.
 
 Quasistatic balance of the block and linear pads, per sample (x right, y up, finger 1 left; F what a
 fingertip exerts; paper, Sections 2 and 3.3, with the block's inertia and the pads' compliance, which it

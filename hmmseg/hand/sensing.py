@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmmseg.hand.plausibility import Finding, all_changed, check_forces, scale_to_velocity
 from hmmseg.hand.tool import Tool
-from hmmseg.io.plausibility import Finding, all_changed, check_forces, position_pairs, scale_to_velocity
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
-from hmmseg.io.trial import Trial
+from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
 from hmmseg.robust import robust_sd, white_sd
@@ -51,8 +51,7 @@ def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
 
 def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     """A line where the tool's inertia is none of a gripper's, or another unit's times the stated one."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     found = abs(tool.inertia)
     stated = gripper.tool_mass
     likely = LIGHTEST < found < HEAVIEST if stated is None else _nearest(stated / found)[1] > np.log(2)

@@ -21,9 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.hand.kinematics import forward, jacobian
-from hmmseg.io.plausibility import position_pairs
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.io.trial import ROLL, Trial
+from hmmseg.io.trial import ROLL, Trial, position_pairs
 from hmmseg.robust import bridged
 from hmmseg.tables import Brief
 

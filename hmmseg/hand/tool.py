@@ -22,8 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.gripper import AXES, Gripper, direction
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE, TAIL
 from hmmseg.robust import bridged, robust_sd, white_sd
@@ -221,8 +220,7 @@ def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
 
 def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMotion:
     """What samples `free` (num_timesteps,) of a trial say of its tool."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     force = np.stack([bridged(c, trial.t) for c in wrench_of(trial, gripper).T], axis=1)
     force = smooth(trial.t, force, window=pose.window)[free]
     return FreeMotion(trial.t[free], force, _terms(pose, gripper, rig.gravity)[:, free], pose.window)
@@ -232,8 +230,7 @@ def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
     """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
     motion = free_motion(trial, rig, pose, free)
     tool = tool_of(trial.file, rig, motion, float(trial.t.mean()))
-    assert rig.gripper is not None
-    return replace(tool, centre_of_mass=_centre_of_mass(trial, rig.gripper, tool, free, motion.terms))
+    return replace(tool, centre_of_mass=_centre_of_mass(trial, rig.wrist, tool, free, motion.terms))
 
 
 def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool = True) -> Tool:
@@ -242,8 +239,7 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     `between`: what is to be read lies between samples of free motion. Else the offset's drift is carried on
     only where it shows clearly.
     """
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     where = f"{file}: columns {', '.join(gripper.wrench[:3])}"
     if motion.t.size < SAMPLES:
         raise InputError(where, "show no free motion to find the tool's own share from",
@@ -270,8 +266,7 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
 def _fit(rig: Rig, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool
          ) -> tuple[np.ndarray, _Fitted, float]:  # fmt: skip
     """Axes, the regression along them and the scale of what it leaves, robustly, in turns."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     weights = np.ones(len(force))
     for _ in range(ROUNDS):
         axes = _axes(gripper, weights, force, terms[0] + terms[1])
@@ -375,8 +370,7 @@ def _centre_of_mass(trial: Trial, gripper: Gripper, tool: Tool, free: np.ndarray
 
 def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     """What the tool does to its environment (num_timesteps, 3), in the world's axes [N]."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - tool.since)[:, None]
     moved, hung, dragged, jerk = _terms(pose, gripper, rig.gravity)
     own = tool.inertia * moved + tool.drag * dragged + tool.jerked * jerk

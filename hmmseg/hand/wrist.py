@@ -1,6 +1,6 @@
 """A gripper with a sensor in its wrist as the two fingers that the contact equations know.
 
-The wrist feels the sum of what both fingers do; each finger's half of it stands in the channels. What
+The wrist feels the sum of what both fingers do; each finger's channels hold half of it. What
 they press against each other with does not reach the wrist. Where no grip force is recorded, the
 pads' own spring tells it: their squeeze is the opening at which they touched less the one they are
 held at (`hmmseg.hand.opening`). That says when something is held, and where the touch lies within what
@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmmseg.contact.decompose import HIDDEN_GRIP
 from hmmseg.errors import InputError
+from hmmseg.hand.plausibility import REACH, Finding, all_changed, changed, length_unit
 from hmmseg.hand.sensing import tool_warnings
 from hmmseg.hand.signals import grouped
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
-from hmmseg.io.gripper import AXES, Gripper, direction
-from hmmseg.io.plausibility import REACH, Finding, all_changed, changed, length_unit
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import MOVED, SURE
 from hmmseg.robust import bridged, robust_sd, white_sd
@@ -202,8 +202,7 @@ CANCELLED = 0.05  # limit: share of either finger's way
 
 def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
     """Positions and openings in other units; an opening that does not change, or is one finger's."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     travels = {name: _travel(trial, name) for name in gripper.position.values()}
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
@@ -226,8 +225,7 @@ def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
 
 def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
     """Two fingers' ways of which one counts the other way: their sum stays while they move."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     if len(gripper.opening) < 2:
         return []
     first, second = (trial.channels[name] for name in gripper.opening)
@@ -242,8 +240,7 @@ def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
 
 def _one_finger(rig: Rig) -> list[Finding]:
     """An opening of one column that is named after one of two fingers."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     (name, *more) = gripper.opening
     entry = (rig.columns | rig.topics).get(name)
     if more or (entry is not None and entry.unit is not None):
@@ -260,8 +257,7 @@ def _travel(trial: Trial, name: str) -> float:
 
 def counts_closing(trial: Trial, rig: Rig) -> InputError:
     """The line for an opening that grows as the gripper closes."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     most = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
     name = gripper.opening[0]
     fields = changed(name, rig, sign=-1, offset=round(most, 4))
@@ -284,8 +280,7 @@ def goes_against(trial: Trial, rig: Rig) -> InputError:
 
 def borne_out(trial: Trial, rig: Rig, load: float) -> str:
     """The warning where a lift tells one sign and free motion the other: readings that go with the pose."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
     return (
         f"{where} bear {load:.3g} N of what is lifted, but go against the hand's own acceleration in free "
@@ -294,8 +289,7 @@ def borne_out(trial: Trial, rig: Rig, load: float) -> str:
 
 
 def _other_sign(trial: Trial, rig: Rig, problem: str) -> InputError:
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
     said = not gripper.reaction if gripper.reaction is not None else True
     return InputError(where, problem, f"reaction = {str(said).lower()} under [gripper]")
@@ -303,8 +297,7 @@ def _other_sign(trial: Trial, rig: Rig, problem: str) -> InputError:
 
 def points_down(trial: Trial, rig: Rig) -> InputError:
     """The line for an axis that counts downwards: what is lifted would go down."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     axis = gripper.up.lstrip("-")
     said = axis if gripper.up.startswith("-") else f"-{axis}"
     name = {str(each): name for each, name in gripper.position.items()}[axis]
@@ -315,8 +308,7 @@ def points_down(trial: Trial, rig: Rig) -> InputError:
 
 def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
     """The line for position columns of the wrong axes: what is carried would pull sideways."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     up, position = gripper.up.lstrip("-"), {str(axis): name for axis, name in gripper.position.items()}
     others = [axis for axis in AXES if axis != up and axis in position]
     across = gripper.closing if gripper.closing in others else others[0]
@@ -365,7 +357,7 @@ def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: n
 def contradiction(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, held: Held) -> InputError | None:
     """What to write where no grip lifts anything, None where no other reading explains it, as of slides.
 
-    An opening of the other sign makes free motion of what was held and is told by how much better the tool's
+    An opening of the other sign makes free motion of what was held and shows by how much better the tool's
     own share is then found; axes that are exchanged or reversed leave that as it is.
     """
     try:
@@ -461,14 +453,8 @@ LAG = 0.012
 TILT = 0.01  # chosen: rad; an arm whose orientation is not recorded holds its hand level by about as much
 SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a touch is known to a fifth of it
 CLIPPED = 2.0  # chosen: noise scales
-STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is told
+STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
 NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
-HIDDEN_GRIP = (
-    "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
-    "[gripper] would tell"
-)
-
-
 HALVES = (
     "columns fx1, fx2 and fy1, fy2 are the same in every sample, half of a wrist's force each: the grip is "
     "read from the fingers' distance instead"
@@ -501,8 +487,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
 
     `touch_sd` of the result [m]: how well the openings at which the pads touch are known.
     """
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     pose = pose_of(trial, gripper)
     opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
     pressing = grip_force_of(trial, gripper)
@@ -532,9 +517,8 @@ def _with_other_sign(
 
     What is lifted hangs on the hand: that tells the sign before the hand's own inertia does.
     """
-    assert rig.gripper is not None
-    for reaction in (True, False) if rig.gripper.reaction is None else ():
-        other = rig.model_copy(update={"gripper": rig.gripper.model_copy(update={"reaction": reaction})})
+    for reaction in (True, False) if rig.wrist.reaction is None else ():
+        other = rig.model_copy(update={"gripper": rig.wrist.model_copy(update={"reaction": reaction})})
         found = held_by(trial, other, pose, opening, pressing)
         if found.lifts and max(found.lifts) > 0:
             return found, other, (borne_out(trial, other, max(found.lifts)),)
@@ -577,9 +561,8 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
         "x2": x + shown / 2, "y2": y, "vx2": velocity @ pose.across + closing, "vy2": velocity @ pose.up,
         "fx2": fx / 2 - grip, "fy2": fy / 2,
     }  # fmt: skip
-    assert rig.gripper is not None
-    if rig.gripper.turns:  # by which fingers and block stand askew, who are level in these channels
-        closing = pose.turned[:, :, AXES.index(rig.gripper.closing)]
+    if rig.wrist.turns:  # by which fingers and block stand askew, who are level in these channels
+        closing = pose.turned[:, :, AXES.index(rig.wrist.closing)]
         channels[ROLL] = np.arcsin(np.clip(closing @ pose.up, -1.0, 1.0))
     if pressing is not None and not isinstance(pressing, float):
         missing = ~np.isfinite(pressing)
@@ -592,7 +575,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     for each in grips:
         last = min(each.stop, t.size) - 1
         surely[(t > t[each.start] - SURELY) & (t < t[last] + SURELY)] = 0.0
-    wrong = _inertia(t, pose, tool, rig.gripper.turns, rig.gravity)
+    wrong = _inertia(t, pose, tool, rig.wrist.turns, rig.gravity)
     timing = _timing(t, pose, np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)), fy, tool.noise)
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    free=surely, notes=(*_notes(trial, rig, tool), *strays),
@@ -668,8 +651,7 @@ def _touches(t: np.ndarray, opening: np.ndarray, grip: Grip) -> list[tuple[float
 
 def _notes(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     """What was found of the tool, for the reader."""
-    gripper = rig.gripper
-    assert gripper is not None
+    gripper = rig.wrist
     if gripper.tool_mass is not None and gripper.sensor_axes is not None and gripper.reaction is not None:
         return ()
     mass = "as given" if gripper.tool_mass else "from free motion"

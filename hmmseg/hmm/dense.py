@@ -7,9 +7,8 @@ Proc. IEEE 77(2), 1989).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,9 @@ from jax import Array, lax
 from numpy.typing import ArrayLike
 
 from hmmseg.hmm.inference import ladder
-from hmmseg.hmm.recursions import NEVER, argmax, log_sum, row
+from hmmseg.hmm.recursions import argmax, log_sum, row
+
+BLOCK = 16_384  # numerics: rows that one call takes, so that little is made of a long recording at once
 
 
 @dataclass(frozen=True)
@@ -43,18 +44,34 @@ def log_evidence(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transit
     Raises:
         ValueError: NaN, wrong shapes.
     """
-    return float(_run(_evidence, log_likelihoods, log_initial, log_transition))
+    weights, blocks, transition = _start(log_likelihoods, log_initial, log_transition)
+    with jax.enable_x64(True):
+        for x, n in blocks:
+            weights = np.asarray(_sum(weights, x, transition, n))
+    return float(np.logaddexp.reduce(weights))
 
 
 def viterbi(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transition: ArrayLike) -> Path:
     """Most probable state path; arguments as of `log_evidence`. ValueError where none is possible, too."""
-    path, log_prob = _run(_path, log_likelihoods, log_initial, log_transition)
-    if not np.isfinite(log_prob):
-        raise ValueError("no state path has any probability")
-    return Path(path[: len(np.asarray(log_likelihoods))].astype(np.int64), float(log_prob))
+    weights, blocks, transition = _start(log_likelihoods, log_initial, log_transition)
+    taken = []
+    with jax.enable_x64(True):
+        for x, n in blocks:
+            weights, sources = jax.tree.map(np.asarray, _best(weights, x, transition, n))
+            taken.append((sources, n))
+        if not np.isfinite(weights.max()):
+            raise ValueError("no state path has any probability")
+        k = weights.argmax()
+        pieces = [np.array([k])]
+        for sources, n in reversed(taken):
+            piece = np.asarray(_back(sources, np.int32(k), n))[:n]
+            pieces.append(piece)
+            k = piece[0]
+    return Path(np.concatenate(pieces[::-1]).astype(np.int64), float(weights.max()))
 
 
-def _run(core: Callable, *arrays: ArrayLike):  # type: ignore[no-untyped-def]
+def _start(*arrays: ArrayLike) -> tuple[np.ndarray, Iterator[tuple[np.ndarray, np.int32]], np.ndarray]:
+    """Weights (num_states,) at the first row; further rows, in padded blocks, and their numbers."""
     ll, initial, transition = (np.asarray(a, dtype=np.float64) for a in arrays)
     num_states = ll.shape[-1]
     expected = ((len(ll), num_states), (num_states,), (num_states, num_states))
@@ -64,37 +81,49 @@ def _run(core: Callable, *arrays: ArrayLike):  # type: ignore[no-untyped-def]
             raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
         if np.isnan(array).any():
             raise ValueError(f"{name}: NaN at {np.argwhere(np.isnan(array))[0].tolist()}")
-    x = np.zeros((ladder(len(ll)), num_states))
-    x[: len(ll)] = ll
-    with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _compiled(core)(x, initial, transition, np.int32(len(ll))))
+
+    def blocks() -> Iterator[tuple[np.ndarray, np.int32]]:
+        for at in range(1, len(ll), BLOCK):
+            rows = ll[at : at + BLOCK]
+            padded = np.zeros((min(ladder(len(rows)), BLOCK), num_states))
+            padded[: len(rows)] = rows
+            yield padded, np.int32(len(rows))
+
+    return initial + ll[0], blocks(), transition
 
 
-@cache
-def _compiled(core: Callable) -> Callable:
-    return jax.jit(core)
+@jax.jit
+def _sum(weights: Array, x: Array, transition: Array, n: Array) -> Array:
+    """Weights (num_states,) of all paths to each state, n rows further on."""
 
-
-def _evidence(x: Array, initial: Array, transition: Array, n: Array) -> Array:
     def step(t: Array, weights: Array) -> Array:
         return log_sum(weights[:, None] + transition, 0) + row(x, t)
 
-    return log_sum(lax.fori_loop(jnp.int32(1), n, step, initial + x[0]), 0)
+    return lax.fori_loop(jnp.int32(0), n, step, weights)
 
 
-def _path(x: Array, initial: Array, transition: Array, n: Array) -> tuple[Array, Array]:
-    def step(t: Array, table: Array) -> Array:
-        best = (row(table, t - 1)[:, None] + transition).max(0) + row(x, t)
-        return lax.dynamic_update_index_in_dim(table, best, t, 0)
+@jax.jit
+def _best(weights: Array, x: Array, transition: Array, n: Array) -> tuple[Array, Array]:
+    """Weights (num_states,) of the best paths, n rows further on, and from where they came to each row."""
 
-    first = jnp.full(x.shape, NEVER).at[0].set(initial + x[0])
-    table = lax.fori_loop(jnp.int32(1), n, step, first)
-    last = argmax(row(table, n - 1))
+    def step(t: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        ways = carry[0][:, None] + transition
+        source = argmax(ways).astype(carry[1].dtype)
+        return ways.max(0) + row(x, t), lax.dynamic_update_index_in_dim(carry[1], source, t, 0)
 
-    def back(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        t, (k, path) = n - 2 - i, carry
-        k = argmax(row(table, t) + transition[:, k])
+    few = x.shape[1] <= 256
+    return lax.fori_loop(
+        jnp.int32(0), n, step, (weights, jnp.zeros(x.shape, jnp.uint8 if few else jnp.int32))
+    )
+
+
+@jax.jit
+def _back(sources: Array, k: Array, n: Array) -> Array:
+    """States before each of n rows, of the path that is in state k at the last of them."""
+
+    def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        t, (k, path) = n - 1 - i, carry
+        k = row(sources, t)[k].astype(jnp.int32)
         return k, path.at[t].set(k)
 
-    path = jnp.zeros(len(x), jnp.int32).at[n - 1].set(last)
-    return lax.fori_loop(jnp.int32(0), n - 1, back, (last, path))[1], row(table, n - 1)[last]
+    return lax.fori_loop(jnp.int32(0), n, step, (k, jnp.zeros(len(sources), jnp.int32)))[1]

@@ -22,7 +22,7 @@ from jax.tree_util import register_pytree_node_class
 from numpy.typing import ArrayLike
 
 from hmmseg.hmm.chain import InfeasibleAlignment, jumps_between
-from hmmseg.hmm.recursions import NEVER, backwards, forwards, log_add, log_sum, numbers, pick, row
+from hmmseg.hmm.recursions import NEVER, backwards, forwards, known, log_add, log_sum, numbers, pick, row
 
 RARE = 1e-12  # numerics: durations that are longer than all but this share are left out
 
@@ -140,7 +140,7 @@ def _forward(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Ar
 
     def step(t: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         enter, leave, window = carry  # of having begun 1, 2, ... samples before sample t - 1
-        window = forwards(window, 1).at[:, 0].set(row(enter, t - 1)) + row(x, t - 1)[:, None]
+        window = forwards(window, 1).at[:, 0].set(row(enter, t - 1)) + known(row(x, t - 1))[:, None]
         left = log_sum(window + jnp.where(t == n, chain.survival, chain.pmf), 1)
         leave = lax.dynamic_update_index_in_dim(leave, left, t, 0)
         # Beyond the last sample is a row that nothing reads.
@@ -172,7 +172,7 @@ def posterior(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, A
         after, rest, window = carry  # of ending 1, 2, ... samples from t on, with all that follows
         t = n - 1 - i
         ends = jnp.where(t == n - 1, chain.log_final, row(rest, jnp.minimum(t + 1, len(x) - 1)))
-        window = forwards(window, 1).at[:, 0].set(ends) + row(x, t)[:, None]
+        window = forwards(window, 1).at[:, 0].set(ends) + known(row(x, t))[:, None]
         begun = log_sum(window + jnp.where(ages == n - t, chain.survival, chain.pmf), 1)
         after = lax.dynamic_update_index_in_dim(after, begun, t, 0)
         moved = [backwards(begun, d) + jump for d, jump in enumerate(chain.jumps, 1)]
@@ -196,7 +196,7 @@ def draw(x: Array, chain: DurationChain, n: Array, key: Array, num_draws: int) -
     total, enter, leave = _forward(x, chain, n)
     states, (num_states, longest) = numbers(x.shape[1]), chain.pmf.shape
     front = ((longest, 0), (0, 0))  # rows before the first, that no state may begin with
-    enter, padded = jnp.pad(enter, front, constant_values=NEVER), jnp.pad(x, front)
+    enter, padded = jnp.pad(enter, front, constant_values=NEVER), jnp.pad(known(x), front)
 
     def one(key: Array) -> Array:
         def segment(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -234,7 +234,9 @@ def rank(x: Array, chain: DurationChain, n: Array, count: int) -> tuple[Array, A
 
     def step(t: Array, carry: tuple) -> tuple:
         entered, window, lasted, came, _ = carry
-        window = jnp.concatenate([entered[:, None], window[:, :-1]], axis=1) + row(x, t - 1)[:, None, None]
+        window = (
+            jnp.concatenate([entered[:, None], window[:, :-1]], axis=1) + known(row(x, t - 1))[:, None, None]
+        )
         table = jnp.where(t == n, chain.survival, chain.pmf)
         left, age = lax.top_k((window + table[:, :, None]).reshape(num_states, -1), count)
         ways = [forwards((left + jump[:, None]).T, d).T for d, jump in enumerate(chain.jumps, 1)]

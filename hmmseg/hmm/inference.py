@@ -151,17 +151,16 @@ def _log_evidence(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None)
 def _differentiable(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> jax.Array:
     """The log evidence in the precision of x. Its gradient is the posterior, in that of what it is of."""
     with jax.enable_x64(True):
-        return _log_evidence(missing_as_zeros(x.astype(jnp.float64)), chain, n, parallel)[0].astype(x.dtype)
+        return _log_evidence(x, chain, n, parallel)[0].astype(x.dtype)
 
 
 def _with_gradient(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
     with jax.enable_x64(True):
-        known = missing_as_zeros(x.astype(jnp.float64))
         if isinstance(chain, DurationChain):
-            total, states, _ = durations.posterior(known, chain, n)
+            total, states, _ = durations.posterior(x, chain, n)
             by_chain = None
         else:
-            total, states, moves = recursions.posterior(known, *_tables(chain), n, parallel=parallel)
+            total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
             bands = [moves[:, d, d:] for d in range(len(chain.bands))]
             bands = [each if band.ndim == 2 else each.sum(0)
                      for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
@@ -249,18 +248,12 @@ def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: A
             return inside(
                 x.astype(kind), jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain), n, parallel
             )
-        found = core(missing_as_zeros(x.astype(jnp.float64)), chain, n, *keys, parallel=parallel, **static)[1]
+        found = core(x, chain, n, *keys, parallel=parallel, **static)[1]
         return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, found)
 
 
-def missing_as_zeros(x: Any) -> Any:
-    """Zeros, no evidence, in rows of NaN."""
-    xp = np if isinstance(x, np.ndarray) else jnp
-    return xp.where(xp.isnan(x).all(-1, keepdims=True), 0.0, x)
-
-
 def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
-    """Doubles (num_samples, num_states) without missing rows; ValueError for what is no such table."""
+    """Doubles (num_samples, num_states); ValueError for what is no such table."""
     ll = np.asarray(log_likelihoods, dtype=np.float64)
     _check_shape(ll, chain)
     missing = np.isnan(ll)
@@ -268,7 +261,6 @@ def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
         partly = missing.any(1) & ~missing.all(1)
         if partly.any():
             raise not_numbers(ll, int(partly.argmax()))
-        ll = np.where(missing, 0.0, ll)
     return ll
 
 

@@ -1,6 +1,7 @@
 """The recursions over a chain's states and time, as pure JAX functions in double precision.
 
-Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods without NaN; `w` (num_timesteps
+Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods, a row of NaN where a sample is
+missing; `w` (num_timesteps
 - 1 or 1, num_bands, num_states) log weights by their target, w[t, d, k] of going from k - d to k between
 the samples t and t + 1, -inf where k < d, one row where they do not vary; `n` int32, how many rows are
 no padding. A table of the recursion has a row for every timestep; what stands beyond row n - 1 means
@@ -33,7 +34,7 @@ keep_programs()
 NEVER = -jnp.inf  # physics: the logarithm of no weight
 BLOCK = 256  # numerics: rows that are searched together for where a path entered its state
 
-Plus = Callable[[Array, Array], Array]
+Operation = Callable[[Array, Array], Array]
 
 
 def log_add(a: Array, b: Array) -> Array:
@@ -79,16 +80,22 @@ def row(table: Array, t: Array) -> Array:
     return table[0] if len(table) == 1 else lax.dynamic_index_in_dim(table, t, keepdims=False)
 
 
+def known(x: Array) -> Array:
+    """Log-likelihoods (..., num_states) in double precision, zeros (no evidence) of a missing sample."""
+    x = x.astype(jnp.float64)
+    return jnp.where(jnp.isnan(x).all(-1, keepdims=True), 0.0, x)
+
+
 def forwards(values: Array, d: int) -> Array:
     """Of each state the value d states before it, -inf where there is none."""
     pads = [(0, 0, 0)] * (values.ndim - 1) + [(d, -d, 0)]
     return lax.pad(values, jnp.array(NEVER, values.dtype), pads)
 
 
-def backwards(values: Array, d: int) -> Array:
-    """Of each state the value d states after it, -inf where there is none."""
+def backwards(values: Array, d: int, nothing: float = NEVER) -> Array:
+    """Of each state the value d states after it, `nothing` where there is none."""
     pads = [(0, 0, 0)] * (values.ndim - 1) + [(-d, d, 0)]
-    return lax.pad(values, jnp.array(NEVER, values.dtype), pads)
+    return lax.pad(values, jnp.array(nothing, values.dtype), pads)
 
 
 def by_device(parallel: bool | None, by_row: Callable[..., Any], by_state: Callable[..., Any],
@@ -99,7 +106,7 @@ def by_device(parallel: bool | None, by_row: Callable[..., Any], by_state: Calla
     return (by_state if parallel else by_row)(*args)
 
 
-def forward(x: Array, w: Array, initial: Array, n: Array, plus: Plus,
+def forward(x: Array, w: Array, initial: Array, n: Array, plus: Operation,
             parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
     """Weights [t, k] of all paths (the best path, for `plus` a maximum) that are in state k at sample t.
 
@@ -108,12 +115,14 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Plus,
     """
 
     def by_row(x: Array, w: Array, initial: Array, n: Array) -> tuple[Array, Array]:
-        table = jnp.full(x.shape, NEVER).at[0].set(initial + x[0])
+        table = jnp.full(x.shape, NEVER).at[0].set(initial + known(x[0]))
 
         def step(t: Array, carry: tuple) -> tuple:
             table, *taken = carry
             before, weight = row(table, t - 1), row(w, t - 1)
-            now = reduce(plus, [forwards(before, d) + weight[d] for d in range(w.shape[1])]) + row(x, t)
+            now = reduce(plus, [forwards(before, d) + weight[d] for d in range(w.shape[1])]) + known(
+                row(x, t)
+            )
             if taken:
                 top = finite(now.max())
                 now, taken = now - top, [taken[0] + top]
@@ -124,6 +133,7 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Plus,
         return found[0], (found[1] if plus is log_add else jnp.zeros(()))
 
     def by_state(x: Array, w: Array, initial: Array, n: Array) -> tuple[Array, Array]:
+        x = known(x)
         first = (initial + x[0])[:, None]
         keep = jnp.pad((x[1:] + w[:, 0]).T, ((0, 0), (1, 0)), constant_values=NEVER)
         num = w.shape[1] - 1  # columns before this one
@@ -131,7 +141,7 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Plus,
         def state(before: Array, k: Array) -> tuple[Array, Array]:
             enter = [before[d - 1, :-1] + w[:, d, k] for d in range(1, num + 1)]
             enter = [jnp.broadcast_to(jnp.array(NEVER), (len(x) - 1,)), *enter]
-            column = solve(keep[k], jnp.append(first[k], reduce(plus, enter) + x[1:, k]), plus)
+            column = solve(keep[k], jnp.append(first[k], reduce(plus, enter) + x[1:, k]), jnp.add, plus)
             return jnp.concatenate([column[None], before[: max(num - 1, 0)]])[: max(num, 1)], column
 
         start = jnp.full((max(num, 1), len(x)), NEVER)
@@ -140,43 +150,67 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Plus,
     return by_device(parallel, by_row, by_state, x, w, initial, n)
 
 
-def backward(x: Array, w: Array, final: Array, n: Array, parallel: bool | None) -> Array:
-    """Summed weights [t, k] of all that may follow state k at sample t, each row up to a constant."""
+def shares(before: Array, w: Array) -> Array:
+    """Of who is in state k, which share came from k - d (..., num_bands, num_states).
 
-    def by_row(x: Array, w: Array, final: Array, n: Array) -> Array:
-        table = lax.dynamic_update_index_in_dim(jnp.full(x.shape, NEVER), final, n - 1, 0)
+    `before` (..., num_states): weights of all paths one sample earlier; `w` (..., num_bands, num_states).
+    """
+    ways = jnp.stack([forwards(before, d) + w[..., d, :] for d in range(w.shape[-2])], -2)
+    weights = jnp.exp(ways - finite(ways.max(-2, keepdims=True)))
+    return weights / jnp.maximum(weights.sum(-2, keepdims=True), 1.0)  # the largest is one, or all are zeros
 
-        def step(i: Array, table: Array) -> Array:
-            t = n - 1 - i
-            after, weight = row(table, t) + row(x, t), row(w, t - 1)
-            now = reduce(log_add, [backwards(after + weight[d], d) for d in range(w.shape[1])])
-            return lax.dynamic_update_index_in_dim(table, now - finite(now.max()), t - 1, 0)
 
-        return lax.fori_loop(jnp.int32(0), n - 1, step, table) if len(x) > 1 else table
+def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | None) -> tuple[Array, Array]:
+    """Probabilities of states (num_timesteps, num_states) and moves, from the forward pass alone.
 
-    def by_state(x: Array, w: Array, final: Array, n: Array) -> Array:
-        over = numbers(len(x)) >= n - 1  # from here on nothing more may follow
-        keep = jnp.pad((x[1:] + w[:, 0]).T, ((0, 0), (0, 1)), constant_values=NEVER)
-        num = w.shape[1] - 1
+    Who is in state k at sample t has come from k - d with a probability that the samples after t say nothing
+    about, so p[t - 1, j] = sum_d share[t, d, j + d] p[t, j + d] leads back from the last sample.
+    """
+    num_timesteps, num_states = before.shape
+    num_bands = w.shape[1]
+    last = probabilities(row(before, n - 1) + final, 0)
+
+    def by_row(before: Array, w: Array, last: Array, n: Array) -> tuple[Array, Array]:
+        states = lax.dynamic_update_index_in_dim(jnp.zeros_like(before), last, n - 1, 0)
+        moves = jnp.zeros((num_timesteps - 1, num_bands, num_states))
+
+        # The row is carried along with its table: where it is read back from there, XLA copies the table.
+        def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            t, (states, moves, now) = n - 1 - i, carry
+            moved = now[None] * shares(row(before, t - 1), row(w, t - 1))
+            now = reduce(jnp.add, [backwards(moved[d], d, 0.0) for d in range(num_bands)])
+            states = lax.dynamic_update_index_in_dim(states, now, t - 1, 0)
+            return states, lax.dynamic_update_index_in_dim(moves, moved, t - 1, 0), now
+
+        return lax.fori_loop(jnp.int32(0), n - 1, step, (states, moves, last))[:2]
+
+    def by_state(before: Array, w: Array, last: Array, n: Array) -> tuple[Array, Array]:
+        there = (numbers(num_timesteps - 1) < n - 1)[:, None, None]  # from beyond, nothing has come
+        share = jnp.where(there, shares(before[:-1], w), 0.0)
+        goes = [backwards(share[:, d], d, 0.0) for d in range(num_bands)]  # [t, k] of k + d at t + 1
+        num = max(num_bands - 1, 1)  # columns after this one
 
         def state(after: Array, k: Array) -> tuple[Array, Array]:
-            leave = [after[d - 1, 1:] + (backwards(x[1:] + w[:, d], d))[:, k] for d in range(1, num + 1)]
-            leave = [jnp.broadcast_to(jnp.array(NEVER), (len(x) - 1,)), *leave]
-            enter = jnp.where(over, final[k], jnp.append(reduce(log_add, leave), NEVER))
-            column = solve(jnp.where(over, NEVER, keep[k]), enter, log_add, reverse=True)
-            return jnp.concatenate([column[None], after[: max(num - 1, 0)]])[: max(num, 1)], column
+            leave = sum(after[d - 1, 1:] * goes[d][:, k] for d in range(1, num_bands))
+            leave = jnp.zeros(num_timesteps - 1) + leave
+            enter = jnp.append(leave, 0.0) + jnp.where(numbers(num_timesteps) == n - 1, last[k], 0.0)
+            column = solve(jnp.append(goes[0][:, k], 0.0), enter, jnp.multiply, jnp.add, reverse=True)
+            return jnp.concatenate([column[None], after])[:num], column
 
-        start = jnp.full((max(num, 1), len(x)), NEVER)
-        return lax.scan(state, start, numbers(x.shape[1]), reverse=True)[1].T
+        start = jnp.zeros((num, num_timesteps))
+        states = lax.scan(state, start, numbers(num_states), reverse=True)[1].T
+        return states, states[1:, None] * share
 
-    return by_device(parallel, by_row, by_state, x, w, final, n)
+    if num_timesteps == 1:
+        return last[None], jnp.zeros((0, num_bands, num_states))
+    return by_device(parallel, by_row, by_state, before, w, last, n)
 
 
-def solve(a: Array, b: Array, plus: Plus, reverse: bool = False) -> Array:
-    """v (num_timesteps,) of v[t] = plus(v[t - 1] + a[t], b[t]), from v[-1] = -inf."""
+def solve(a: Array, b: Array, times: Operation, plus: Operation, reverse: bool = False) -> Array:
+    """v (num_timesteps,) of v[t] = plus(times(v[t - 1], a[t]), b[t]), from v[-1] = nothing."""
 
     def join(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-        return first[0] + second[0], plus(first[1] + second[0], second[1])
+        return times(first[0], second[0]), plus(times(first[1], second[0]), second[1])
 
     return lax.associative_scan(join, (a, b), reverse=reverse)[1]
 
@@ -258,7 +292,7 @@ def posterior(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
 
     def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array, Array]:
         before, taken = forward(x, w, initial, n, log_add, parallel)
-        states, moves = joined(w, before, backward(x, w, final, n, parallel), n)
+        states, moves = smooth(before, w, final, n, parallel)
         return log_sum(row(before, n - 1) + final, 0) + taken, states, moves
 
     return one_by_one(core, parallel)(x, w, initial, final, n)
@@ -269,17 +303,6 @@ def probabilities(log_weights: Array, axis: int | tuple[int, ...]) -> Array:
     weights = jnp.exp(log_weights - finite(log_weights.max(axis, keepdims=True)))
     total = weights.sum(axis, keepdims=True)
     return weights / jnp.maximum(total, 1.0)  # the largest weight is one, or all are zeros
-
-
-def joined(w: Array, before: Array, after: Array, n: Array) -> tuple[Array, Array]:
-    """Probabilities of states and moves, from both passes."""
-    states = jnp.where((numbers(len(before)) < n)[:, None], before + after, NEVER)
-    states = lax.optimization_barrier(probabilities(states, 1))  # else computed again for every band
-    came = [forwards(before[:-1], d) + w[:, d] for d in range(w.shape[1])]  # from where to each state
-    most = finite(reduce(jnp.maximum, came))
-    came = [jnp.exp(each - most) for each in came]
-    share = states[1:] / jnp.maximum(sum(came), 1.0)
-    return states, jnp.stack([share * each for each in came], 1)
 
 
 def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, *, parallel: bool | None) -> Array:
@@ -323,7 +346,7 @@ def rank(x: Array, w: Array, initial: Array, final: Array, n: Array, count: int)
     """
     (num_timesteps, num_states), num_bands = x.shape, w.shape[1]
     states = numbers(num_states)[None]
-    first = jnp.full((num_states, count), NEVER).at[:, 0].set(initial + x[0])
+    first = jnp.full((num_states, count), NEVER).at[:, 0].set(initial + known(x[0]))
 
     def step(t: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         before, pointers = carry
@@ -331,7 +354,7 @@ def rank(x: Array, w: Array, initial: Array, final: Array, n: Array, count: int)
         ways = [forwards(before.T, d).T + weight[d][:, None] for d in range(num_bands)]
         best, pointer = lax.top_k(jnp.concatenate(ways, axis=1), count)
         pointers = lax.dynamic_update_index_in_dim(pointers, pointer.astype(jnp.int32), t, 0)
-        return best + row(x, t)[:, None], pointers
+        return best + known(row(x, t))[:, None], pointers
 
     pointers = jnp.zeros((num_timesteps, num_states, count), jnp.int32)
     best, pointers = lax.fori_loop(jnp.int32(1), n, step, (first, pointers))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from hmmseg.hmm.chain import Chain, InfeasibleAlignment
 from hmmseg.hmm.durations import DurationChain
-from hmmseg.hmm.recursions import backward, forwards, joined, log_add, log_sum
+from hmmseg.hmm.recursions import forwards, log_add, log_sum, smooth
 from hmmseg.hmm.results import crossings
 
 
@@ -81,9 +81,7 @@ class StreamingFilter:
         self.chain, self.lag = chain, lag
         self.num_samples = 0
         self._w = chain.by_target()
-        # The last lag + 2 samples, the newest last: log-likelihoods, and weights of the paths so far less
-        # those of all of them at the newest, whose sum is the log evidence.
-        self._x = np.zeros((lag + 2, chain.num_states))
+        # Of the last lag + 2 samples, the newest last: log probability of each state given those so far.
         self._before = np.full((lag + 2, chain.num_states), -np.inf)
         self._log_evidence = 0.0
 
@@ -104,15 +102,15 @@ class StreamingFilter:
             )
         first = np.asarray(self.chain.log_initial) if self.num_samples == 0 else np.full(k, -np.inf)
         with jax.enable_x64(True):
-            x, before, gained, *smoothed = jax.tree.map(
-                np.asarray, _compiled(_updated)(self._x, self._before, self._w, first, row)
+            before, gained, *smoothed = jax.tree.map(
+                np.asarray, _compiled(_updated)(self._before, self._w, first, row)
             )
         if not math.isfinite(gained):
             reached = np.flatnonzero(np.isfinite(self._before[-1])).max(initial=-1)
             raise InfeasibleAlignment(
                 min(int(reached) + 1, k - 1), f"no state is possible at sample {self.num_samples}"
             )
-        self._x, self._before = x, before
+        self._before = before
         self._log_evidence += float(gained)
         sample, self.num_samples = self.num_samples, self.num_samples + 1
         late = (None, None) if sample < self.lag else (smoothed[0][1], smoothed[1][0])
@@ -136,27 +134,27 @@ class StreamingFilter:
             raise InfeasibleAlignment(self.chain.num_states - 1, "reached, but cannot be held to the end")
         num = min(most, self.num_samples)
         with jax.enable_x64(True):
-            smoothed, boundary = map(np.asarray, _compiled(_smoothed)(self._x, self._before, self._w, final))
+            smoothed, boundary = map(np.asarray, _compiled(_smoothed)(self._before, self._w, final))
         at = len(smoothed) - num
         return Window(self.num_samples - num, smoothed[at:], boundary[at - 1 : len(boundary)])
 
 
-def _smoothed(x: Array, before: Array, w: Array, final: Array) -> tuple[Array, Array]:
+def _smoothed(before: Array, w: Array, final: Array) -> tuple[Array, Array]:
     """Probabilities of the window's states, and of the boundaries between its samples."""
-    states, moves = joined(w, before, backward(x, w, final, jnp.int32(len(x)), False), jnp.int32(len(x)))
+    states, moves = smooth(before, w, final, jnp.int32(len(before)), False)
     return states, crossings([moves[:, d, d:] for d in range(1, w.shape[1])])
 
 
-def _updated(x: Array, before: Array, w: Array, first: Array, row: Array) -> tuple[Array, ...]:
-    """The windows with one more sample, what it adds to the log evidence, and what is smoothed then."""
+def _updated(before: Array, w: Array, first: Array, row: Array) -> tuple[Array, ...]:
+    """The window with one more sample, what it adds to the log evidence, and what is smoothed then."""
     now = first
     for d in range(w.shape[1]):
         now = log_add(now, forwards(before[-1], d) + w[0, d])
     now = now + row
     gained = log_sum(now, 0)
-    x = jnp.concatenate([x[1:], row[None]])
-    before = jnp.concatenate([before[1:], now[None]]) - jnp.where(jnp.isfinite(gained), gained, 0.0)
-    return x, before, gained, *_smoothed(x, before, w, jnp.zeros(len(row)))
+    now = now - jnp.where(jnp.isfinite(gained), gained, 0.0)
+    before = jnp.concatenate([before[1:], now[None]])
+    return before, gained, *_smoothed(before, w, jnp.zeros(len(row)))
 
 
 @cache

@@ -1,15 +1,13 @@
-"""The nominal hand: kinematics, fingertip pads, sensor noise and systematic uncertainty."""
+"""The nominal hand: kinematics, pads, a gripper's wrist sensor, noise and systematic uncertainty."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from hmmseg.errors import nearest
-from hmmseg.io.columns import Columns
-from hmmseg.io.gripper import Gripper
 from hmmseg.io.schema import (
     LARGEST,
     Deviation,
@@ -21,6 +19,125 @@ from hmmseg.io.schema import (
     read_toml,
     validated,
 )
+from hmmseg.io.units import Columns
+
+AXES = ("x", "y", "z")
+Axis = Literal["x", "y", "z"]
+Direction = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def _by_axis(value: Any) -> Any:
+    """A list of three columns stands for x, y, z."""
+    if isinstance(value, list | tuple):
+        if len(value) != 3:
+            raise ValueError(f"has {len(value)} columns; expected x, y, z, or a table such as "
+                             '{y = "ee_y", z = "ee_z"}')  # fmt: skip
+        return dict(zip(AXES, value, strict=True))
+    return value
+
+
+def _several(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+class Gripper(StrictTable):
+    """Columns of the tool's pose, its opening and the wrench, and the tool that hangs on the sensor.
+
+    `position`: columns of the tool's position [m] by axis of the world; an axis that is absent does not
+    move. `quaternion` (x, y, z, w) or `rotation_vector` (axis times angle [rad]): columns of the tool's
+    orientation; without them it does not turn, and its axes are the world's. `up`: the world's axis
+    against gravity. `opening`: the distance between the pads [m], or one column a finger to be summed.
+
+    `wrench`: columns fx, fy, fz [N] and where there are any tx, ty, tz [N m], given along the axes of
+    the `sensor`, the `tool` or the `world` (`frame`). `sensor_axes`: along which axes of the tool the
+    sensor's x, y, z point. `reaction`: the wrench is what the environment does to the tool, not what
+    the tool does. What is not said of the two is found from how the tool's mass moves and hangs.
+    `tool_mass` [kg] and `centre_of_mass` [m] (tool's axes, from the sensor) are found from free motion
+    where they are not given, an offset of the sensor always.
+
+    `closing`: the tool's axis along which the pads close. `fingertip`: where the pads' middle lies [m]
+    (tool's axes, from the tool's position). `grip_force`: what each pad presses with, a column or a
+    number [N]. `motor_current`: a column [A], with `force_per_ampere` [N/A] a grip force.
+    """
+
+    position: Annotated[dict[Axis, Name], BeforeValidator(_by_axis)] = Field(
+        default={"x": "x", "y": "y", "z": "z"}
+    )
+    quaternion: tuple[Name, Name, Name, Name] | None = None
+    rotation_vector: tuple[Name, Name, Name] | None = None
+    up: Direction = "z"
+    opening: Annotated[tuple[Name, ...], BeforeValidator(_several)] = ("opening",)
+    wrench: tuple[Name, ...] = ("fx", "fy", "fz")
+    frame: Literal["sensor", "tool", "world"] = "sensor"
+    sensor_axes: tuple[Direction, Direction, Direction] | None = None
+    reaction: bool | None = None
+    closing: Axis = "y"
+    tool_mass: FinitePositive | None = None
+    centre_of_mass: tuple[Finite, Finite, Finite] | None = None
+    fingertip: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    grip_force: Name | FinitePositive | None = None
+    motor_current: Name | None = None
+    force_per_ampere: FinitePositive | None = None
+
+    @field_validator("wrench")
+    @classmethod
+    def _three_or_six(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(names) not in (3, 6):
+            raise ValueError(f"has {len(names)} columns; expected 3 forces, or 3 forces and 3 torques")
+        return names
+
+    @field_validator("opening")
+    @classmethod
+    def _one_or_two(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(names) not in (1, 2):
+            raise ValueError(f"has {len(names)} columns; expected one, or one for each finger")
+        return names
+
+    @field_validator("sensor_axes")
+    @classmethod
+    def _right_handed(cls, axes: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        import numpy as np  # slow to import, and only grippers need it
+
+        if axes is not None and not np.isclose(np.linalg.det(np.stack([direction(a) for a in axes])), 1):
+            raise ValueError(f"{', '.join(axes)} are no right-handed axes; expected such as y, x, -z")
+        return axes
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Gripper:
+        if self.quaternion is not None and self.rotation_vector is not None:
+            raise ValueError("has both quaternion and rotation_vector; expected one of them")
+        if self.up.lstrip("-") not in self.position:
+            raise ValueError(f"position has no column for {self.up.lstrip('-')}, the axis that is up")
+        if self.force_per_ampere is not None and self.motor_current is None:
+            raise ValueError("has force_per_ampere without motor_current")
+        return self
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Every channel a trial of this gripper needs."""
+        force = self.grip_force if isinstance(self.grip_force, str) else None
+        named = (
+            *self.position.values(), *(self.quaternion or ()), *(self.rotation_vector or ()), *self.opening,
+            *self.wrench, force, self.motor_current,
+        )  # fmt: skip
+        return tuple(dict.fromkeys(name for name in named if name is not None))
+
+    @property
+    def turns(self) -> bool:
+        """Whether the tool's orientation is recorded."""
+        return self.quaternion is not None or self.rotation_vector is not None
+
+    @property
+    def grip_known(self) -> bool:
+        """Whether the pads' normal force is known."""
+        return self.grip_force is not None or self.force_per_ampere is not None
+
+
+def direction(axis: str) -> Any:
+    """Unit vector (3,), an array, of an axis such as `-z`."""
+    import numpy as np  # as above
+
+    return (-1.0 if axis[0] == "-" else 1.0) * np.eye(3)[AXES.index(axis[-1])]
 
 
 class Finger(StrictTable):
@@ -106,7 +223,17 @@ class Rig(StrictTable):
 
     @classmethod
     def read(cls, source: str | Path | dict[str, Any] | Rig) -> Rig:
-        """Rig from a `rig.toml`, its table as a dict, or a rig itself; InputError for anything at fault."""
+        """Read the description of a hand.
+
+        Args:
+            source: a `rig.toml`, its table as a dict, or a rig, which is given back as it is.
+
+        Returns:
+            The rig, lengths in m, forces in N, angles in rad, stiffnesses in N/m.
+
+        Raises:
+            InputError: names the key at fault, and the nearest known one.
+        """
         if isinstance(source, Rig):
             return source
         return parse_rig(source) if isinstance(source, dict) else read_rig(Path(str(source)))
@@ -135,6 +262,13 @@ class Rig(StrictTable):
     def jointed(self) -> bool:
         """Whether trials are recorded in joint space."""
         return self.fingers is not None
+
+    @property
+    def wrist(self) -> Gripper:
+        """The gripper with a sensor in its wrist; ValueError for any other hand."""
+        if self.gripper is None:
+            raise ValueError("a hand of fingertips has no wrist sensor")
+        return self.gripper
 
     def finger(self, i: int) -> Finger:
         """Finger 1 (left) or 2 (right); ValueError for a Cartesian hand."""

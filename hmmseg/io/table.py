@@ -1,9 +1,12 @@
-"""A table as a file has it, and numbers from its columns, before anything is mapped."""
+"""A table as a file or a frame has it, and numbers from its columns, before anything is mapped."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +18,7 @@ MAX_COLUMNS = 20_000  # limit: no robot says so many; the arrays of each take ki
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one file or frame under their own names; only those asked for are read.
+    """Columns of one file or frame under their own names; only those wanted are read.
 
     `names` are all that the file has; `rows` (num_rows,) numbers the rows as an editor does;
     `units` are those that the file itself states. `origin` is where t = 0 lies in ns since 1970
@@ -36,12 +39,38 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def plain_table(file: str, columns: dict[str, np.ndarray], names: Sequence[str] | None = None) -> Table:
-    """A table whose rows count from 1, as many as most of its columns have."""
+def plain_table(
+    file: str, columns: dict[str, np.ndarray], rest: Sequence[str] = (), wanted: Sequence[str] | None = None
+) -> Table:
+    """A table whose rows count from 1, as many as most of its columns have; `rest`: columns not read."""
     columns = flat(columns)
+    if wanted is not None:
+        columns = {name: values for name, values in columns.items() if name in wanted}
     lengths = [len(values) for values in columns.values()]
     count = max(lengths, key=lengths.count, default=0)
-    return Table(file, tuple(names if names is not None else columns), columns, np.arange(1, count + 1))
+    return Table(file, (*columns, *rest), columns, np.arange(1, count + 1))
+
+
+def is_wanted(name: str, wanted: Sequence[str] | None) -> bool:
+    """Whether a column is to be read: `pose[2]` is of the column `pose`."""
+    return wanted is None or name in wanted or any(each.startswith(f"{name}[") for each in wanted)
+
+
+def check_part(path: Path, part: str | None, found: Sequence[str]) -> None:
+    """InputError unless one of the recordings that a file holds is chosen, or there is one only."""
+    if part is None and len(found) > 1:
+        raise InputError(
+            str(path), f"holds {len(found)} recordings", f"{path.name}#{found[0]} for one of them"
+        )
+    if part is not None and part not in found:
+        raise InputError(f"{path}#{part}", "no such recording", ", ".join(found[:5]) or "no #")
+
+
+def check_unique(names: Sequence[str], where: str) -> None:
+    """InputError where two columns have one name."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
 
 
 def appended(table: Table, more: Table) -> Table:
@@ -125,3 +154,34 @@ def shown(value: object) -> str:
     """A cell for a message: one line, not long."""
     text = " ".join(str(value).split())
     return text if len(text) <= 60 else text[:60] + "..."
+
+
+def frame_table(source: Any, wanted: Sequence[str] | None) -> Table:
+    """Table of a frame or dict; rows count from 1. InputError for anything else."""
+    where = "DataFrame" if hasattr(source, "columns") else type(source).__name__
+    if isinstance(source, Mapping):
+        names = [str(name).strip() for name in source]
+        values = list(source.values())
+    elif hasattr(source, "columns") and hasattr(source, "iloc"):
+        names = [str(name).strip() for name in source.columns]
+        values = [source.iloc[:, i] for i in range(len(names))]
+    elif hasattr(source, "columns") and hasattr(source, "get_column"):
+        names = [str(name).strip() for name in source.columns]
+        values = [source.get_column(name) for name in source.columns]
+    else:
+        raise InputError(where, "is no table", "a file, a DataFrame or a dict of arrays")
+    check_unique(names, where)
+    kept = {n: _array(each) for n, each in zip(names, values, strict=True) if is_wanted(n, wanted)}
+    return plain_table(where, kept, [name for name in names if name not in kept])
+
+
+def _array(values: Any) -> np.ndarray:
+    if hasattr(values, "dtype") and type(values.dtype).__module__.startswith("pandas"):  # nullable
+        if values.dtype.kind in "fiu":
+            return values.to_numpy(dtype=np.float64, na_value=np.nan)
+        if values.dtype.kind == "M":  # with a time zone
+            return values.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy()
+        return values.to_numpy(dtype=object)
+    if hasattr(values, "to_numpy"):
+        return values.to_numpy()
+    return np.asarray(values)

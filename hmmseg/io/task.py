@@ -36,7 +36,17 @@ class Task:
 
     @staticmethod
     def read(source: str | Path | dict[str, Any] | Task) -> BlockTask | SequenceTask:
-        """Task from a `task.toml`, its table as a dict, or a task; InputError for anything at fault."""
+        """Read a task description.
+
+        Args:
+            source: a `task.toml`, its table as a dict, or a task, which is given back as it is.
+
+        Returns:
+            Blocks and moves, or a plain ordered list of states.
+
+        Raises:
+            InputError: names the key or the move at fault; also for moves that contradict each other.
+        """
         if isinstance(source, BlockTask | SequenceTask):
             return source
         return parse_task(source) if isinstance(source, dict) else read_task(Path(str(source)))

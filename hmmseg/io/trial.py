@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.columns import Column, source_of
-from hmmseg.io.formats import LOGS, kind_of, read_table, split_part
-from hmmseg.io.frames import frame_table
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table, numbers, times
+from hmmseg.io.table import Table, check_unique, numbers, times
 from hmmseg.io.task import SequenceTask, Task
-from hmmseg.io.units import LARGEST, LATEST, measures, si_factor, unwrapped
+from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
 from hmmseg.tables import Tabled
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
@@ -34,7 +31,7 @@ class Trial(Tabled):
     `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
     channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
     `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
-    reason. `touch_sd` [m]: how well the distance is known at which the fingers touch a block, beside noise;
+    reason. `touch_sd` [m]: how well the distance at which the fingers touch a block is known, but for noise;
     `touches` [s]: times of touch and release known apart from forces, with their standard deviations;
     `timing` (num_timesteps,) [s]: how uncertain it is when a force changed that changes there. Of a sensor
     in the wrist, whose forces are halved between the fingers, `inertia` (num_timesteps, 2) [N]: by how much
@@ -59,15 +56,28 @@ class Trial(Tabled):
 
     @staticmethod
     def read(source: Any, rig: Any = None, task: Any = None) -> Trial:
-        """Trial from a file, a DataFrame (pandas, polars), a dict of arrays or a trial itself.
+        """Read one recording.
 
-        `rig` (or, for a plain ordered task, `task`) says which channels it has: a path, a dict or
-        what `Rig.read` and `Task.read` give. InputError names file, row or column at fault.
+        Args:
+            source: a file of any kind, a DataFrame (pandas, polars), a dict of arrays (num_timesteps,), or a
+                trial, which is given back as it is.
+            rig: the hand, which says which channels there are and how columns map to them: a `rig.toml`, its
+                table as a dict, or a `Rig`.
+            task: of a plain ordered task its description, instead of or with `rig`.
+
+        Returns:
+            The trial in SI units: times (num_timesteps,) [s] and channels by name, NaN where missing.
+
+        Raises:
+            InputError: names the file, row or column at fault and what was expected; also where the recording
+                cannot be what it says (other units, flipped signs, swapped fingers).
         """
         if isinstance(source, Trial):
             return source
         hand = None if rig is None else Rig.read(rig)
         order = None if task is None else Task.read(task)
+        from hmmseg.hand.read import read_trial  # above: what a hand's recording cannot be is judged there
+
         return read_trial(source, hand, order if isinstance(order, SequenceTask) else None)
 
     def tables(self) -> list[Any]:
@@ -101,45 +111,8 @@ class Trial(Tabled):
         return Path(name).stem + f"_{part}" * bool(part)
 
 
-def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceTask | None = None) -> Trial:
-    """Trial from a file, a pandas or polars DataFrame or a dict of arrays; InputError says where it fails.
-
-    The channels kept are the rig's (joint space, Cartesian or a gripper's), or for a plain ordered
-    task the ones it names (every column but `t` otherwise), taken from the columns or messages
-    that the rig's `[columns]` or `[topics]` map to them. A hand's recording that cannot be as it is
-    (other units, flipped signs, swapped fingers) is refused with what to write into the rig.
-    """
-    if task is None and rig is None:
-        raise ValueError("a block task's trial needs its rig")
-    names, _ = channels_of(rig, task)
-    log = isinstance(source, str | Path) and kind_of(split_part(source)[0]) in LOGS
-    columns: Mapping[str, Column] = {} if rig is None else (rig.topics if log else rig.columns)
-    theirs = None if names is None else [source_of(name, columns) for name in ("t", *names)]
-    read = read_table if isinstance(source, str | Path) else frame_table
-    table = read(source, theirs)
-    trial = trial_of(table, rig, task)
-    if task is not None or rig is None:
-        from hmmseg.io.plausibility import check_clock, judged
-
-        warnings = judged(trial, check_clock(trial, rig, moving=False))
-        return replace(trial, warnings=(*trial.warnings, *warnings))
-    from hmmseg.hand.plausibility import check  # which read trials themselves
-    from hmmseg.hand.roll import levelled
-    from hmmseg.hand.sensing import sensed
-    from hmmseg.hand.wrist import from_halves, halved, two_fingers
-
-    trial = sensed(trial, rig)
-    warnings = check(trial, rig)
-    trial = levelled(trial)
-    if rig.gripper is not None:
-        trial = two_fingers(trial, rig)
-    elif halved(trial):
-        trial = from_halves(trial, rig)
-    return replace(trial, warnings=(*trial.warnings, *warnings))
-
-
 def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:
-    """Trial from a table as it was read, whether or not it can be; InputError as `read_trial`.
+    """Trial from a table as it was read, whether or not it can be; InputError where it cannot.
 
     `whole`: all of a recording, whose channels must have some values.
     """
@@ -209,9 +182,7 @@ def _every(table: Table, columns: Mapping[str, Column]) -> list[str]:
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
                  optional: tuple[str, ...], plain: bool) -> None:  # fmt: skip
     where = table.file
-    for name in table.names:
-        if table.names.count(name) > 1:
-            raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
+    check_unique(table.names, where)
     tables = "[topics]" if table.messages else "[columns]"
     for ours in columns:
         if names is not None and ours not in ("t", *names):
@@ -266,3 +237,10 @@ def _check_times(t: np.ndarray, table: Table) -> None:
         i = back[0] + 1
         raise InputError(f"{where}: row {rows[i]}, column t", f"{t[i]:g} after {t[i - 1]:g}",
                          "strictly increasing times")  # fmt: skip
+
+
+def position_pairs(trial: Trial) -> list[tuple[str, str]]:
+    """Names of each position with its velocity, where both are recorded."""
+    named = [(f"q{i}{j}", f"dq{i}{j}") for i in "12" for j in "12"]
+    named += [(f"{axis}{i}", f"v{axis}{i}") for i in "12" for axis in "xy"]
+    return [pair for pair in named if all(name in trial.channels for name in pair)]

@@ -36,13 +36,13 @@ class Answer:
 
     note: str | None  # what was irregular about the row, in words
 
-    def __init__(self, watcher: Filter, t: float, now: np.ndarray, smoothed: np.ndarray,
-                 means: np.ndarray, best: np.ndarray, final: bool) -> None:  # fmt: skip
-        self._watcher, self.t, self.final = watcher, t, final
+    def __init__(self, watcher: Filter, t: float, now: np.ndarray, smoothed: np.ndarray, means: np.ndarray,
+                 round_: int, departed: tuple[int, float, int], final: bool) -> None:  # fmt: skip
+        self._watcher, self.t, self.final, self.round = watcher, t, final, round_
         self.probabilities, self.departed = now[:-1], float(now[-1])
         self.smoothed, self._means = smoothed[:-1], means
-        self.round, self._missed, self._left_at = int(best[0]), int(best[2]), float(best[3])
-        self._state, self.note = int(best[4]), None
+        self._missed, self._left_at, state = departed
+        self._off, self.note = watcher.off_task[max(state, 0)], None
         self.index = int(self.probabilities.argmax())
         if self.departed > 0.5:
             self.index = self._missed
@@ -87,7 +87,7 @@ class Answer:
             return None
         w = self._watcher
         if self.departed > 0.5:
-            state, block = w.off_task[max(self._state - w.num_steps, 0)]
+            state, block = self._off
             held = state if state == FREE else f"{state} of {block or 'another block'}"
             step, reason = w.steps[self._missed], f"{held} from {self._left_at:.2f} s on"
         else:
@@ -99,7 +99,7 @@ class Answer:
         """One line of JSON, without its newline; `more`: further entries of the last one."""
         step = self.subtask
         w = self._watcher
-        state = step.state if self.departed <= 0.5 else w.off_task[max(self._state - w.num_steps, 0)][0]
+        state = step.state if self.departed <= 0.5 else self._off[0]
         probabilities = ["0" if p < 5e-7 else f"{p:.6f}" for p in self.probabilities.tolist()]
         parts = [
             f'{{"t":{self.t:.9g},"subtask":"{step.name}","object":{_name(step.object)},"state":"{state}"',

@@ -3,6 +3,10 @@
 The filter is over alignments with the blocks' unknown weights and widths: hypotheses that differ by when
 each subtask began carry conjugate posteriors of everything else (a Rao-Blackwellised filter that
 enumerates where a particle filter draws; Adams and MacKay 2007; Doucet et al. 2000). docs/watch.md.
+
+The filter knows a boundary to a sample of its own pace; where a block is lifted, or samples are far apart,
+the contact equations say more: the alignment of the two subtasks alone, with the crossing between samples
+(hmmseg.segmentation.boundaries), under the parameters that the filter has learned.
 """
 
 from __future__ import annotations
@@ -10,30 +14,63 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
+from hmmseg.contact.decompose import (
+    ABOVE_GROUND,
+    FREE,
+    ON_GROUND,
+    SLIDING,
+    Subtask,
+    height_equations,
+    subtasks,
+)
 from hmmseg.contact.equations import pads_of
+from hmmseg.hand.signals import task_space
+from hmmseg.hmm import left_to_right, smooth
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS
-from hmmseg.online import layout as at
+from hmmseg.io.trial import CARTESIAN_CHANNELS, CARTESIAN_OPTIONAL, JOINT_CHANNELS, Trial
+from hmmseg.levels import DRIFTS
 from hmmseg.online.answer import Answer, Crossing
-from hmmseg.online.layout import Layout
-from hmmseg.online.properties import Properties
-from hmmseg.online.readings import HISTORY, ROWS, hand_row, read, widen
-from hmmseg.online.refine import REACH, refined
-from hmmseg.online.scores import CREEP
-from hmmseg.online.step import LOG_DEPARTURE, advance
-from hmmseg.online.summary import boundary, summarise
-from hmmseg.segmentation.emissions import MAX_RATE, noise_sd
+from hmmseg.online.hypotheses import LOG_DEPARTURE, advance, boundary, summarise
+from hmmseg.online.hypothesis import (
+    ABOVE_KIND,
+    CREEP,
+    FREE_KIND,
+    GROUND_KIND,
+    HYPOTHESIS,
+    RANGES,
+    READING,
+    ROW,
+    ROWS,
+    SCALES,
+    SLIDING_KIND,
+    read,
+    widen,
+)
+from hmmseg.segmentation.boundaries import combine
+from hmmseg.segmentation.changes import Disagreement, Prior, moment
+from hmmseg.segmentation.emissions import (
+    MAX_RATE,
+    WINDOW,
+    Parameters,
+    features,
+    log_likelihoods,
+    noise_sd,
+    thin,
+)
+from hmmseg.segmentation.pads import sense
+from hmmseg.segmentation.posteriors import contacts, nearest_touch
+from hmmseg.segmentation.rounds import one_round, round_tasks
 
 WARM_UP = 8  # numerics: rows that tell a force noise which the rig does not state
 NUM_CHANNELS = len(CARTESIAN_CHANNELS)
-KINDS = {FREE: at.FREE_KIND, ON_GROUND: at.GROUND_KIND, SLIDING: at.SLIDING_KIND, ABOVE_GROUND: at.ABOVE_KIND}
+KINDS = {FREE: FREE_KIND, ON_GROUND: GROUND_KIND, SLIDING: SLIDING_KIND, ABOVE_GROUND: ABOVE_KIND}
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
 # hand at rest creeps, and pads' foam gives by tenths of a mm.
 VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
@@ -43,24 +80,28 @@ LEAST_SPANS = (0.1, 0.1, 0.03, 0.03)
 LEAST_FORCE = 50.0  # prior: and of its forces, in sds of their noise
 ROUGH = 3.0  # prior: net and shear force of a held block at first, in sds of the force noise
 UNBIASED = 10.0  # prior: a sensor's bias before anything is known, in sds of its noise
+NEAREST = round(DRIFTS * MAX_RATE)  # samples of a hold that locate the block next to a contact change
+REACH = 0.6  # chosen: s before a boundary: what is read of the subtask that it ends
+FINE = 100.0  # numerics: Hz; in faster recordings the filter itself places touches
 
 
 @dataclass
 class _State:
     """All that changes from row to row; copied whole, it is a point to return to."""
 
-    table: np.ndarray
+    rows: np.ndarray
+    known: np.ndarray
     count: int
-    history: np.ndarray
-    head: int
-    filled: int
-    last_t: float
-    last_row: np.ndarray
-    since: float
+    ring: np.ndarray
     extremes: np.ndarray
-    spans: np.ndarray
-    settled: int
-    started: bool
+    ranges: np.ndarray
+    last_row: np.ndarray
+    head: int = -1
+    filled: int = 0
+    last_t: float = math.nan
+    since: float = 0.0
+    settled: int = 0
+    started: bool = False
     num_rows: int = 0
 
 
@@ -69,11 +110,16 @@ class Filter:
 
     def __init__(self, task: BlockTask, rig: Rig, lag: float) -> None:
         self.task, self.rig, self.lag = task, rig, lag
-        self.channels = JOINT_CHANNELS if self.rig.jointed else CARTESIAN_CHANNELS
-        self.optional = () if self.rig.jointed else CARTESIAN_OPTIONAL
+        self.channels = JOINT_CHANNELS if rig.jointed else CARTESIAN_CHANNELS
+        self.optional = () if rig.jointed else CARTESIAN_OPTIONAL
         self.rows: deque[tuple[float, np.ndarray]] = deque()  # the last, over the lag and REACH before it
         self._prepare_task(task)
-        self._prepare_hand(rig)
+        noise = rig.noise
+        position = noise.angle if rig.jointed else noise.position
+        fingers = [rig.finger(i) for i in (1, 2)] if rig.jointed else []
+        self._geometry = np.array([v for f in fingers for v in (*f.base, *f.links)] or [0.0] * 8)
+        self._noise = np.array([(position or 0.0) ** 2, (noise.velocity or 0.0) ** 2])
+        self._pads, self.force_noise = np.array(pads_of(rig), float), noise.force
         self._written, self._written_t = "{}", -math.inf
         self.crossings: list[Crossing] = []
         self.first_t = math.nan  # of the first row [s]
@@ -81,71 +127,58 @@ class Filter:
         self.together = 1.0 / MAX_RATE  # readings nearer to each other than this are no two [s]
         self._waiting: list[tuple[float, np.ndarray]] = []
         self._velocities = True
-        width, rows = self.layout.width, 24 * len(self.kinds)
-        self._fresh = np.zeros((len(self.kinds) + 2, width))
-        self._x, self._row = np.full(at.NUM_READ, np.nan), np.zeros(12)
-        self._x[at.SD_FX :] = 0.0, 0.0, 1.0
-        self._now, self._smoothed = np.zeros(self.num_steps + 1), np.zeros(self.num_steps + 1)
-        self._means = np.zeros((2 * self.layout.num_objects + self.layout.num_moves, 3))
-        self._best, self._least = np.zeros(5), np.array(LEAST_SPANS)
+        num_quantities = 2 * (len(task.objects) + 1) + len(task.moves)
+        num_states = len(self._chain[0])
+        self._fresh, self._table = (
+            (np.zeros(most, HYPOTHESIS), np.zeros((most, num_quantities, 2)))
+            for most in (num_states + 2, 24 * num_states)
+        )
+        self._x = np.full(1, np.nan).astype(READING)
+        self._x["sd_fx"], self._x["sd_fy"], self._x["gripped"] = 0.0, 0.0, 1.0
+        self._now, self._smoothed = np.zeros((2, self.num_steps + 1))
+        self._means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
+        self._least, self._round, self._departed = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
         self._state = _State(
-            np.zeros((rows, width)), 0, np.full((ROWS, HISTORY), np.nan), -1, 0, math.nan, np.zeros(12), 0.0,
-            np.array([[np.inf, -np.inf]] * 4), np.array([*LEAST_SPANS, 1.0, 1.0]), 0, False,
+            *self._table, 0, np.full(ROWS, np.nan).astype(ROW), np.array([[np.inf, -np.inf]] * 4),
+            np.array([(*LEAST_SPANS, 1.0, 1.0)], RANGES), np.zeros(12),
         )  # fmt: skip
 
     def _prepare_task(self, task: BlockTask) -> None:
-        from hmmseg.segmentation.rounds import one_round, round_tasks
-
         self.steps: tuple[Subtask, ...] = subtasks(one_round(task))
         self.num_steps = len(self.steps)
         names = list(task.objects)
-        self.layout = Layout(len(names), len(task.moves))
         sliding = any(move.slide for move in task.moves)
-        off: list[tuple[str, int]] = [(FREE, -1)]
         states = (ON_GROUND, ABOVE_GROUND, SLIDING) if sliding else (ON_GROUND, ABOVE_GROUND)
-        off += [(state, o) for o in range(len(names) + 1) for state in states]
+        off = [(FREE, -1), *((state, o) for o in range(len(names) + 1) for state in states)]
         own = [(s.state, -1 if s.state == FREE else names.index(str(s.object))) for s in self.steps]
         self.off_task = [(state, None if o < 0 else [*names, None][o]) for state, o in off]
-        self.kinds = np.array([KINDS[state] for state, _ in own + off], dtype=np.int64)
-        blocks = np.array([o for _, o in own + off], dtype=np.int64)
         repeats = 1000 if task.repeat == "unknown" else task.repeat
-        self.num_rounds, self.cyclic = float(repeats), repeats > 1
-        tasks = round_tasks(task, min(repeats, 2 * len(names) + 2))
-        self.properties = Properties(task, tasks, self.rig)
-        moves = np.array(
-            [-1 if s.move is None or not self.properties.steady[s.move] else s.move for s in self.steps]
-            + [-1] * len(off), dtype=np.int64,
-        )  # fmt: skip
-        self._chain = (self.kinds, blocks, moves, self.num_steps)
-
-    def _prepare_hand(self, rig: Rig) -> None:
-        self._geometry = np.zeros(8)
-        if rig.jointed:
-            fingers = [rig.finger(i) for i in (1, 2)]
-            self._geometry[:] = [v for f in fingers for v in (*f.base, *f.links)]
-        noise = rig.noise
-        position = noise.angle if rig.jointed else noise.position
-        self._noise = np.array([(position or 0.0) ** 2, (noise.velocity or 0.0) ** 2])
-        self._pads = np.array(pads_of(rig), dtype=float)
-        self.force_noise = noise.force
+        self.num_rounds, self.cyclic = repeats, repeats > 1
+        self.properties = Properties(task, round_tasks(task, min(repeats, 2 * len(names) + 2)), self.rig)
+        steady = self.properties.steady
+        moves = [-1 if s.move is None or not steady[s.move] else s.move for s in self.steps]
+        states = [(KINDS[state], o, move)
+                  for (state, o), move in zip(own + off, moves + [-1] * len(off), strict=True)]  # fmt: skip
+        self._chain = np.array(states), self.properties.signs, self.num_steps, len(names), repeats
 
     def _begin(self, noise: float) -> None:
         """The one hypothesis to start from, and those of a recording that starts off its task."""
-        s, h = self._state, np.zeros(self.layout.width)
-        h[at.MISSED], h[at.LEFT_AT], h[at.ENTRY] = -1.0, math.inf, s.last_t
-        bias = np.maximum(UNBIASED * noise, 3 * np.array(self.rig.systematic.force_bias))
-        h[at.BIAS + 1 : at.BIAS + 8 : 2] = 1.0 / bias**2
+        s = self._state
+        h = np.zeros(1, HYPOTHESIS)
+        h["missed"], h["left_at"], h["entered"][:, 0] = -1, math.inf, s.last_t
+        h["bias"][..., 1] = (
+            1.0 / np.maximum(UNBIASED * noise, 3 * np.array(self.rig.systematic.force_bias)) ** 2
+        )
         rough = ROUGH * noise
-        for which, scale in enumerate((noise, rough, rough, rough, VELOCITY, LEVEL, WIDTH)):
-            h[at.SCALES + 2 * which : at.SCALES + 2 * which + 2] = PRIOR * scale**2, PRIOR
-        s.table[0] = h
-        off = len(self.kinds) - self.num_steps
-        for i in range(1, off):  # whatever is free motion at the start is the task's own
-            s.table[i] = h
-            s.table[i, at.STATE], s.table[i, at.MISSED] = self.num_steps + i, 0.0
-            s.table[i, at.LEFT_AT], s.table[i, at.WEIGHT] = s.last_t, LOG_DEPARTURE - math.log(off)
+        starts = np.array([noise, rough, rough, rough, VELOCITY, LEVEL, WIDTH])
+        h["scale"][0] = np.stack([PRIOR * starts**2, np.full(starts.size, PRIOR)], axis=1)
+        off = len(self.off_task)
+        s.rows[:off], s.known[:off] = h, 0.0
+        away = s.rows[1:off]  # whatever is free motion at the start is the task's own
+        away["state"], away["missed"] = self.num_steps + np.arange(1, off), 0
+        away["left_at"], away["weight"] = s.last_t, LOG_DEPARTURE - math.log(off)
         s.count, s.started = off, True
-        s.spans[[at.SPAN_FORCE, at.SPAN_PRESS]] = LEAST_FORCE * noise
+        s.ranges["force"] = s.ranges["press"] = LEAST_FORCE * noise
 
     def take(self, t: float, row: np.ndarray) -> None:
         """One row (12,) in SI units, NaN where missing, at a time after all before.
@@ -164,29 +197,22 @@ class Filter:
             return
         dt = t - s.last_t if s.num_rows else 0.0
         s.num_rows += 1
-        derived = not self.rig.jointed and not self._velocities
-        hand_row(row, self.rig.jointed, self._geometry, not derived, s.last_row, max(dt, 1e-9), self._row)
-        if derived and dt == 0.0:
-            self._row[4:6] = math.nan
         s.head = (s.head + 1) % ROWS
         s.filled = min(s.filled + 1, ROWS)
-        x = self._x
-        read(s.history, s.head, s.filled, t, dt, self._row, self._noise, not derived, x)
-        widen(s.extremes, s.spans, self._least, x)
+        x, jointed = self._x, self.rig.jointed
+        read(s.ring, s.head, s.filled, t, dt, row, jointed, self._geometry, jointed or self._velocities,
+             s.last_row, self._noise, x)  # fmt: skip
+        widen(s.extremes, s.ranges, self._least, x)
         if row.size > NUM_CHANNELS:
-            x[at.SD_FX :] = row[NUM_CHANNELS + 1 :]
+            x["sd_fx"], x["sd_fy"], x["gripped"] = row[NUM_CHANNELS + 1 :]
         s.since += dt
         since = s.since if s.since >= 0.999 / MAX_RATE else 0.0
         if since:
             s.since = 0.0
         share = min(1.0, dt / self.together) if dt > 0 else 1.0
-        s.last_t = t
-        s.last_row = row
-        s.count, _ = advance(
-            s.table, s.count, self._fresh, x, dt, since, share, self._chain, self.num_rounds, self.cyclic,
-            s.spans, self._pads, self.rig.gravity, self.layout.num_objects, self.layout.rises,
-            self.properties.signs,
-        )  # fmt: skip
+        s.last_t, s.last_row = t, row
+        s.count = advance(*self._table, *self._fresh, s.count, x, dt, since, share, *self._chain, s.ranges,
+                          self._pads, self.rig.gravity)  # fmt: skip
         self._settle(t - self.lag)
 
     def idle(self, t: float) -> None:
@@ -220,24 +246,89 @@ class Filter:
         """Boundaries that are now older than the lag, each once."""
         s = self._state
         while self._now[-1] < 0.5:  # off the task nothing is a boundary of it
-            mean, variance, come, early = boundary(s.table, s.count, self.num_steps, s.settled, before)
+            mean, variance, come, early = boundary(s.rows, s.count, self.num_steps, s.settled, before)
             if early < 0.5 or come <= 0:
                 return
-            self._settled(s.settled, mean, variance)
+            del self.crossings[s.settled :]
+            self.crossings.append(self._crossing(s.settled, mean, math.sqrt(variance)))
             s.settled += 1
-
-    def _settled(self, number: int, mean: float, variance: float) -> None:
-        del self.crossings[number:]
-        self.crossings.append(self._crossing(number, mean, math.sqrt(variance)))
 
     def _crossing(self, number: int, mean: float, sd: float) -> Crossing:
         """A boundary from the filter, or from the rows around it where these say it more finely."""
         per_round = self.num_steps - 1
         before, after = (self.steps[(number + k - 1) % per_round + 1 if number + k else 0] for k in (0, 1))
-        best = self._state.table[int(self._state.table[: self._state.count, at.WEIGHT].argmax())]
         previous = self.crossings[number - 1].t if number else -math.inf
-        found = refined(self, best, before, after, previous, mean, sd)
+        found = self._refined(before, after, previous, mean, sd)
         return Crossing(after, number // per_round, *(found or (mean, sd)))
+
+    def _refined(
+        self, before: Subtask, after: Subtask, previous: float, mean: float, sd: float
+    ) -> tuple[float, float] | None:
+        """Median and sd [s] of a boundary that the filter places at `mean`; None where the rows say no more.
+
+        `previous` [s]: the boundary before.
+        """
+        touch, wrist = before.state == FREE or after.name == "place", self.rig.gripper is not None
+        start = max(mean - REACH, previous)
+        rows = [each for each in self.rows if start <= each[0] <= mean + max(self.lag, REACH)]
+        if len(rows) < 2 * NEAREST or self._now[-1] > 0.5:
+            return None
+        t = np.array([each[0] for each in rows])
+        if touch and 1.0 / np.median(np.diff(t)) > FINE:
+            return None
+        table = np.array([each[1] for each in rows])
+        there = {name: table[:, k] for k, name in enumerate(self.channels) if not np.isnan(table[:, k]).all()}
+        if set(self.channels) - set(there) - set(self.optional):
+            return None
+        timing = table[:, NUM_CHANNELS] if wrist else None
+        trial = Trial("stream", t, there, touches=tuple(self.touches), timing=timing)
+        signals = thin(task_space(trial, self.rig), MAX_RATE, WINDOW)
+        if signals.t.size < NEAREST:
+            return None
+        parameters = self._parameters()
+        found = features(signals, self.rig)
+        steps = (replace(before, index=0), replace(after, index=1))
+        levels = {}
+        for step in steps:
+            side = signals.t < mean if step.index == 0 else signals.t > mean
+            if step.state in (ON_GROUND, SLIDING) and side.any():
+                near = found.block_y(parameters.bias)[side]
+                near = near[-NEAREST:] if step.index == 0 else near[:NEAREST]
+                if np.isfinite(near).any():
+                    levels[step.index] = float(np.nanmedian(near))
+        parameters = replace(parameters, levels=(levels,))
+        chain = left_to_right([signals.t.size / 2] * 2)
+        try:
+            posterior = smooth(log_likelihoods(found, steps, parameters, 0), chain)
+        except ValueError:
+            return None
+        probability = posterior.boundary[:, 0]
+        n, t = int(probability.argmax()), signals.t
+        near = (t[n + 1], t[n + 1] + DRIFTS) if touch else (t[n] - DRIFTS, t[n])
+        contact = contacts(signals, sense([], [], (), parameters, self.rig), parameters)
+        change = contact.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
+        out = combine(t, probability, {}) if change is None else moment(change, Disagreement())
+        if wrist and FREE in (before.state, after.state):
+            out = nearest_touch(tuple(self.touches), out)
+        median = out.quantile(0.5)
+        if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
+            return None  # another event than the filter's
+        return median, out.sd
+
+    def _parameters(self) -> Parameters:
+        """What the heaviest hypothesis has learned, under the names of the segmentation off line."""
+        s = self._state
+        best = int(s.rows["weight"][: s.count].argmax())
+        h, known = s.rows[best], s.known[best]
+        sds = np.sqrt(h["scale"][:, 0] / h["scale"][:, 1]).tolist()
+        scale: dict[str, float] = dict(zip(SCALES, sds, strict=True))
+        weight, width = {}, {}
+        for o, name in enumerate(self.task.objects):
+            (load, sure), (size, seen) = known[2 * o : 2 * o + 2].tolist()
+            weight[name] = max(load / sure, 1e-3) if sure > 0 else 10 * scale["force"]
+            if seen > 0:
+                width[name] = size / seen
+        return Parameters(h["bias"][:, 0] / h["bias"][:, 1], weight, scale, width)
 
     def properties_text(self, answer: Answer) -> str:
         """The properties as JSON, written anew once an independent reading, as they change no faster."""
@@ -245,24 +336,24 @@ class Filter:
             self._written, self._written_t = answer.properties_json(), answer.t
         return self._written
 
-    @property
-    def failed_now(self) -> bool:
-        """Whether the recording has more likely than not left its task."""
-        return bool(self._now[-1] > 0.5)
-
     def answer(self, final: bool = False) -> Answer:
         """What is known now."""
         s = self._state
         if not s.started:
-            self._now[:], self._smoothed[:] = 0.0, 0.0
+            self._now[:], self._smoothed[:], self._means[:] = 0.0, 0.0, 0.0
             self._now[0] = self._smoothed[0] = 1.0
-            self._means[:] = 0.0
-            self._best[:] = 0.0
         else:
-            summarise(s.table, s.count, self.num_steps, s.last_t - self.lag, self.layout.num_objects,
-                      self.layout.num_moves, self.layout.rises, self._now, self._smoothed, self._means,
-                      self._best)  # fmt: skip
-        return Answer(self, s.last_t, self._now, self._smoothed, self._means, self._best, final)
+            blocks, before = len(self.task.objects), s.last_t - self.lag
+            on, off = summarise(s.rows, s.known, s.count, self.num_steps, blocks, before, self._now,
+                                self._smoothed, self._means)  # fmt: skip
+            if on >= 0:
+                self._round = int(s.rows["round"][on])
+            if off >= 0:
+                missed, left_at, state = (s.rows[name][off].item() for name in ("missed", "left_at", "state"))
+                self._departed = missed, left_at, state - self.num_steps
+        return Answer(
+            self, s.last_t, self._now, self._smoothed, self._means, self._round, self._departed, final
+        )
 
     def finish(self) -> Answer:
         """The last answer: every boundary that has come is settled, whatever its age."""
@@ -279,22 +370,81 @@ class Filter:
     def snapshot(self) -> Any:
         """All that changes, to return to with `restore`."""
         s = self._state
-        state = copy.copy(s)
-        state.table, state.history = s.table[: s.count].copy(), s.history.copy()
-        state.extremes, state.spans = s.extremes.copy(), s.spans.copy()
-        return state, len(self.crossings), list(self._waiting), self._now.copy()
+        big = (
+            s.rows[: s.count].tobytes(),
+            s.known[: s.count].copy(),
+            s.ring.tobytes(),
+        )  # named ones copy slowly
+        small = copy.copy(s), s.extremes.copy(), s.ranges.copy()
+        return small, big, len(self.crossings), list(self._waiting), self._now.copy()
 
     def restore(self, snapshot: Any) -> list[tuple[float, np.ndarray]]:
         """Return to an earlier point; the rows taken since."""
-        state, crossings, self._waiting = snapshot[0], snapshot[1], list(snapshot[2])
-        table = self._state.table
-        table[: state.count] = state.table
-        self._state = copy.copy(state)
-        self._state.table, self._state.history = table, state.history.copy()
-        self._state.extremes, self._state.spans = state.extremes.copy(), state.spans.copy()
-        self._now[:] = snapshot[3]
+        (state, extremes, ranges), (rows, known, ring), crossings, waiting, now = snapshot
+        self._state = s = copy.copy(state)
+        s.rows[: s.count], s.known[: s.count] = np.frombuffer(rows, HYPOTHESIS), known
+        s.ring, s.extremes, s.ranges = np.frombuffer(ring, ROW).copy(), extremes.copy(), ranges.copy()
+        self._waiting, self._now[:] = list(waiting), now
         del self.crossings[crossings:]
         since = [each for each in self.rows if each[0] > state.last_t]
         for _ in since:
             self.rows.pop()
         return since
+
+
+class Properties:
+    """What the means of weights, widths and rises say of every block, with errors that all rows share.
+
+    `steady` (num_moves,): whether a move rises by the same heights in every round; `signs` (num_moves,):
+    which way it goes where that is known, 0 elsewhere.
+    """
+
+    def __init__(self, task: BlockTask, rounds: Sequence[BlockTask], rig: Rig) -> None:
+        self.objects = task.objects
+        each = [height_equations(one_round(one)) for one in rounds]
+        self.steady = [len({str(sorted(e[m][1].items())) for e in each}) == 1 for m in range(len(task.moves))]
+        self.equations = np.zeros((len(task.moves), len(task.objects)))
+        self.signs = np.zeros(len(task.moves))
+        for move, rise in each[0]:
+            if self.steady[move] and rise and not task.moves[move].slide:
+                for name, coefficient in rise.items():
+                    self.equations[move, task.objects.index(name)] = coefficient
+                if len({np.sign(v) for v in rise.values()}) == 1:
+                    self.signs[move] = np.sign(next(iter(rise.values())))
+        gain = np.array(rig.systematic.force_gain)
+        self.weight_gain = float(np.hypot(gain[1], gain[3]) / 2)  # half of it on each finger
+        self.touch_sd = 0.0  # how well the distance at which fingers touch is known, in all grips alike [m]
+        self.force_sd = 0.0  # how well the zero of the net force is known, in all grips alike [N]
+        self._seen: bytes = b""
+        self._heights: list[tuple[str, str, float, float]] = []
+
+    def table(self, means: np.ndarray) -> list[tuple[str, str, float, float]]:
+        """(object, property, mean, sd) of what is known more likely than not."""
+        out = []
+        for o, name in enumerate(self.objects):
+            (weight, of_weight, weighed), (width, of_width, seen) = means[2 * o : 2 * o + 2].tolist()
+            if weighed > 0.5:
+                variance = of_weight + (self.weight_gain * weight) ** 2 + self.force_sd**2
+                out.append((name, "weight", weight, math.sqrt(variance)))
+            if seen > 0.5:
+                out.append((name, "width", width, math.sqrt(of_width + self.touch_sd**2)))
+        rises = means[2 * len(self.objects) :]
+        if rises.size and rises[:, 2].max() > 0.5:
+            key = rises.tobytes()
+            if key != self._seen:
+                self._seen, self._heights = key, self._solve(rises)
+            out += self._heights
+        return out
+
+    def _solve(self, rises: np.ndarray) -> list[tuple[str, str, float, float]]:
+        """Heights that the rises determine, by weighted least squares."""
+        used = (rises[:, 2] > 0.5) & (self.equations != 0).any(axis=1)
+        if not used.any():
+            return []
+        a = self.equations[used] / np.sqrt(rises[used, 1])[:, None]
+        inverse = np.linalg.pinv(a.T @ a)
+        mean = inverse @ a.T @ (rises[used, 0] / np.sqrt(rises[used, 1]))
+        determined = np.abs(np.linalg.pinv(a) @ a - np.eye(len(self.objects))).max(axis=1) < 1e-9
+        sd = np.sqrt(np.diag(inverse))
+        return [(name, "height", float(mean[o]), float(sd[o]))
+                for o, name in enumerate(self.objects) if determined[o]]  # fmt: skip

@@ -80,10 +80,19 @@ class Watcher:
         return self.filter.lag
 
     def update(self, t: float, channels: Sequence[float] | Mapping[str, float] | np.ndarray) -> Answer:
-        """One row: time [s] and the channels in SI units, NaN where missing.
+        """Take one row.
 
-        Missing velocities of a Cartesian hand, NaN throughout, are derived from positions. The answer is of
-        the newest row; its `note` says what was irregular about this one.
+        Args:
+            t: its time [s].
+            channels: one number for each of `channels` in that order, or a dict by name; SI units, NaN where
+                missing. Velocities of a Cartesian hand that are always missing are derived from positions.
+
+        Returns:
+            What is known at the newest row; `note` says what was irregular about this one.
+
+        Raises:
+            ValueError: for another number of channels, or a time that is not finite.
+            InputError: for an orientation that cannot be, or lifts that pull up.
         """
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]

@@ -4,6 +4,10 @@ As `hmmseg.hand.wrist`, with what the rows so far tell. What the tool itself put
 the free motion before the first grip, so nothing can be said before that (all of it is the task's first
 subtask anyhow), and anew at every further one. Motion is smoothed over a window, so rows come out a window
 late; while the gripper closes or lets go, until it is known when it touched.
+
+Off line a closing is read from both of its ends (`hmmseg.hand.wrist`). While it happens, a touch shows only
+once the gripper stands, some tens of milliseconds after it; until then nobody knows whether samples since
+it slowed down were of a grip. Those are held back.
 """
 
 from __future__ import annotations
@@ -11,17 +15,28 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hand.tool import WINDOW, FreeMotion, Pose, Tool, applied_force, free_motion, pose_of, tool_of
-from hmmseg.hand.wrist import TOGETHER, Grip, as_fingers, give_of, grip_force_of, lifts_pull
+from hmmseg.hand.wrist import (
+    LEAST_CLOSING,
+    SLOWED,
+    STEP,
+    TOGETHER,
+    Grip,
+    as_fingers,
+    give_of,
+    grip_force_of,
+    grip_of,
+    lifts_pull,
+)
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
-from hmmseg.online.closing import Closings
-from hmmseg.online.load import Went
-from hmmseg.robust import bridged
+from hmmseg.levels import MOVED, SURE
+from hmmseg.robust import NORMAL, bridged, robust_sd
 
 WHERE = "stream"
 BATCH = 0.02  # numerics: s that are turned into fingers together
@@ -42,8 +57,7 @@ class Wrist:
     """
 
     def __init__(self, rig: Rig) -> None:
-        assert rig.gripper is not None
-        self.rig, self.gripper, self.names = rig, rig.gripper, rig.gripper.channels
+        self.rig, self.gripper, self.names = rig, rig.wrist, rig.wrist.channels
         self._rows: list[tuple[float, tuple[float, ...]]] = []  # in order of time, a window's context
         self._out = -math.inf  # up to where rows have come out
         self._opening = Closings(self._gives)
@@ -97,7 +111,7 @@ class Wrist:
         return None
 
     def ready(self, final: bool = False) -> list[tuple[float, np.ndarray]]:
-        """Rows that can be told of now, each once; with `final` all that are left."""
+        """Rows that are ready now, each once; with `final` all that are left."""
         if not self._rows:
             return []
         newest = self._rows[-1][0]
@@ -271,3 +285,197 @@ def checked(rig: Rig, t: float, row: np.ndarray) -> None:
     if math.isfinite(norm) and not abs(norm - 1) < 0.05:
         where = f"{WHERE}: t = {t:.9g} s: columns {', '.join(gripper.quaternion)}"
         raise InputError(where, f"a quaternion of norm {norm:.3g}", "a norm of 1 (x, y, z, w)")
+
+
+STAND = 0.1  # chosen: s of next to no motion: the gripper stands
+STILL = 0.1  # chosen: share of a closing's top speed that is next to none
+SAMPLES = 4  # numerics: of a stand at least, and steps: what the touch is read from
+PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
+NOISE = 200  # numerics: samples that tell the opening's noise
+CLEAR = 10.0  # chosen: noise scales of a motion, as off line
+REMEMBERED = 10.0  # numerics: s of a closing that are kept
+OPENING = 0.1  # chosen: share of the way back at which a gripper has surely let go, as off line
+
+
+class Held:
+    """One grip: from `start` to `stop` [s], inf while it lasts; `grip` as off line."""
+
+    def __init__(self, start: float, grip: Grip) -> None:
+        self.start, self.stop, self.grip = start, math.inf, grip
+
+
+class Closings:
+    """Follows an opening, sample by sample.
+
+    `grips`: the last two. `known` [s]: up to when it is known what is held. `give` says of a closing's
+    times what the pads give in it [m], None where nothing tells.
+    """
+
+    def __init__(self, give: Callable[[np.ndarray, np.ndarray], float | None]) -> None:
+        self._give = give
+        self.grips: deque[Held] = deque(maxlen=2)
+        self.known = -math.inf
+        self.closing, self.number = False, 0  # whether it closes now, and how many grips there were
+        self.refused: Held | None = None  # the last one, where it was no grip
+        self._kept: deque[tuple[float, float]] = deque()  # since the widest opening before
+        self._low, self._high = math.inf, -math.inf
+        self._noise, self._seen = 0.0, 0
+        self._recent: deque[float] = deque(maxlen=NOISE // 10)
+        self._fastest, self._slowed, self._floor, self._wide = 0.0, -math.inf, math.inf, math.nan
+
+    @property
+    def held(self) -> Held | None:
+        """The grip that lasts."""
+        return self.grips[-1] if self.grips and self.grips[-1].stop == math.inf else None
+
+    @property
+    def swing(self) -> float:
+        """Least motion of the opening that counts [m]."""
+        return max(0.1 * (self._high - self._low), CLEAR * self._noise, LEAST_CLOSING)
+
+    def free(self, t: float, opening: float) -> bool:
+        """Whether a sample is surely of free motion: outside of every grip, more open than halfway."""
+        for held in self.grips:
+            if t >= held.start and (t < held.stop or opening < (held.grip.held + self._high) / 2):
+                return False
+        return t <= self.known
+
+    def take(self, t: float, opening: float) -> None:
+        """The next sample."""
+        self._learn_noise(opening)
+        self._low, self._high = min(self._low, opening), max(self._high, opening)
+        if self.held is not None:
+            self._hold(t, opening)
+            return
+        kept = self._kept
+        if not self.closing:
+            if not kept or opening >= kept[0][1]:
+                kept.clear()
+            self._keep(t, opening)
+            self.known = t
+            if opening < kept[0][1] - self.swing:
+                self.closing, self._fastest, self._slowed = True, 0.0, t
+                self._floor = opening
+            return
+        self._keep(t, opening)
+        self._close(t, opening)
+
+    def _learn_noise(self, opening: float) -> None:
+        """Noise of one sample [m] from second differences, as off line."""
+        self._recent.append(opening)
+        n = len(self._recent)
+        if self._seen < NOISE and n == NOISE // 10:
+            self._seen += n
+            bent = np.abs(np.diff(self._recent, 2))
+            self._noise = max(self._noise, NORMAL * float(np.median(bent)) / np.sqrt(6))
+            self._recent.clear()
+
+    def _speed(self, over: float) -> float:
+        """Closing speed over the last `over` s [m/s]."""
+        t, opening = self._kept[-1]
+        for then, before in reversed(self._kept):
+            if t - then >= over - 1e-9:
+                return (before - opening) / (t - then)
+        return math.nan
+
+    def _close(self, t: float, opening: float) -> None:
+        self._floor = min(self._floor, opening)
+        if opening > self._floor + self.swing:  # it opens again and has gripped nothing
+            self._open(t, opening)
+            return
+        fast = self._speed(STEP)
+        if fast >= SLOWED * self._fastest:
+            self._slowed = t
+        self._fastest = max(self._fastest, fast)
+        self.known = max(self._slowed, t - PATIENCE)
+        if t - self._slowed < STAND or not self._speed(STAND) < STILL * self._fastest:
+            return
+        times, way = np.array(self._kept).T
+        end = times.size - 1
+        stands = end - int(np.argmax(way <= way[end] + OPENING * (way[0] - way[end])))
+        if stands < max(SAMPLES, int(SAMPLES * STEP / float(np.median(np.diff(times))))):
+            return
+        grip = grip_of(times, way, np.zeros(times.size, bool), (0, end, end), self._give(times, way))
+        if grip is None:
+            self._open(t, opening)
+            return
+        self.grips.append(Held(max(float(times[grip.start]), self.known), grip))
+        self.refused = None
+        self.closing, self.known, self._wide = False, t, math.nan
+        self.number += 1
+
+    def _hold(self, t: float, opening: float) -> None:
+        held = self.grips[-1]
+        self._keep(t, opening)
+        self._floor = min(self._floor, opening)
+        if opening < held.grip.held - self.swing:  # it had only paused
+            self.refused = self.grips.pop()
+            self.closing, self._slowed, self.known = True, t, held.start
+            return
+        if opening <= held.grip.width:
+            self._wide, self.known = math.nan, t
+            return
+        if math.isnan(self._wide):
+            self._wide = t
+        self.known = max(self.known, t - PATIENCE)
+        if opening > max(held.grip.width, self._floor + OPENING * (self._high - self._floor)):
+            held.stop = self._wide
+            self._open(t, opening)
+
+    def refuse(self) -> None:
+        """The grip that lasts turns out to hold nothing."""
+        self.refused = self.grips.pop()
+        self._open(*self._kept[-1])
+
+    def _keep(self, t: float, opening: float) -> None:
+        self._kept.append((t, opening))
+        while t - self._kept[0][0] > REMEMBERED:
+            self._kept.popleft()
+
+    def _open(self, t: float, opening: float) -> None:
+        self.closing, self.known = False, t
+        self._floor = math.inf
+        self._kept.clear()
+        self._kept.append((t, opening))
+
+
+WENT = 20  # numerics: samples of a hand that goes somewhere before what it bears is judged
+
+
+class Went:
+    """What a hand that holds on to something bears once it has gone somewhere."""
+
+    def __init__(self) -> None:
+        self._start: tuple[float, np.ndarray] | None = None
+        self._last, self._decided = -math.inf, False
+        self._up: list[float] = []
+        self._across: list[float] = []
+        self._raised = 0
+
+    def take(self, t: float, height: float, position: np.ndarray, up: float, across: float, apart: float
+             ) -> None:  # fmt: skip
+        """One sample: where it is and what it does to the world; nearer than `apart` [s] they count once."""
+        if self._start is None:
+            self._start = height, position
+        if self._decided or t < self._last + apart:
+            return
+        raised = height > self._start[0] + MOVED
+        if raised or np.linalg.norm(position - self._start[1]) > MOVED:
+            self._last = t
+            self._up.append(up)
+            self._across.append(across)
+            self._raised += raised
+
+    def load(self, noise: float) -> float | None:
+        """The load [N], 0 for nothing, below 0 for one that pulls up; None before or after it is judged."""
+        n = len(self._up)
+        if self._decided or n < WENT:
+            return None
+        self._decided = True
+        limit = SURE / math.sqrt(n / TOGETHER)
+        up, across = np.array(self._up), np.array(self._across)
+        found, aside = float(np.median(up)), float(np.median(across))
+        scatter = [max(robust_sd(v - np.median(v)), noise) for v in (up, across)]
+        if 2 * self._raised > n and abs(found) > limit * scatter[0]:
+            return found
+        return 1.0 if abs(aside) > limit * scatter[1] or abs(found) > limit * scatter[0] else 0.0

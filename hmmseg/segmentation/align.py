@@ -6,7 +6,6 @@ that fit are fitted together, so that they share blocks, biases and pads, and ev
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
-from hmmseg.contact.equations import block_width
+from hmmseg.hand.read import LongRecording
 from hmmseg.hand.signals import Signals, task_space, timely, with_heights
-from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
@@ -35,7 +33,6 @@ from hmmseg.segmentation.conformity import (
 )
 from hmmseg.segmentation.emissions import WINDOW, Features, Parameters, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
-from hmmseg.segmentation.free_contacts import astride, standing
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import (
@@ -136,8 +133,7 @@ def _read(signals: Signals, rig: Rig, taps: Spans) -> Reading:
 class Piece:
     """One round of one recording (of a task done once: all of it), aligned.
 
-    `first`, `last` [s] are its ends; `failed` counts subtasks from its own first. `remarks`: what was done
-    in addition to the task.
+    `first`, `last` [s] are its ends; `failed` counts subtasks from its own first.
     """
 
     boundaries: tuple[BoundaryPosterior, ...]
@@ -146,7 +142,6 @@ class Piece:
     evidence: float
     first: float
     last: float
-    remarks: tuple[str, ...] = ()
 
 
 def aligned_rounds(
@@ -214,28 +209,7 @@ def _aligned(reading: Reading, steps: tuple[Subtask, ...], pool: Pool, j: int) -
     boundaries = boundary_posteriors(pool.changes[j], pool.disagreement, t, alignment, reading.fine.touches)
     evidence = float(alignment.log_evidence)
     spans = to_spans(steps, boundaries, *reading.ends)
-    remarks = _closed_on_others(reading, spans, pool.fit.parameters)
-    return Piece(boundaries, spans, None, evidence, *reading.ends, remarks)
-
-
-def _closed_on_others(reading: Reading, spans: Sequence[Span], p: Parameters) -> tuple[str, ...]:
-    """What is said of fingers that closed on something wider before they held their block."""
-    s, out = reading.fine, []
-    force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1) - p.bias
-    press = np.stack([force[:, 0], -force[:, 2]], axis=1)
-    apart = block_width(s.distance, force[:, 0], force[:, 2], reading.features.pads)
-    noise = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
-    for before, grip in itertools.pairwise(spans):
-        width = p.width.get(str(grip.object))
-        if before.state != FREE or grip.state == FREE or width is None:
-            continue
-        met = astride(s.t, press, apart, noise, width, grip.start)
-        if met is not None:
-            out.append(
-                f"the fingers closed on something {1e3 * met[1]:.0f} mm wide at {met[0]:.2f} s, before they "
-                f"held {grip.object}: on what it stands on, or on what the task does not name"
-            )
-    return tuple(out)
+    return Piece(boundaries, spans, None, evidence, *reading.ends)
 
 
 def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity, pool: Pool) -> Piece:
@@ -257,17 +231,8 @@ def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity,
     every = to_spans(shown.steps, found, *ends)
     spans = (*every[: shown.num_before], *every[len(every) - shown.num_after :])
     step = steps[verdict.failing]
-    reason = explain(verdict, steps, [span.start for span in every], _stands(reading.thinned, every))
+    reason = explain(verdict, steps, [span.start for span in every])
     return Piece(boundaries, spans, Failure(step.index, step.name, step.object, reason), evidence, *ends)
-
-
-def _stands(s: Signals, spans: Sequence[Span]) -> np.ndarray:
-    """Times [s] at which a finger stands on something."""
-    free = np.zeros(s.t.size, bool)
-    for span in spans:
-        free |= (span.state == FREE) & (s.t >= span.start) & (s.t < span.end)
-    force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1)
-    return s.t[standing(s.t, force, s.sd_force, free)]
 
 
 def joined(
@@ -302,7 +267,7 @@ def joined(
     segmentation = Segmentation(
         file, rate, sum(p.evidence for p in pieces), tuple(spans), failures[0] if failures else None,
         len(pieces) if number > 1 or open_end else None, tuple(failures), recorded,
-        (*remarks, *(f"{file}: {r}" for piece in pieces for r in piece.remarks)),
+        remarks,
     )  # fmt: skip
     return segmentation, tuple(boundaries), present
 

@@ -45,10 +45,10 @@ class Crossing:
 
     `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise.
     `kind`: "smooth" motion through the crossing; "impact": the crossing stops it (a touch, a
-    touchdown); "launch": it sets in with the crossing (a block that was held down lifts off). `anywhere`:
-    probability that it happened at some moment of the interval, whatever the motion. `earlier`: how long
-    before the left end [s] another sample was, its value and its rate. `restless` [m^2/s^3]: variance
-    a second by which the rate wanders where another motion may begin within the interval; 0: it is one.
+    touchdown); "launch": it sets in with the crossing (a block that was held down lifts off).
+    `earlier`: how long before the left end [s] another sample was, its value and its rate. `restless`
+    [m^2/s^3]: variance a second by which the rate wanders where another motion may begin within the
+    interval; 0: it is one.
     """
 
     left: float
@@ -59,7 +59,6 @@ class Crossing:
     sd_right: float
     sd_v: float
     kind: Kind = "smooth"
-    anywhere: float = 0.0
     earlier: tuple[float, float, float] | None = None
     restless: float = 0.0
 
@@ -297,7 +296,7 @@ def _single_density(c: Crossing, h: float) -> np.ndarray:
     u = (np.arange(POINTS) + 0.5) / POINTS
     log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, u)
     density = np.exp(log_density - log_density.max())
-    return (1 - c.anywhere) * density / density.sum() + c.anywhere / POINTS
+    return density / density.sum()
 
 
 def first_of(crossings: list[Crossing], width: float) -> np.ndarray:

@@ -13,9 +13,8 @@ near the ground); these samples do. The alignment says which contact is meant.
 
 Force and position must agree where there is contact. By how much they do not, at the contacts nearest to
 the changes of one kind in all recordings at hand (a block that a first finger pushed, a table that yields,
-pads that creep), is a discrepancy [m] that positions are then allowed. How often a force is silent while
-positions still find the pad pressed is the share of contacts that end abruptly. A change that may be one of
-several things (a grip that ends, the later of two touches) is a mixture of them.
+pads that creep), is a discrepancy [m] that positions are then allowed. A change that may be one of several
+things (a grip that ends, the later of two touches) is a mixture of them.
 """
 
 from __future__ import annotations
@@ -25,13 +24,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr
 
 from hmmseg.levels import SURE, TAIL
 from hmmseg.segmentation.boundaries import (
     ONSET,
     POINTS,
-    UNIFORM,
     BoundaryPosterior,
     Crossing,
     Kind,
@@ -178,19 +176,16 @@ class Prior:
             return np.log(out * inside)
 
 
-ROUNDS = 20  # numerics: of expectation and maximisation
-SEEN = 4.0  # prior: contacts that the prior of an abrupt end is worth
+SEEN = 4.0  # prior: samples that the prior of forces no louder than their noise is worth
 
 
 @dataclass(frozen=True)
 class Disagreement:
     """Model error of changes of one sort: `position` [m] that positions are allowed where there is contact;
-    `abrupt`: share of contacts that end at once, by a pad that slips off or turns, before it is relaxed.
     `louder`: what forces are of their noise after a change, as they ring, or come late.
     """
 
     position: float = DISCREPANCY
-    abrupt: float = UNIFORM
     louder: float = 1.0
 
 
@@ -253,7 +248,7 @@ def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreem
     """What the changes of each sort show of where force and position disagree."""
     sorts = dict.fromkeys(change.sort for change in changes)
     return {
-        sort: Disagreement(_discrepancy(own), _abruptness(own), _loudness(changes, sort[1]))
+        sort: Disagreement(_discrepancy(own), _loudness(changes, sort[1]))
         for sort in sorts
         for own in [[c for c in changes if c.sort == sort]]
     }
@@ -280,19 +275,6 @@ def _discrepancy(changes: Sequence[Change]) -> float:
     return float(np.sqrt((apart.size * excess + KNOWN * DISCREPANCY**2) / (apart.size + KNOWN)))
 
 
-def _abruptness(changes: Sequence[Change]) -> float:
-    """Share of contacts that end before the position's way is spent: by maximum likelihood, and its prior."""
-    z = np.array([
-        inside(c, _last_pressed(c, n)) for change in changes if not change.making
-        for c, n in zip(change.contacts, change.intervals, strict=True)
-    ])  # fmt: skip
-    z = z[np.isfinite(z)]
-    share = UNIFORM
-    for _ in range(ROUNDS):
-        share = (abrupt(share, z).sum() + UNIFORM * SEEN) / (z.size + SEEN)
-    return float(share)
-
-
 def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
     """What forces are of their noise where positions say for sure that there is no contact any more.
 
@@ -309,25 +291,6 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
     # Of a normal distribution; half of the samples may be anything.
     excess = max(float(np.median(z2)) / 0.455 - 1.0, 0.0)
     return float(np.sqrt(1.0 + z2.size * excess / (z2.size + SEEN)))
-
-
-def abrupt(share: float, z: np.ndarray | float) -> np.ndarray:
-    """Probability that a contact ended abruptly whose place is z sds inside when its force is silent.
-
-    A relaxed pad is then anywhere outside, of an abrupt end the place is as likely inside.
-    """
-    return np.asarray(share / (share + (1 - share) * 2 * ndtr(-np.asarray(z))))
-
-
-def inside(c: Penetration, n: int) -> float:
-    """How far inside, in sds of noise, a contact's place still is at the end of interval n."""
-    return float(c.place[n + 1] / c.sd_place)
-
-
-def _last_pressed(c: Penetration, n: int) -> int:
-    """The interval up to n at whose start the force last shows contact, whatever positions say."""
-    sure = np.flatnonzero(c.pressed[: n + 1] > SURE * c.sd_pressed)
-    return int(sure[-1]) if sure.size else n
 
 
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
@@ -425,5 +388,4 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
             return found
         then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
         return replace(found, earlier=then) if np.isfinite(then).all() else found
-    share = abrupt(known.abrupt, inside(c, n)) if kind == "smooth" else 0.0
-    return Crossing(-pressed, -gap, -before, -after, sd_pressed, c.sd_place, c.sd_rate, kind, float(share))
+    return Crossing(-pressed, -gap, -before, -after, sd_pressed, c.sd_place, c.sd_rate, kind)

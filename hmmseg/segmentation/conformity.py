@@ -496,12 +496,10 @@ def at(t: float) -> BoundaryPosterior:
     return BoundaryPosterior(np.array([t]), np.array([1.0]))
 
 
-def explain(
-    c: Conformity, steps: tuple[Subtask, ...], starts: Sequence[float], stands: np.ndarray | None = None
-) -> str:
+def explain(c: Conformity, steps: tuple[Subtask, ...], starts: Sequence[float]) -> str:
     """Why the failing subtask is not there, in plain words.
 
-    `starts` [s]: when each step of the order shown starts; `stands` [s]: when a finger stood on something.
+    `starts` [s]: when each step of the order shown starts.
     """
     if c.failing is None:
         raise ValueError("the trial fits its task")
@@ -518,7 +516,7 @@ def explain(
     if left == 0:
         return f"the recording starts while a block is {PHRASES[c.runs[0].state]}"
     if c.runs[left].state == FREE:
-        return _stood(steps[left - 1], left, starts, stands) or _let_go(c, steps[left - 1], left, starts)
+        return _let_go(c, steps[left - 1], left, starts)
     if c.runs[left - 1].state == FREE:
         return _gripped(c, steps, left, starts[left])
     step, then = steps[left - 1], PHRASES[c.runs[left].state]
@@ -531,20 +529,6 @@ def _ended(last: Subtask, runs: Sequence[Run]) -> str:
     grips = sum(a.state == FREE != b.state for a, b in itertools.pairwise(runs))
     number = {0: "", 1: "second ", 2: "third "}.get(grips, "further ")
     return f"no {number}grip: the recording ends in free motion"
-
-
-def _stood(held: Subtask, left: int, starts: Sequence[float], stands: np.ndarray | None) -> str:
-    """What is said of a grip that never lifted, where a finger stood on something meanwhile."""
-    if stands is None or held.name != "pickup":
-        return ""
-    before = starts[left - 2] if left > 1 else -np.inf  # free motion before the grip
-    then = stands[(stands >= before) & (stands < starts[left])]
-    if not then.size:
-        return ""
-    return (
-        f"a finger pushed down on something at {then[0]:.2f} s, harder than a grip could, before "
-        f"{held.object} was held: on the ground, or on what the task does not name"
-    )
 
 
 def _let_go(c: Conformity, held: Subtask, left: int, starts: Sequence[float]) -> str:

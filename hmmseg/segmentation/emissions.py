@@ -24,13 +24,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
+from hmmseg.densities import log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
-from hmmseg.levels import MOVED, TAIL
+from hmmseg.levels import MOVED
 from hmmseg.robust import white_sd
 from hmmseg.tables import Brief
 
@@ -118,27 +118,6 @@ class Parameters:
     levels: tuple[dict[int, float], ...] = ()
 
 
-def log_student(residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
-    """Log density of a Student-t residual; 0 where the residual is missing (NaN)."""
-    constant = gammaln((TAIL + 1) / 2) - gammaln(TAIL / 2) - 0.5 * np.log(TAIL * np.pi)
-    value = constant - np.log(scale) - (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL)
-    return np.where(np.isfinite(value), value, 0.0)
-
-
-def log_student_below(z: np.ndarray) -> np.ndarray:
-    """Log probability that a standard Student-t variable (of TAIL degrees of freedom) lies below z."""
-    root = np.sqrt(z**2 + TAIL)
-    above = np.where(z < 0, TAIL / (root * (root - z)), 1 + z / root)  # 1 + z / root without cancellation
-    return 2 * np.log(above) + np.log(3 - above) - np.log(4)
-
-
-def _log_between(value: np.ndarray, low: float, high: float, scale: float) -> np.ndarray:
-    """Log density of a uniform on [low, high] with noise-softened edges; 0 where missing."""
-    soft = log_student_below((value - low) / scale) + log_student_below((high - value) / scale)
-    # Bounded below: one wild sample is a transient, not proof against a state.
-    return np.where(np.isfinite(value), np.maximum(soft, -25.0) - np.log(high - low), 0.0)
-
-
 def _log_mostly(residual: np.ndarray, scale: np.ndarray, span: float, stray: float) -> np.ndarray:
     """Log density of a residual that is small but for a share `stray` of samples; 0 where missing."""
     close = np.log1p(-stray) + log_student(residual, scale)
@@ -188,7 +167,7 @@ def _log_ungripped(force: np.ndarray, scale: float, span: float, rung: float) ->
     silent = log_student(force, scale)
     fingers = silent[:, :2].sum(axis=1), silent[:, 2:].sum(axis=1)
     touching = [
-        _log_between(sign * force[:, c], 0.0, span, scale) + _log_between(force[:, c + 1], -span, span, scale)
+        log_between(sign * force[:, c], 0.0, span, scale) + log_between(force[:, c + 1], -span, span, scale)
         for sign, c in ((1.0, 0), (-1.0, 2))
     ]
     loud = np.log(2 * np.log1p(span / scale)) + np.log(np.abs(force) + scale)
@@ -247,7 +226,7 @@ def _broad(f: Features, *names: str) -> np.ndarray:
 def _log_held(f: Features, p: Parameters, force: np.ndarray) -> np.ndarray:
     """Log density of the forces that press a block between the fingers, but for the net vertical one."""
     grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
-    out = _log_between(grip, 0.0, f.span["force"], p.scale["force"])
+    out = log_between(grip, 0.0, f.span["force"], p.scale["force"])
     if f.free is not None:
         out += SHUT * (f.free == 1)
     shear = (force[:, 1] - force[:, 3]) / 2
@@ -279,7 +258,7 @@ def _log_gripped(
         return np.logaddexp(np.log1p(-LOST) + out, np.log(LOST) + free)
     if state not in (ON_GROUND, SLIDING):
         raise ValueError(f"no emission for the contact state {state!r}")
-    out = grip + _log_between(fy, -f.span["press"], weight, scale["carry"])
+    out = grip + log_between(fy, -f.span["press"], weight, scale["carry"])
     aside = None if state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
     upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), _broad(f, "vy")
     if level is None:  # where it rests is not known

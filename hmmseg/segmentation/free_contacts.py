@@ -6,10 +6,6 @@ other. Emissions are those of `hmmseg.segmentation.emissions`, but for two thing
 hold would need its own), and a lifted block may also be held still, which must not pass for a rest on
 something. Fitted by Viterbi training from robust starts, so that an order forced on a trial that does not
 have it cannot spoil weights or widths.
-
-A pad that holds a block by its side passes on at most its friction, |fy| <= mu |fx| (Coulomb). A finger
-that pushes down harder than that stands on something; fingers that both press while they are farther apart
-than their block is wide have something else between them.
 """
 
 from __future__ import annotations
@@ -23,8 +19,8 @@ from scipy.special import log_ndtr
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense as ergodic
-from hmmseg.levels import MOVED, SURE
-from hmmseg.robust import NORMAL, median_of_known, robust_sd
+from hmmseg.levels import SURE
+from hmmseg.robust import NORMAL, median_of_known
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
@@ -136,58 +132,6 @@ def runs(found: np.ndarray) -> list[tuple[int, int]]:
     """Where each stretch of true samples starts and stops."""
     edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-FRICTION = 1.5  # cited: rubber on dry solids reaches about 1 to 1.4 (Persson, J. Chem. Phys. 115, 2001)
-CLEAR = 6.0  # numerics: standard deviations, so that no noise of an hour at 1 kHz is taken for a touch
-BRIEF = 0.05  # physics: s; an impact of hard parts rings no longer
-
-
-def standing(t: np.ndarray, force: np.ndarray, sd_force: float, free: np.ndarray) -> np.ndarray:
-    """Booleans (num_timesteps,): samples of stretches in which a finger stands on something.
-
-    `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N] at t [s]; `sd_force`: their noise, NaN if not stated.
-    `free` (num_timesteps,) marks free motion: offsets and spread of the vertical forces are learned there.
-    """
-    out = np.zeros(t.size, bool)
-    for across, along in (force[:, :2].T, force[:, 2:].T):
-        rest = along[free & np.isfinite(along)]
-        centre = float(np.median(rest)) if rest.size else 0.0
-        spread = robust_sd(rest - centre) if rest.size else 0.0
-        limit = FRICTION * np.abs(np.nan_to_num(across)) + CLEAR * max(spread, float(np.nan_to_num(sd_force)))
-        out |= _lasting(centre - np.nan_to_num(along, nan=np.inf) > limit, t)
-    return out
-
-
-def astride(
-    t: np.ndarray, press: np.ndarray, apart: np.ndarray, sd_force: float, width: float, touch: float
-) -> tuple[float, float] | None:
-    """When fingers that close on a block first had something wider between them [s], and how wide [m] it was.
-
-    None where nothing was. `press` (num_timesteps, 2): what each finger presses inwards with [N] at t [s],
-    `sd_force` its noise; `apart` (num_timesteps,): width [m] of what is between them, if anything. The block
-    is `width` [m] wide and is touched at `touch` [s]. Fingers that press no more for longer than an impact
-    have released it meanwhile: what they did before belongs to no closing.
-    """
-    pressed = press > SURE * sd_force
-    n = int(np.searchsorted(t, touch))
-    any_pressed = np.flatnonzero(pressed[:n].any(axis=1))
-    last, first = touch, n
-    for i in any_pressed[::-1]:
-        if last - t[i] > BRIEF:
-            break
-        first, last = int(i), float(t[i])
-    found = np.flatnonzero(pressed[first:n].all(axis=1) & (apart[first:n] > width + MOVED))
-    return (float(t[first + found[0]]), float(apart[first + found[0]])) if found.size else None
-
-
-def _lasting(found: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Those stretches of `found` that last longer than an impact."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], found, [False]])))
-    out = np.zeros_like(found)
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        out[start:stop] = stop - start > 1 and t[stop - 1] - t[start] >= BRIEF
-    return out
 
 
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
@@ -349,11 +293,10 @@ def _tapped(
 ) -> list[slice]:
     """Samples of touches too brief for a grip, of a block at rest that is gripped next.
 
-    A touch lasts as long as it presses about as firmly as that grip. Fingers that stand on something touch
-    what is no block.
+    A touch lasts as long as it presses about as firmly as that grip.
     """
     held = np.array([state != FREE for state, _ in states])[path]
-    force, stands = filled(f.grip), standing(f.t, f.force, np.nan, ~held)
+    force = filled(f.grip)
     grips = [slice(*run) for run in runs(held)]
     out = []
     for grip, following in itertools.pairwise(grips):
@@ -361,9 +304,6 @@ def _tapped(
         same = {block for _, block in touched} == {states[path[following.start]][1]}
         firm = int((force[grip] > FIRM * np.median(force[following])).sum())
         brief = firm * interval <= TAP and grip.start > 0
-        longer = (grip.stop - grip.start) * interval > TAP
-        if longer and stands[grip].any():
-            continue
         if brief and same and {state for state, _ in touched} == {ON_GROUND}:
             out.append(grip)
     return out

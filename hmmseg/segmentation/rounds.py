@@ -16,8 +16,8 @@ from typing import Protocol, overload, runtime_checkable
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
+from hmmseg.hand.read import LongRecording
 from hmmseg.hand.signals import Signals, come_late, differenced, group_size, task_space
-from hmmseg.io.long import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.conformity import DEPARTURE, Conformity, assignments, column, departing, settled

@@ -1,10 +1,18 @@
-"""Emissions of plain ordered tasks: independent Student t features, tempered for dependence.
+"""What states and boundaries of a plain ordered task look like, and how states follow each other.
 
-Neighbouring cells and different channels repeat each other's evidence. Multiplying their
-likelihoods as if independent makes boundaries overconfident, so the log-likelihood is multiplied by
-`temper`, the share of independent observations: one over the integrated autocorrelation time of the
-residuals, times the effective number of features over their number (participation ratio of the
-residual correlation's eigenvalues).
+States have independent Student t features, tempered for dependence: neighbouring cells and different
+channels repeat each other's evidence, and multiplying their likelihoods as if independent would make
+boundaries overconfident. So the log-likelihood is multiplied by `temper`, the share of independent
+observations: one over the integrated autocorrelation time of the residuals, times the effective number of
+features over their number (participation ratio of the residual correlation's eigenvalues).
+
+A labelled boundary often lies at a fixed lag from what the channels show (a controller switches, contact
+follows). For every boundary the course of all channels in a window around it, without the window's mean, is
+compared with what such windows look like anywhere: a log-likelihood ratio per candidate time, added to the
+log weight of advancing. Nothing in it knows the time of day or the time since the start.
+
+Durations are geometric on the grid with a learned mean: the one law that a crop at the start does not
+disturb, and a wide one, so that the clock does not decide. States may be skipped.
 """
 
 from __future__ import annotations
@@ -14,6 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import gammaln
+
+from hmmseg.hmm import Chain
 
 DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
 ONE_CELL = 1e-9  # numerics: a state without even so much weight is left as it is
@@ -99,3 +109,130 @@ def _autocorrelation_time(r: np.ndarray) -> float:
     rho = covariance / covariance[0]
     end = int(np.argmax(rho < 0.05)) or len(rho)
     return float(1 + 2 * rho[1:end].sum())
+
+
+PRIOR_COUNT = 2.0  # prior: weight of the channel's own pooled spread against that of each lag
+LEAST_SPREAD = 0.05  # chosen: of a window's usual spread: labels are no better aligned than that
+
+
+@dataclass(frozen=True)
+class Detectors:
+    """Templates of all boundaries; windows have `2 * half` cells.
+
+    `mean`, `spread` (num_boundaries, 2 * half, num_channels), `usual` (num_channels,) the spread of
+    windows anywhere; `jitter` (num_boundaries,) [cells] how much more than their posterior says
+    held-out labels scatter; `weight` multiplies the log-likelihood ratio (neighbouring cells and
+    channels are not independent), `state_weight` the state emissions.
+    """
+
+    half: int
+    mean: np.ndarray
+    spread: np.ndarray
+    usual: np.ndarray
+    jitter: np.ndarray
+    weight: float = 0.0
+    state_weight: float = 1.0
+
+    def crossing(self, values: np.ndarray) -> np.ndarray:
+        """Log weights (num_cells - 1, num_boundaries) of crossing, from all features of a trial."""
+        return self.weight * self.log_ratios(values[:, : self.mean.shape[2]])
+
+    def log_ratios(self, values: np.ndarray) -> np.ndarray:
+        """Unweighted log-likelihood ratios (num_cells - 1, num_boundaries), one a cell edge."""
+        windows = _windows(values, self.half)
+        log_far = _log_density(windows, self.usual)
+        return np.stack([
+            np.nansum(_log_density(windows - mean, spread) - log_far, axis=(1, 2))
+            for mean, spread in zip(self.mean, self.spread, strict=True)
+        ], axis=1)  # fmt: skip
+
+
+def _log_density(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Student t, without its constant."""
+    return -(DOF + 1) / 2 * np.log1p((x / scale) ** 2 / DOF) - np.log(scale)
+
+
+def _windows(values: np.ndarray, half: int) -> np.ndarray:
+    """Windows (num_cells - 1, 2 * half, num_channels) around every edge, mean removed; NaN outside."""
+    gap = np.full((half - 1, values.shape[1]), np.nan)
+    padded = np.concatenate([gap, values, gap])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half, axis=0).swapaxes(1, 2)
+    known = np.isfinite(windows)
+    mean = np.where(known, windows, 0.0).sum(1) / np.maximum(known.sum(1), 1)
+    return windows - mean[:, None]
+
+
+def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) -> Detectors:
+    """Templates from channels [(num_cells, num_channels), ...] and labelled edges.
+
+    `edges[i][b]` is the index of the edge (between the cells of that index and the next) at
+    boundary b of trial i; -1 where the boundary shows nothing of its own (a skipped subtask). A
+    boundary that no trial shows has ratio 0 everywhere.
+    """
+    windows = [_windows(values, half) for values in trials]
+    usual = np.sqrt(np.nanmean(np.vstack(windows) ** 2, axis=(0, 1)))
+    usual = np.maximum(np.nan_to_num(usual), 1e-6)
+    near = np.stack([w[np.clip(e, 0, len(w) - 1)] for w, e in zip(windows, edges, strict=True)])
+    near[np.stack(edges) < 0] = np.nan
+    known = np.isfinite(near)
+    count = known.sum(0)
+    filled = np.where(known, near, 0.0)
+    mean = filled.sum(0) / np.maximum(count, 1)
+    square = (known * (filled - mean) ** 2).sum(0)
+    pooled = square.sum(1, keepdims=True) / np.maximum(count.sum(1, keepdims=True), 1)
+    spread = (square + PRIOR_COUNT * pooled) / (count + PRIOR_COUNT) * (1 + 1 / np.maximum(count, 1))
+    spread = np.where(count > 0, np.sqrt(spread) + LEAST_SPREAD * usual, usual)
+    return Detectors(half, mean, spread, usual, np.zeros(len(mean)))
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """Band-limited transitions, of which a chain of hmmseg.hmm is made.
+
+    `bands[d]` (num_states - d,): log weight of going from k to k + d between neighbouring cells;
+    `log_initial`, `log_final` (num_states,).
+    """
+
+    bands: tuple[np.ndarray, ...]
+    log_initial: np.ndarray
+    log_final: np.ndarray
+
+    def chain(self, crossing: np.ndarray | None = None) -> Chain:
+        """The chain; with log weights (num_cells - 1, num_boundaries) of crossing each boundary, if given.
+
+        Who skips subtasks crosses their boundaries.
+        """
+        stay, advance, *skips = self.bands
+        if crossing is not None:
+            total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
+            advance, *skips = (band + total[:, d:] - total[:, : total.shape[1] - d]
+                               for d, band in enumerate(self.bands[1:], 1))  # fmt: skip
+        return Chain(stay, advance, skips or None, log_initial=self.log_initial, log_final=self.log_final)
+
+
+def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Transitions:
+    """Transitions from mean durations [cells] and the probability that an optional state occurs."""
+    num_states = len(mean_cells)
+    skippable = np.asarray(optional, bool)
+    present = np.where(skippable, np.log(presence), 0.0)
+    absent = np.where(skippable, np.log1p(-np.where(skippable, presence, 0.5)), -np.inf)
+    leave = 1.0 / np.maximum(mean_cells, 1.5)
+    stay = np.log1p(-leave)
+    stay[-1] = 0.0  # the last state lasts as long as the recording does
+    jumps = [stay]
+    for d in range(1, max(2, _longest_run(skippable) + 2)):
+        band = np.array([
+            np.log(leave[k]) + absent[k + 1 : k + d].sum() + present[k + d] for k in range(num_states - d)
+        ])  # fmt: skip
+        jumps.append(band)
+    initial = np.array([absent[:k].sum() + present[k] for k in range(num_states)])
+    final = np.array([absent[k + 1 :].sum() for k in range(num_states)])
+    return Transitions(tuple(jumps), initial, final)
+
+
+def _longest_run(flags: np.ndarray) -> int:
+    longest = run = 0
+    for flag in flags:
+        run = run + 1 if flag else 0
+        longest = max(longest, run)
+    return longest

@@ -51,10 +51,10 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
         out = []
         for trial in self._trials(sequences):
             spans = segment_sequence([trial], order, self.model_)[0].spans
-            names = list(order.sequence)
-            edges = np.array([span.start for span in spans[1:]])
-            states = np.array([names.index(span.subtask) for span in spans] or [0])
-            out.append(states[np.searchsorted(edges, trial.t, side="right")])
+            starts, ahead = np.array([span.start for span in spans[1:]]), np.arange(1, len(spans))
+            first = np.searchsorted(trial.t, starts) - ahead  # a sample at least for each state before it
+            first = np.clip(np.maximum.accumulate(first), 0, trial.t.size - len(spans)) + ahead
+            out.append(np.searchsorted(first, np.arange(trial.t.size), side="right"))
         return out if _several(X) else out[0]
 
     def _order(self, channels: int) -> SequenceTask:

@@ -11,16 +11,16 @@ import numpy as np
 from hmmseg.hmm import Chain
 from hmmseg.hmm.learn import em, expectation
 from hmmseg.hmm.results import AlignmentPosterior
-from hmmseg.sequence.detectors import Detectors
 from hmmseg.sequence.emissions import (
+    Detectors,
     StudentEmissions,
+    Transitions,
     from_weights,
     independent_share,
     residuals,
+    transitions,
     update,
 )
-from hmmseg.sequence.model import jumps, ratios_of
-from hmmseg.sequence.transitions import Transitions, transitions
 
 FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
 STEPS_PER_FLOOR = 4  # numerics: of EM
@@ -134,10 +134,8 @@ class _Durations:
     law: Transitions
 
     def chain(self, trial: int) -> Chain:
-        if self.detectors is None:
-            return self.law.chain()
-        ratios = ratios_of(self.learner.values[trial], self.detectors)
-        return self.law.chain(jumps(ratios, self.detectors, self.law.bands))
+        d = self.detectors
+        return self.law.chain(None if d is None else d.crossing(self.learner.values[trial]))
 
     def updated(self, responsibilities: Sequence[np.ndarray]) -> _Durations:
         return replace(self, law=self.learner.law(self.learner.as_labelled(responsibilities)))

@@ -1,7 +1,13 @@
-"""What is learned of a plain ordered task, and its file."""
+"""What is learned of a plain ordered task, its file, and whether a trial follows it.
+
+Two scores of a trial are compared with those of the trials that the model was learned from: how much better
+free switching among the same states explains it than the forced order does, and how poorly even the forced
+order does per cell. Besides, a subtask squeezed to almost nothing did not happen.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,17 +15,17 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hmm import dense as ergodic
 from hmmseg.hmm.inference import align
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
-from hmmseg.sequence.detectors import Detectors
-from hmmseg.sequence.emissions import StudentEmissions
+from hmmseg.robust import NORMAL
+from hmmseg.segmentation.spans import Failure
+from hmmseg.sequence.emissions import Detectors, StudentEmissions, Transitions, transitions
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
-from hmmseg.sequence.transitions import Transitions, transitions
 from hmmseg.tables import Tabled
 
-Bands = tuple[np.ndarray, ...]  # to stay, to advance by one state, by two, ...
 FORMAT = "hmmseg.sequence-model/3"
 INDEPENDENT = 250.0  # chosen: independent observations that one trial's fit is judged by in the limit of many
 
@@ -33,7 +39,7 @@ class SequenceModel(Tabled):
     different. `mean_cells`, `presence` (num_states,): mean duration in cells and the probability
     that an optional state occurs. `typical` (num_states,) is the median duration [cells] in the
     trials learned from, `usual_scores` (2, 2) their median and width of the two scores of
-    hmmseg.sequence.misfit. Where not all labels of two trials were given, `courses` are the ways to align the
+    `misfit_scores`. Where not all labels of two trials were given, `courses` are the ways to align the
     trials and to name their changes, and boundaries are as uncertain as all of them together; `lag`
     (num_boundaries,) [cells] is how far they lie off such a change (the scale of a Laplace law), `sure`
     (num_boundaries,) the probability that the boundaries of this model are the task's.
@@ -56,10 +62,6 @@ class SequenceModel(Tabled):
     def transitions(self) -> Transitions:
         """Transitions between neighbouring cells, without boundary detectors."""
         return transitions(self.mean_cells, self.presence, optional_states(self.task, self.settled))
-
-    def weights(self, trial: SequenceFeatures) -> tuple[np.ndarray, Bands]:
-        """Log-likelihoods (num_cells, num_states) and transition bands of one trial."""
-        return weights(trial.values, self.emissions, self.detectors, self.transitions.bands)
 
     def tables(self) -> list[Any]:
         """Its states: how long they usually last, and how surely the model has their beginnings."""
@@ -86,9 +88,12 @@ class SequenceModel(Tabled):
 
     def align(self, trials: list[SequenceFeatures]) -> list[AlignmentPosterior]:
         """Posterior alignments; InfeasibleAlignment for a trial with fewer cells than subtasks."""
-        parts = [self.weights(trial) for trial in trials]
-        law = self.transitions
-        return align([p[0] for p in parts], [law.chain(p[1]) for p in parts])
+        law, d = self.transitions, self.detectors
+        lls = [self.emissions.log_likelihoods(trial.values) for trial in trials]
+        if d is None:
+            return align(lls, [law.chain()] * len(lls))
+        chains = [law.chain(d.crossing(trial.values)) for trial in trials]
+        return align([d.state_weight * ll for ll in lls], chains)
 
 
 @dataclass(frozen=True)
@@ -117,28 +122,6 @@ class NamedCourse:
 def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
     """Which states of the model may be skipped."""
     return [name in task.optional for name in task.sequence] + [True] * settled
-
-
-def weights(values: np.ndarray, emissions: StudentEmissions, detectors: Detectors | None,
-            bands: Bands) -> tuple[np.ndarray, Bands]:  # fmt: skip
-    """Log-likelihoods and bands of one trial; detectors make advancing depend on time."""
-    ll = emissions.log_likelihoods(values)
-    if detectors is None:
-        return ll, bands
-    return detectors.state_weight * ll, jumps(ratios_of(values, detectors), detectors, bands)
-
-
-def ratios_of(values: np.ndarray, detectors: Detectors) -> np.ndarray:
-    """Log ratios (num_cells - 1, num_boundaries) of one trial's boundaries."""
-    return detectors.log_ratios(values[:, : detectors.mean.shape[2]])
-
-
-def jumps(log_ratios: np.ndarray, detectors: Detectors, bands: Bands) -> Bands:
-    """Bands with boundaries' emissions in them; who skips subtasks crosses their boundaries."""
-    crossed = np.pad(np.cumsum(detectors.weight * log_ratios, axis=1), ((0, 0), (1, 0)))
-    return (bands[0], *(
-        band + crossed[:, d:] - crossed[:, : crossed.shape[1] - d] for d, band in enumerate(bands[1:], 1)
-    ))  # fmt: skip
 
 
 def save_model(model: SequenceModel, path: str | Path) -> None:
@@ -251,3 +234,80 @@ def _check(model: SequenceModel, table: dict[str, np.ndarray], task: SequenceTas
     for key, shape in shapes.items():
         if table[key].shape != shape or not np.isfinite(table[key]).all():
             raise InputError(where, f"{key} has shape {table[key].shape}", f"finite numbers of shape {shape}")
+
+
+WIDTHS = 6.0  # chosen: a trial this many widths outside the others does not fit
+LEAST_WIDTH = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
+FEW = 4.0  # chosen: trials; the usual width of scores is widened by one over their number, times this
+MEASURABLE = 20.0  # chosen: cells a subtask usually lasts, for two cells to be too few
+SQUEEZED = 0.03  # chosen: of the typical duration
+
+
+def misfit_scores(
+    log_likelihoods: np.ndarray, mean_cells: np.ndarray, alignment: AlignmentPosterior
+) -> np.ndarray:
+    """(2,): log evidence of free switching over forced order [nats], minus log evidence per cell."""
+    return np.array([
+        ergodic.log_evidence(*_free(log_likelihoods, mean_cells)) - alignment.log_evidence,
+        -alignment.log_evidence / len(log_likelihoods),
+    ])  # fmt: skip
+
+
+def usual_misfit(per_trial: Sequence[np.ndarray]) -> np.ndarray:
+    """(2, 2): median and width of each score over the trials learned from.
+
+    The width of few trials is uncertain itself and widened by 1 + FEW / their number.
+    """
+    table = np.array(per_trial)
+    center = np.median(table, 0)
+    width = NORMAL * np.median(np.abs(table - center), 0)
+    widened = np.maximum(width, LEAST_WIDTH) * (1 + FEW / len(table))
+    return np.column_stack([center, widened])
+
+
+def find_failure(names: Sequence[str], optional: Sequence[bool], typical: np.ndarray, usual: np.ndarray,
+                 log_likelihoods: np.ndarray, mean_cells: np.ndarray,
+                 alignment: AlignmentPosterior) -> Failure | None:  # fmt: skip
+    """The first subtask at which the trial leaves its task; None where it fits.
+
+    `usual` (2, 2): what `usual_misfit` gave of the trials learned from.
+    The first subtask may be cropped to any length, so it is never called squeezed.
+    """
+    for k in range(1, len(names)):
+        cells = float(alignment.smoothed[:, k].sum())
+        if not optional[k] and typical[k] >= MEASURABLE and cells < max(SQUEEZED * typical[k], 2.0):
+            return Failure(k, names[k], None, "is squeezed to almost nothing: it does not happen")
+    worse, poorer = (misfit_scores(log_likelihoods, mean_cells, alignment) - usual[:, 0]) / usual[:, 1]
+    if worse > WIDTHS:
+        path = ergodic.viterbi(*_free(log_likelihoods, mean_cells)).path
+        k, reason = _first_departure(path, names, optional)
+        return Failure(k, names[k], None, reason)
+    if poorer > WIDTHS:
+        excess = log_likelihoods.max(1) - np.median(log_likelihoods.max(1))
+        k = min(int(alignment.path[np.argmin(np.convolve(excess, np.ones(9), "same"))]), len(names) - 1)
+        return Failure(k, names[k], None, "looks like nothing the model has learned")
+    return None
+
+
+def _free(log_likelihoods: np.ndarray, mean_cells: np.ndarray) -> tuple:
+    """Arguments of the ergodic model: same durations, any state next."""
+    num_states = log_likelihoods.shape[1]
+    leave = 1 / np.maximum(mean_cells, 1.5)
+    transition = np.tile(np.log(leave / max(num_states - 1, 1))[:, None], (1, num_states))
+    np.fill_diagonal(transition, np.log1p(-leave) if num_states > 1 else 0.0)
+    return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
+
+
+def _first_departure(path: np.ndarray, names: Sequence[str], optional: Sequence[bool]) -> tuple[int, str]:
+    """Where the freely switching path first breaks the order."""
+    runs = np.minimum(path[np.r_[True, np.diff(path) != 0]], len(names) - 1)
+    at = -1
+    for state in runs:
+        missing = [k for k in range(at + 1, state) if not optional[k]]
+        if missing:
+            return missing[0], f"is passed over: {names[state]} comes first"
+        if state < at:
+            return at, f"is broken off: {names[state]} comes again"
+        at = int(state)
+    missing = [k for k in range(at + 1, len(names)) if not optional[k]]
+    return (missing[0], "never happens") if missing else (at, "does not keep the task's order")

@@ -1,8 +1,14 @@
-"""Segment trials of a plain ordered task: spans with boundary medians, deviations and intervals."""
+"""Segment trials of a plain ordered task: spans with boundary medians, deviations and intervals.
+
+Where trials can be aligned and read in several ways, every course gives each of its changes a posterior;
+together, weighted by the probabilities of the courses and that the boundary is that change, they are what is
+known of where a boundary lies, and of which label would decide.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -14,12 +20,100 @@ from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Place, Question, Segmentation, Span
-from hmmseg.sequence import misfit as sequence_misfit
+from hmmseg.sequence.courses import NEAR, WEIGHING
 from hmmseg.sequence.features import SequenceFeatures, features
-from hmmseg.sequence.fit import fit_sequence
-from hmmseg.sequence.labels import boundary_probabilities
-from hmmseg.sequence.model import SequenceModel, optional_states
-from hmmseg.sequence.places import Boundaries, near, places, together
+from hmmseg.sequence.fit import boundary_probabilities, fit_sequence
+from hmmseg.sequence.model import NamedCourse, SequenceModel, find_failure, optional_states
+
+LISTED = 0.05  # chosen: least probability of a place that is listed
+SURE = 0.95  # chosen: from here on one place is the answer and no other is listed
+FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
+LEAST = 1e-3  # numerics: probability of a naming that makes no difference
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """`crossing` (num_cells - 1, num_boundaries): probability that each is at each edge; `gain`
+    (num_boundaries,) [nats]: the expected reduction of entropy, of what is which change, by its label."""
+
+    crossing: np.ndarray
+    gain: np.ndarray
+
+
+def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np.ndarray) -> Boundaries:
+    """Posterior over all courses, from `crossings` [(num_cells - 1, num_changes), ...] of each.
+
+    `lag` (num_boundaries,) [cells]. The gain is the mutual information of naming and label: what the
+    entropy of the mixture exceeds that of its parts by.
+    """
+    from scipy.ndimage import convolve1d, shift  # slow to import
+
+    mixture, gain = [], []
+    for b, scale in enumerate(lag):
+        parts, weights = [], []
+        for crossing, course in zip(crossings, courses, strict=True):
+            weight = course.probability * course.naming[b]
+            for j in np.flatnonzero(course.naming[b] > LEAST):
+                moved = crossing[:, j]
+                if course.shift[b, j]:
+                    moved = shift(moved, course.shift[b, j], order=1)
+                parts.append(moved)
+                weights.append(weight[j])
+        table = _normal(convolve1d(np.array(parts), _laplace(scale), axis=1, mode="constant"))
+        p = np.array(weights) / np.sum(weights)
+        mixed = p @ table
+        gain.append(max(_entropy(mixed) - float(p @ [_entropy(part) for part in table]), 0.0))
+        mixture.append((1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / len(mixed))
+    return Boundaries(np.array(mixture).T, np.array(gain))
+
+
+def _laplace(scale: float) -> np.ndarray:
+    reach = int(np.ceil(FARTHEST * scale))
+    kernel = np.exp(-np.abs(np.arange(-reach, reach + 1)) / max(scale, 1e-9))
+    return kernel / kernel.sum()
+
+
+def _normal(table: np.ndarray) -> np.ndarray:
+    return table / np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
+
+
+def near(edges: np.ndarray, crossing: np.ndarray, time: float) -> float:
+    """Probability within NEAR of `time` of a boundary: `crossing` (num_cells - 1,) at the inner `edges`."""
+    here = np.abs(edges[1:-1] - time) <= NEAR * (edges[-1] - edges[0])
+    return float(crossing[here].sum() / crossing.sum())
+
+
+def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
+    """Places [s] of one boundary, most probable first; none where one of them is sure.
+
+    `edges` (num_cells + 1,) [s], `crossing` (num_cells - 1,) the boundary's probability at the inner ones,
+    `answer` [s] the time that is given: the first place. A place is what lies within NEAR of the trial.
+    """
+    inner, left = edges[1:-1], crossing / crossing.sum()
+    reach = NEAR * (edges[-1] - edges[0])
+    low = np.searchsorted(inner, inner - reach)
+    high = np.searchsorted(inner, inner + reach, side="right")
+    found, time = [], answer
+    while True:
+        here = np.abs(inner - time) <= reach
+        found.append(Place(float(time), float(left[here].sum())))
+        left = np.where(here, 0.0, left)
+        total = np.concatenate([[0.0], np.cumsum(left)])
+        window = total[high] - total[low]
+        peak = int(window.argmax())
+        if window[peak] < LISTED:
+            break
+        middle = (total[low[peak]] + total[high[peak]]) / 2
+        time = inner[np.searchsorted(total[1:], middle)]
+    found.sort(key=lambda place: -place.probability)
+    if found[0].probability >= SURE or len(found) == 1:
+        return ()
+    return tuple(place for place in found if place.probability >= LISTED)
+
+
+def _entropy(p: np.ndarray) -> float:
+    return float(-(p * np.log(np.where(p > 0, p, 1.0))).sum())
+
 
 MAIN = 0.5  # chosen: least probability about a median for it to be the answer, not a time amid several places
 
@@ -73,7 +167,7 @@ def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: Alignmen
 
 def _failure(data: SequenceFeatures, model: SequenceModel) -> Failure | None:
     plain = model.without_templates(data)
-    return sequence_misfit.find_failure(
+    return find_failure(
         model.task.sequence, optional_states(model.task, False), model.typical, model.usual_scores,
         plain.emissions.log_likelihoods(data.values), model.mean_cells, plain.align([data])[0],
     )  # fmt: skip
@@ -86,17 +180,23 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     visited = _visit_probabilities(alignment)[: len(names)]
     optional = optional_states(model.task, False)
     kept = [k for k in range(len(names)) if not optional[k] or visited[k] >= 0.5]
-    first, last = float(trial.t[0]), float(trial.t[-1])
+    first, last, step = float(trial.t[0]), float(trial.t[-1]), float(data.edges[1] - data.edges[0])
     own = boundary_probabilities(alignment)
-    starts: list[_Boundary] = [(first, 0.0, (first, first))]
-    elsewhere: list[tuple[Place, ...]] = [()]
+    found = []
     for k in kept[1:]:
-        median, sd, (low, high) = _boundary(
+        median, sd, interval = _boundary(
             data.edges, known.crossing[:, k - 1], first, last, scattered=bool(model.courses)
         )
         if model.courses and near(data.edges, known.crossing[:, k - 1], median) < MAIN:
             median = _boundary(data.edges, own[:, k - 1], first, last)[0]
-        median = max(median, starts[-1][0])
+        found.append((median, sd, interval))
+    starts: list[_Boundary] = [(first, 0.0, (first, first))]
+    elsewhere: list[tuple[Place, ...]] = [()]
+    for number, (k, (median, sd, (low, high))) in enumerate(zip(kept[1:], found, strict=True), 1):
+        if model.courses and not any(course.shift[k - 1].any() for course in model.courses):
+            median = _jump(trial, model, median, starts[-1][0], [*found, (last,)][number][0])
+        # A state that is there lasts a cell at least, as in every alignment: medians of places need not.
+        median = max(starts[-1][0] + step, min(median, last - step * (len(kept) - number)))
         starts.append((median, sd, (min(low, median), max(high, median))))
         elsewhere.append(places(data.edges, known.crossing[:, k - 1], median) if model.courses else ())
     ends = [*starts[1:], (last, 0.0, (last, last))]
@@ -104,6 +204,35 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
         Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2], others)
         for k, start, end, others in zip(kept, starts, ends, elsewhere, strict=True)
     )
+
+
+def _jump(trial: Trial, model: SequenceModel, time: float, before: float, after: float) -> float:
+    """When [s] the channels jump near a change that the features place at `time`, between its neighbours.
+
+    Slopes look across a window, so that they know of an abrupt change half a window before it comes. The
+    samples themselves do not: a level on either side with normal noise, and a change that lies off `time` by
+    the law of `Weighing.lag`, no farther than NEAR, anywhere between two samples. The median.
+    """
+    length, window = float(trial.t[-1] - trial.t[0]), model.mapping.window * model.mapping.step
+    farthest = max(NEAR * length, model.mapping.step)
+    reach = farthest + window
+    inside = slice(*np.searchsorted(trial.t, [max(before, time - reach), min(after, time + reach)]))
+    x = np.stack([trial.channels[name][inside] for name in model.mapping.channels], axis=1)
+    between = (trial.t[inside][1:] + trial.t[inside][:-1]) / 2
+    open_ = np.abs(between - time) <= farthest
+    if not open_.any():
+        return time
+    there = np.isfinite(x)
+    x = np.where(there, x - np.nanmean(x, axis=0, where=there), 0.0)
+    count, first = there.cumsum(axis=0), x.cumsum(axis=0)
+    left, right = count[:-1], count[-1] - count[:-1]
+    explained = first[:-1] ** 2 / np.maximum(left, 1) + (first[-1] - first[:-1]) ** 2 / np.maximum(right, 1)
+    total = (x**2).sum(axis=0)
+    rest = np.maximum(total - explained, 1e-9 * total) + np.finfo(float).tiny
+    cost = model.emissions.temper * (count[-1] / 2 * np.log(rest)).sum(axis=1)
+    cost = (cost + np.abs(between - time) / (WEIGHING.lag * length))[open_]
+    weight = np.exp(cost.min() - cost).cumsum()
+    return float(between[open_][np.searchsorted(weight, weight[-1] / 2)])
 
 
 def _visit_probabilities(alignment: AlignmentPosterior) -> np.ndarray:

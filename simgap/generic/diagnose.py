@@ -465,11 +465,11 @@ def _candidate(
     count: int,
 ) -> Candidate:  # fmt: skip
     change = EFFECTS[mine[0].effect]
-    ends = (np.full(u.size, end) for end in (change.low, change.high))
+    low, high = (np.full(u.size, end) for end in (change.low, change.high))
     labels = tuple(f"{p.channel}/{p.place}/{p.key}" for p in mine)
     return Candidate(change.name, labels, u, np.zeros(u.size), np.ones(u.size),
                      np.tile(_whitened(white, shift), count), np.tile(_whitened(white, slopes), (count, 1)),
-                     *ends)  # fmt: skip
+                     low, high)  # fmt: skip
 
 
 def _document(

@@ -1,4 +1,4 @@
-"""Effects as they can be felt beside the nominal world: of the scene, or of what the sensors say."""
+"""Effects as they can be felt next to the nominal world: of the scene, or of what the sensors say."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
     parameters, forms = known[name].parameters, known[name].forms
     nothing = {p.name: p.neutral if p.log or p.shape else 0.0 for p in parameters}
-    first = forms[0] if forms else tuple(nothing)  # forms overlap: a gain of a finger beside that of both
+    first = forms[0] if forms else tuple(nothing)  # forms overlap: a gain of a finger and that of both
     strong = {p.name: OFTEN * p.sd for p in parameters if p.name in first and not (p.log or p.shape)}
     usual = known[name].played or nothing | ({} if given else strong)
     return dict(usual) | {key: float(value) for key, value in (given or {}).items() if np.isfinite(value)}

@@ -125,7 +125,7 @@ class PlayServer:
             await asyncio.sleep(max(FRAME - (time.monotonic() - now), 0.001))
 
     async def _told(self, message: str | bytes) -> dict[str, Any] | None:
-        """What a message of the page does; what cannot be read is told and changes nothing."""
+        """What a message of the page does; what cannot be read is answered so and changes nothing."""
         try:
             asked = json.loads(message)
             kind = asked["kind"]
@@ -147,11 +147,11 @@ class PlayServer:
         return None
 
     async def _change(self, name: str | None) -> dict[str, Any]:
-        """Switch an effect on beside the nominal world, or off."""
+        """Switch an effect of the second world on or off."""
         if name is not None and (not isinstance(name, str) or name not in felt_effects()):
             return {"kind": "said", "text": "no such effect"}
         world = None
-        if name is not None:  # compiled beside the page's frames
+        if name is not None:  # compiled while the page goes on
             world = await asyncio.to_thread(self.session.world_with, {name: effect_values(name)})
         self.session.beside(world)
         return self._scene()

@@ -46,7 +46,7 @@ def default_task(objects: list[str]) -> BlockTask:
 
 
 class Session:
-    """The nominal world, another beside it if wanted, and the hand that both follow.
+    """The nominal world, a second one if wanted, and the hand that both follow.
 
     Aim with `aim` (the hand's middle, closed or open) or `touch` (each finger by itself), let time pass
     with `advance`, read `frame`, `save` what was recorded since `reset`.
@@ -66,11 +66,11 @@ class Session:
         self.reset()
 
     def world_with(self, effects: Mapping[str, Mapping[str, float]]) -> PlayedWorld:
-        """Another world with these effects, ready to stand beside the nominal one."""
+        """Another world with these effects, ready to run next to the nominal one."""
         return PlayedWorld(self.task, self.rig, self.blocks, self.x, self.nominal.start, effects)
 
     def beside(self, world: PlayedWorld | None) -> None:
-        """Put another world beside the nominal one, or none; both begin anew."""
+        """Run another world next to the nominal one, or none; both begin anew."""
         self.other = world
         self.reset()
 
@@ -136,7 +136,7 @@ class Session:
         return rate * np.minimum(1.0, FASTEST / np.maximum(speed, 1e-9))
 
     def scene(self) -> dict[str, Any]:
-        """What does not change: the blocks' sizes and the effect beside."""
+        """What does not change: the blocks' sizes and the other world's effect."""
         sizes = {name: [block.width, block.height, block.weight] for name, block in self.blocks.items()}
         effects = {} if self.other is None else self.other.effects
         return {"kind": "scene", "blocks": sizes, "effects": effects, "home": self.home.tolist(),
@@ -152,7 +152,7 @@ class Session:
         return {"kind": "frame", "t": self.nominal.t, "command": self.command.tolist(), "worlds": worlds}
 
     def save(self, folder: Path) -> list[Path]:
-        """The nominal world's recording as the next trial_NN.csv beside rig, task and true properties.
+        """The nominal world's recording as the next trial_NN.csv, with rig, task and true properties.
 
         ValueError where there is less than a second of it, InputError where the folder is another session's.
         No file that is there is replaced.

@@ -54,12 +54,6 @@ PARTS = {
     "actuator.gain": ("strength", "Command a known torque of {0}, or hold a known weight, and measure."),
     "actuator.damping": ("velocity gain", "Look up the velocity gain in the drive of {0}."),
     "actuator.limit": ("largest force", "Look up the current limit in the drive of {0}."),
-    "option.timestep": ("the simulator's time step", "Simulate with a tenth of the step: is the gap gone?"),
-    "option.iterations": ("the solver's iterations", "Simulate with more iterations: is the gap gone?"),
-    "option.hold": ("how commands hold between samples", "Log commands at the rate of the controller."),
-    "option.late": ("when within a step commands come", "Log commands at the rate of the controller."),
-    "option.rk4": ("the simulator's integrator", "Simulate with the integrator RK4: is the gap gone?"),
-    "option.implicit": ("the simulator's integrator", "Simulate implicitly: is the gap gone?"),
     "gravity.direction": ("a base that is tilted", "Put a level on the robot's base."),
 }
 
@@ -117,11 +111,11 @@ SAID = 3  # look: places of a gap that a sentence has
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
 ALPHA = 0.05  # chosen: p-value below which what remains is more than noise
-TINY = 1e-16  # numerics: what double precision tells from zero beside one
+TINY = 1e-16  # numerics: what double precision tells from zero next to one
 
 
 def p_text(p: float) -> str:
-    """A p-value; what is too small to be told apart is only bounded."""
+    """A p-value; what is too small for its digits is only bounded."""
     return f"p = {plain(p, 2)}" if p >= 1e-4 else f"p = {p:.0e}" if p > TINY else "p < 1e-16"
 
 

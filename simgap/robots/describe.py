@@ -64,11 +64,12 @@ def _effects(found: RobotDiagnosis) -> dict[str, Any]:
 
 def _entry(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, Any]:
     far = found.shrinkage
-    told = far is not None and one is found.best and effects == found.verdict.causes
+    if one is not found.best or effects != found.verdict.causes:
+        far = None
     return {
         "parameters": parameters(found, one, effects),
         "log_evidence": one.score - found.search.known[frozenset()].score,
-        "heldout_score": 0.5 * (far.before - far.after) * one.linear.residual.size if told else 0.0,
+        "heldout_score": 0.0 if far is None else 0.5 * (far.before - far.after) * one.linear.residual.size,
         "property_shift": {},
     }
 

@@ -324,7 +324,7 @@ def _cosines(block: Block) -> np.ndarray:
     for c in np.unique(block.channel):
         mine = np.flatnonzero(block.channel == c)
         whole = np.zeros((block.channel.size, min(mine.size, SMOOTH)))
-        whole[mine] = dct(np.eye(mine.size), axis=0, norm="ortho").T[:, :SMOOTH]
+        whole[mine] = np.asarray(dct(np.eye(mine.size), axis=0, norm="ortho")).T[:, :SMOOTH]
         out.append(whole)
     return np.concatenate(out, 1)
 

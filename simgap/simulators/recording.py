@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.columns import Column
+from hmmseg.hand.plausibility import check_clock
 from hmmseg.io.formats import read_table
 from hmmseg.io.formats.logs import interpolated
-from hmmseg.io.plausibility import check_clock
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import MIN_SAMPLES, trial_of
+from hmmseg.io.units import Column
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import pytest
 from estimation.friction import FrictionPosterior, Stretch, friction_posteriors, largest_ratio, slip_evidence
 from estimation.observations import WeighedTrial, Weights, subtask_masks
 from hmmseg.contact.decompose import FREE, subtasks
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Fingertip, Rig, Systematic, read_rig
 from hmmseg.io.task import BlockTask, parse_task, read_task
-from hmmseg.io.trial import read_trial
 
 SD = 0.012  # N
 RIG = Rig(fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))

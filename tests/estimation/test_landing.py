@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimation.pads import first_push, landing
+from estimation.pads import landing
 
 DT = 0.01
 TOUCH = 0.503  # s, between two samples
@@ -60,11 +60,3 @@ def test_too_few_samples_before_the_touch_tell_nothing():
     t, reading, give, _ = landed()
     assert landing(t, reading, give, place_of(t), (TOUCH, 0.0), (t > 0.48) & (t < TOUCH), 1e-6) is None
     assert landing(t, reading, 0 * give, place_of(t), (TOUCH, 0.0), t < TOUCH, 1e-6) is None
-
-
-def test_a_support_is_touched_when_it_first_bears_weight():
-    t, _, _, net = landed()
-    noisy = net + 0.01 * np.random.default_rng(0).normal(size=t.size)
-    moment, sd = first_push(t, noisy, t < TOUCH, (0.6, 0.004))  # a boundary that came 0.1 s late
-    assert moment == pytest.approx(TOUCH, abs=2 * DT) and 0 < sd < DT
-    assert first_push(t, noisy, t < TOUCH, (0.5, 0.004)) == (0.5, 0.004)  # one that did not

@@ -18,9 +18,9 @@ from estimation.observations import (
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
+from hmmseg.levels import TAIL
 from hmmseg.segmentation.align import TrialAlignment
 from hmmseg.segmentation.boundaries import BoundaryPosterior
-from hmmseg.segmentation.emissions import TAIL
 
 
 def made_signals(t, **columns):

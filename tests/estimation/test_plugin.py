@@ -9,10 +9,10 @@ import pytest
 
 from estimation.paper_formulas import Estimate, FrictionBound, estimate_plugin
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, subtasks
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move, read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.spans import Segmentation, Span
 from hmmseg.segmentation.thresholds import StateLabels, segment_qualitative
 

@@ -13,10 +13,11 @@ import pytest
 from fault_scene import FOLDER
 
 from estimation import identify
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.sensing import sensed
 from hmmseg.io.formats import read_table
 from hmmseg.io.rig import read_rig
-from hmmseg.io.trial import read_trial, trial_of
+from hmmseg.io.trial import trial_of
 
 FORCES = ("fx1", "fy1", "fx2", "fy2")
 RATES = ("dq11", "dq12", "dq21", "dq22")

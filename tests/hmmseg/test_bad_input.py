@@ -18,9 +18,9 @@ from estimation.report import read_actual
 from experiments.fuzz import run
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg_cli.main import main
 
 CORPUS = tomllib.loads((Path(__file__).parents[1] / "data/bad/corpus.toml").read_text(encoding="utf-8"))[

@@ -8,9 +8,10 @@ import polars as pl
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
-from hmmseg.io.trial import CARTESIAN_CHANNELS, read_trial
+from hmmseg.io.trial import CARTESIAN_CHANNELS
 from hmmseg.io.units import UNITS, known_unit, measures, si_factor, unit_in_name
 
 PLAIN = SequenceTask(("a", "b"))

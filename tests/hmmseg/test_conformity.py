@@ -14,10 +14,11 @@ from experiments.calibration_worlds import ROWS, replicates
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import list_cases, read_case
 from experiments.worlds import WORLDS, Cell, World, scene, trials_of
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 from hmmseg.segmentation import align as segmentation
 from hmmseg.segmentation.conformity import MAX_RATE, examine
 from hmmseg.segmentation.emissions import features, thin

@@ -10,20 +10,18 @@ from scipy.integrate import quad
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.contact.equations import Pads
+from hmmseg.densities import log_between, log_student_below
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.levels import MOVED
+from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation.emissions import (
     LOST,
     RUNG,
     STRAY,
-    TAIL,
     Features,
     Parameters,
-    _log_between,
     _log_ungripped,
     log_likelihoods,
     log_student,
-    log_student_below,
 )
 
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
@@ -92,7 +90,7 @@ def test_student_is_scipys_t():
 
 def test_soft_uniform_is_a_density():
     def density(x):
-        return float(np.exp(_log_between(np.array([x]), 0.5, 4.0, 0.05))[0])
+        return float(np.exp(log_between(np.array([x]), 0.5, 4.0, 0.05))[0])
 
     total, _ = quad(density, -1, 6, points=[0.5, 4.0], epsabs=1e-9)
     # Both soft edges together lose what one edge's noise carries beyond the other: nothing here.

@@ -9,8 +9,8 @@ from scipy import optimize, stats
 
 from hmmseg.hmm import learn
 from hmmseg.hmm.chain import InfeasibleAlignment
+from hmmseg.levels import TAIL
 from hmmseg.segmentation import fit as contact_fit
-from hmmseg.segmentation.emissions import TAIL
 from hmmseg.segmentation.fit import (
     MeanShares,
     _location,

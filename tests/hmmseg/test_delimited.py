@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.formats import read_table
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
-from hmmseg.io.trial import read_trial
 
 PLAIN = SequenceTask(("a", "b"), channels=("x", "f"))
 T = np.arange(12) * 0.05

@@ -8,6 +8,7 @@ pytest.importorskip("sklearn")
 from sklearn.base import clone
 from sklearn.utils.estimator_checks import check_estimator
 
+from hmmseg import segment
 from hmmseg.sequence.estimator import OrderedSegmenter
 
 
@@ -30,6 +31,30 @@ def test_several_some_of_them_labelled():
     found = clone(OrderedSegmenter(n_states=3, rate=50.0)).fit(x, [y[0], y[1], None, None])
     for got, wanted in zip(found.predict(x), y, strict=True):
         assert (got != wanted).mean() < 0.03
+
+
+def test_abrupt_changes_are_dated_where_they_jump_and_short_states_are_there():
+    """States of 10 samples after a wait of 19 s are all predicted; a change is dated between two samples."""
+    truth = np.array([19.2, 19.4, 19.6])
+    states = np.searchsorted(truth, np.arange(1000) / 50, side="right")
+    x = [3.0 * states[:, None] + np.random.default_rng(k).normal(0, 0.2, (1000, 1)) for k in range(3)]
+    found = OrderedSegmenter(n_states=4, rate=50.0).fit(x)
+    for predicted in found.predict(x):
+        assert (np.diff(predicted) >= 0).all() and set(predicted) == {0, 1, 2, 3}
+    y = np.array([0, 0.3, 0.2, 0.1, 10, 11, 12, 13])
+    spans = segment({"t": np.arange(8.0), "y": y}, {"sequence": ["low", "high"]})[0].spans
+    assert spans[1].start == 3.5 and spans[1].start_90[0] <= 3.5 <= spans[1].start_90[1]
+
+
+def test_a_jump_is_dated_within_a_sample():
+    rng = np.random.default_rng(5)
+    ends = np.array([[2.013, 3.291, 5.002], [1.8, 2.937, 5.211]])
+    t = np.arange(0, 7, 0.01)
+    trials = [{"t": t, "f": np.array([0, 1, -1, 2.0])[np.searchsorted(e, t)] + rng.normal(0, 0.1, t.size)}
+              for e in ends]  # fmt: skip
+    for each, true in zip(segment(trials, {"sequence": list("abcd")}), ends, strict=True):
+        found = np.array([span.start for span in each.spans[1:]])
+        np.testing.assert_allclose(found, true, atol=0.01)
 
 
 EXPECTED = {

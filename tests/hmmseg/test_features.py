@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import Fingertip, Noise, Rig, read_rig
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 from hmmseg.segmentation.emissions import acceleration, features, noise_sd, thin
 
 HERE = Path(__file__).resolve().parents[2]

@@ -26,11 +26,11 @@ from file_writers import (
 from log_writers import Topic, mcap_of
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.formats import kind_of, parts_of, read_table, split_part
 from hmmseg.io.formats.logs import interpolated
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
-from hmmseg.io.trial import read_trial
 
 TOPICS = parse_rig({"topics": {
     "push": {"from": "/wrench.wrench.force.x", "sign": -1},

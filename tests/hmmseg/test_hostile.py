@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import parse_task, read_task
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 from hmmseg.online.watcher import Watcher
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import load_model, save_model

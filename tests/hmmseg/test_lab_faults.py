@@ -15,9 +15,9 @@ from estimation.checks import dense
 from estimation.identification import identify_aligned
 from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 
 GF, KGF = 9.80665e-3, 9.80665

@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 from hmmseg import example_folder
 from hmmseg.errors import InputError
-from hmmseg.io import long
-from hmmseg.io.long import LongRecording
+from hmmseg.hand import read as long
+from hmmseg.hand.read import LongRecording
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import Task
 from hmmseg.io.trial import Trial

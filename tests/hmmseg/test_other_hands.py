@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 
 PLACES, FORCES = ("x1", "x2", "y1", "y2"), ("fx1", "fx2", "fy1", "fy2")
 FOLDERS = ("foam_restack_1", "restack_1", "pick_4", "session_9_50hz")

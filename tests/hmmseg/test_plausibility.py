@@ -13,8 +13,9 @@ import pytest
 from fault_scene import CARTESIAN, FOLDER, FREE, JOINT, JOINTED, mended
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
-from hmmseg.io.trial import JOINT_CHANNELS, read_trial
+from hmmseg.io.trial import JOINT_CHANNELS
 
 
 def changed(table, **factors):

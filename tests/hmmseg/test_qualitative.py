@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move, SequenceTask, read_task
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 from hmmseg.segmentation.thresholds import (
     NUMBERS,
     StateLabels,

@@ -11,13 +11,11 @@ from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import most_telling
-from hmmseg.sequence.courses import Course
+from hmmseg.sequence.courses import NEAR, WEIGHING, Course, best_choice, naming, probabilities
 from hmmseg.sequence.emissions import StudentEmissions
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import NamedCourse, load_model, save_model
-from hmmseg.sequence.naming import NEAR, WEIGHING, best_choice, naming, probabilities
-from hmmseg.sequence.places import places, together
-from hmmseg.sequence.segment import _shortest, segment_sequence
+from hmmseg.sequence.segment import _shortest, places, segment_sequence, together
 
 TASK = SequenceTask(("wait", "push", "pull"))
 

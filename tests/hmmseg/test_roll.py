@@ -17,9 +17,10 @@ from experiments.worlds import WORLDS, scene, trials_of
 from hmmseg.contact.decompose import subtasks
 from hmmseg.contact.equations import corner_drop, pads_of, rolled_offset, turned
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.roll import levelled, slow_roll
 from hmmseg.hand.signals import task_space
-from hmmseg.io.trial import CARTESIAN_CHANNELS, ROLL, read_trial
+from hmmseg.io.trial import CARTESIAN_CHANNELS, ROLL
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.posteriors import tilts

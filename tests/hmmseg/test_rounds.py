@@ -13,9 +13,10 @@ import pytest
 
 from experiments.misfit_edits import join, let_go
 from hmmseg.contact.decompose import subtasks
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
-from hmmseg.io.trial import Trial, read_trial
+from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align
 from hmmseg.segmentation.rounds import round_tasks
 

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from hmmseg.io.trial import Trial
-from hmmseg.sequence.changepoints import partition
-from hmmseg.sequence.detectors import learn
-from hmmseg.sequence.emissions import from_weights, independent_share
+from hmmseg.sequence.courses import partition
+from hmmseg.sequence.emissions import from_weights, independent_share, learn, transitions
 from hmmseg.sequence.features import cell_means, feature_map, features, without_old
-from hmmseg.sequence.transitions import transitions
 
 
 def test_cells_average_samples_and_stay_empty_where_there_are_none():

@@ -7,10 +7,11 @@ import pandas as pd
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import SequenceTask
-from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, read_trial
+from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS
 
 FINGERS = {
     "1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},

@@ -12,10 +12,9 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import Task
 from hmmseg.io.trial import Trial
-from hmmseg.online import layout as at
-from hmmseg.online import scores
-from hmmseg.online.readings import SLOPE, WINDOW
-from hmmseg.online.step import _absorb
+from hmmseg.online import hypothesis as one
+from hmmseg.online.hypotheses import Table, absorb
+from hmmseg.online.hypothesis import HYPOTHESIS, RANGES, READING, SLOPE, WINDOW
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, features, log_likelihoods
@@ -56,32 +55,29 @@ def test_emissions_are_those_off_line():
     p = Parameters(bias, {"block1": 0.34, "block2": 0.44}, scale, {"block1": 0.016, "block2": 0.0254},
                    ({1: 0.05},))  # fmt: skip
     expected, halting = log_likelihoods(f, steps, p, 0, rung=0.0), _log_halting(f, p)
-    h = np.zeros(at.Layout(2, 2).width)
+    rows = np.zeros(1, HYPOTHESIS)
     sure = 1e14  # precision of what is known
-    for c in range(4):
-        h[at.BIAS + 2 * c : at.BIAS + 2 * c + 2] = bias[c] * sure, sure
-    for which, value in enumerate(scale.values()):
-        h[at.SCALES + 2 * which : at.SCALES + 2 * which + 2] = value**2, 1.0
-    h[at.OBJECTS : at.OBJECTS + 8] = np.array([0.34, 1, 0.016, 1, 0.44, 1, 0.0254, 1]) * sure
-    h[at.LEVEL : at.LEVEL + 2] = 0.05 * sure, sure
-    spans = np.array([f.span[name] for name in ("vx", "vy", "y", "d", "force", "press")])
-    pads = np.array(f.pads)
+    rows["bias"][0] = np.stack([bias * sure, np.full(4, sure)], axis=1)
+    rows["scale"][0] = np.stack([np.square([*scale.values()]), np.ones(7)], axis=1)
+    rows["level"] = 0.05 * sure, sure
+    h, known = rows[0], np.array([[v, 1] for v in (0.34, 0.016, 0.44, 0.0254)]) * sure
+    span = np.array([tuple(f.span[name] for name in RANGES.names)], RANGES)[0]
     for n in range(0, f.t.size, 3):
-        x = np.array([f.t[n], *f.force[n], f.vx[n], f.vy[n], f.ay[n], f.y[n], f.d[n], f.sd_y[n], f.sd_d[n],
-                      f.sd_vx[n], f.sd_vy[n], f.y[n - 1] if n else np.nan, np.nan, np.nan, 0.0, 0.0,
-                      1.0])  # fmt: skip
+        x = np.array([(f.t[n], f.force[n], f.vx[n], f.vy[n], f.ay[n], f.y[n], f.d[n], f.sd_y[n], f.sd_d[n],
+                       f.sd_vx[n], f.sd_vy[n], f.y[n - 1] if n else np.nan, np.nan, np.nan, 0.0, 0.0,
+                       1.0)], READING)[0]  # fmt: skip
         for step in steps[:4]:
             if step.state == FREE:
-                found, halt = scores.free(h, x, spans), scores.STILL
+                found, halt = one.free(h, x, span), one.STILL
             else:
-                found, halt = scores.held(h, 0, x, spans, pads, 2), 0.0
+                found, halt = one.held(h, known, 0, 2, x, span, f.pads), 0.0
                 if step.state == ON_GROUND:
-                    found += scores.supported(h, at.GROUND_KIND, 0, x, spans, pads, step.index == 1)
+                    found += one.supported(h, known, one.GROUND_KIND, 0, x, span, f.pads, step.index == 1)
                 else:
                     assert step.state == ABOVE_GROUND
-                    found += scores.lifted(h, 0, x, spans, f.gravity, 2, 0.0)
-                    halt = scores.STILL * scores.JUST_LIFTED
-            more = scores._standing(h, x, spans)
+                    found += one.lifted(h, known, 0, 2, x, span, f.gravity, 0.0)
+                    halt = one.STILL * one.JUST_LIFTED
+            more = one._halting(h, x, span)
             np.testing.assert_allclose(more, halting[n], rtol=1e-6, atol=1e-6)
             if halt:  # how often a hand halts differs: the filter must not take a rest for a halt
                 found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
@@ -238,15 +234,16 @@ def test_what_cannot_be_watched_is_refused():
 def test_two_hypotheses_merge_to_the_moments_of_their_mixture():
     rng = np.random.default_rng(0)
     share, mean, sd = np.array([0.3, 0.7]), np.array([1.0, 1.6]), np.array([0.05, 0.1])
-    rows = np.zeros((2, at.Layout(2, 2).width))
-    rows[:, at.WEIGHT] = np.log(share) - 2.0
-    moments = [(at.ENTRY, at.ENTRY_VARIANCE), (at.ORIGIN, at.ORIGIN + 1), (at.RING, at.RING + 1)]
-    for first, second in moments:
-        rows[:, first], rows[:, second] = mean, sd**2
-    _absorb(rows[0], rows[1])
+    rows = np.zeros(2, HYPOTHESIS)
+    rows["weight"] = np.log(share) - 2.0
+    moments = [rows["entered"], rows["origin"], rows["ring"][:, 0]]
+    for each in moments:
+        each[:, 0], each[:, 1] = mean, sd**2
+    table = Table(rows, np.ones((2, 8, 2)))
+    absorb(table, 0, table, 1)
     drawn = np.where(rng.uniform(size=400_000) < share[0], *(m + s * rng.standard_normal(400_000)
                      for m, s in zip(mean, sd, strict=True)))  # fmt: skip
-    assert rows[0, at.WEIGHT] == pytest.approx(-2.0)
-    for first, second in moments:
-        assert rows[0, first] == pytest.approx(drawn.mean(), abs=2e-3)
-        assert rows[0, second] == pytest.approx(drawn.var(), rel=0.01)
+    assert rows["weight"][0] == pytest.approx(-2.0)
+    for each in moments:
+        assert each[0, 0] == pytest.approx(drawn.mean(), abs=2e-3)
+        assert each[0, 1] == pytest.approx(drawn.var(), rel=0.01)

@@ -10,12 +10,13 @@ import pytest
 from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.formats import read_table
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial, trial_of
-from hmmseg.online.closing import Closings
+from hmmseg.io.trial import trial_of
 from hmmseg.online.watcher import Watcher
+from hmmseg.online.wrist import Closings
 from hmmseg.segmentation.align import align
 
 SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared

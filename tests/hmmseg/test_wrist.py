@@ -10,11 +10,12 @@ from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.contact.decompose import decompose, revealed_by
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.tool import applied_force, free_tool, pose_of
 from hmmseg.hand.wrist import closings, grip_of
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial, trial_of
+from hmmseg.io.trial import trial_of
 from hmmseg.segmentation.align import align
 
 PLAIN = Setup()
@@ -31,7 +32,7 @@ def read_all(performed, setup, **said):
 
 
 def raw(simulated, setup, **said):
-    from hmmseg.io.frames import frame_table
+    from hmmseg.io.table import frame_table
 
     rig = wrist_rig(setup, **said)
     return trial_of(frame_table(wrist_recording(simulated, setup), None), rig, None), rig

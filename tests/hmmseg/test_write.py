@@ -15,13 +15,13 @@ from file_writers import START, write_lerobot, write_mcap
 from mcap.reader import make_reader
 
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.formats import read_table
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
-from hmmseg.io.trial import read_trial
-from hmmseg.io.write import ADDED, label, lerobot_files
-from hmmseg.io.write import write_mcap as write_topic
 from hmmseg.segmentation.spans import Span
+from hmmseg_cli.labels import ADDED, label, lerobot_files
+from hmmseg_cli.labels import write_mcap as write_topic
 from hmmseg_cli.main import main
 
 NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"

@@ -72,3 +72,30 @@ def test_what_does_not_go_together_is_said(logs, capsys, options, line):
     assert main(["diagnose", *logs, *options]) == 2
     told = capsys.readouterr().err
     assert re.search(line, told) and "Traceback" not in told
+
+
+@pytest.mark.slow
+def test_what_changed_since_healthy_logs_is_named(logs, tmp_path):
+    folder = tmp_path
+    for seed in range(3):
+        found = log(seed + 10, seconds=4.0)
+        rows = np.column_stack([found.t, found["torque"], found["angle"]])
+        np.savetxt(folder / f"old_{seed}.csv", rows, delimiter=",", header="t,torque,angle", comments="")
+    old = [str(folder / f"old_{seed}.csv") for seed in range(3)]
+    target, page = folder / "out.json", folder / "page.html"
+    options = ["--simulator", f"{SWING}:Swing", "--json", str(target), "--report", str(page), "--quiet"]
+    assert main(["diagnose", *logs, "--healthy", *old, *options]) == 0
+    found = json.loads(target.read_text())
+    assert found["verdict"] == "named" and found["causes"] == ["viscous"]
+    told = found["effects"]["viscous"]["parameters"]["viscous"]
+    assert told["interval_90"][0] < 0.004 < told["interval_90"][1] and told["old"] == 0.0
+    assert abs(sum(found["probabilities"].values()) - 1) < 1e-9
+    assert "iscous" in page.read_text()
+    assert main(["diagnose", old[0], "--healthy", *old[1:], *options]) == 0
+    assert json.loads(target.read_text())["verdict"] == "none"
+
+
+def test_an_effect_cannot_be_forced_of_a_change(logs, capsys):
+    options = ["--simulator", f"{SWING}:Swing", "--healthy", logs[1], "--effect", "viscous"]
+    assert main(["diagnose", logs[0], *options]) == 2
+    assert "--effect: does not go with --healthy and a model" in capsys.readouterr().err

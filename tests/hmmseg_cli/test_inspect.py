@@ -16,12 +16,11 @@ import pytest
 from file_writers import write_mcap, write_robomimic
 from log_writers import mcap_of
 
-from hmmseg.io.inspect import inspect
-from hmmseg.io.propose import propose
+from hmmseg.hand.inspect import inspect, propose
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.table import plain_table
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg_cli.inspect import sparkline
 from hmmseg_cli.main import main
 

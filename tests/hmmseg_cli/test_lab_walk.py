@@ -14,8 +14,8 @@ from log_writers import bag_of, mcap_of
 from walk_scene import finger_columns, finger_topics, finger_vectors, german, wrist_topics, wrist_vectors
 
 from experiments.wrist_scene import Setup, performances, wrist_recording
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
-from hmmseg.io.trial import read_trial
 from hmmseg_cli.main import main
 
 FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}

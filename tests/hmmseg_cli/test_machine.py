@@ -36,8 +36,13 @@ COMMANDS = {
                  "page.html"],
     "fit": ["fit", "trial.csv", "--task", "order.toml", "--model", "model.npz", "--json", "out.json"],
     "simulate": ["simulate", *HAND, "--trials", "1", "--output", "made", "--json", "out.json"],
+    "watch": ["watch", *HAND, "--json", "out.json"],
+    "diagnose": ["diagnose", "trial.csv", "--against", "trial_2.csv", "trial_3.csv", "--task", "order.toml",
+                 "--json", "out.json"],
 }  # fmt: skip
+COSTLY = {"watch": 30, "diagnose": 5}  # how many calls of each kind are refused at most
 QUICK = ("decompose", "new", "segment")
+ROWS = b"".join((STACK / "trial_01.csv").read_bytes().splitlines(keepends=True)[:40])
 
 
 @pytest.fixture
@@ -47,7 +52,16 @@ def lab(tmp_path, monkeypatch):
     shutil.copyfile(example_folder() / "task.toml", tmp_path / "task.toml")
     shutil.copyfile(STACK / "rig.toml", tmp_path / "rig.toml")
     shutil.copyfile(STACK / "trial_01.csv", tmp_path / "trial.csv")
+    rows = (tmp_path / "trial.csv").read_text().splitlines(keepends=True)
+    for number in (2, 3):
+        (tmp_path / f"trial_{number}.csv").write_text("".join(rows[: -2 * number]))
     return tmp_path
+
+
+def run(name, monkeypatch):
+    """A command, which reads a recording on standard input where it reads any."""
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(ROWS)))
+    return main(COMMANDS[name])
 
 
 def files(folder):
@@ -95,6 +109,8 @@ CALLS = {
     "rename": (os, "replace", FULL, lambda *_: True),
     "copy": (shutil, "copyfile", FULL, lambda *_: True),
     "folder": (os, "mkdir", FULL, lambda *_: True),
+    "write": (os, "fdopen", FULL, lambda *_: True),
+    "sync": (os, "fsync", FULL, lambda *_: True),
     "memory": (json, "dumps", MemoryError(), lambda *_: True),
 }
 
@@ -103,19 +119,19 @@ def tortured(lab, name, kind, monkeypatch, capsys, most):
     """Refuse each call of a kind in turn; the number of calls that a command makes."""
     module, attribute, error, counted = CALLS[kind]
     real, before = getattr(module, attribute), files(lab)
-    assert main(COMMANDS[name]) == 0  # everything is imported, and kept that is kept
+    assert run(name, monkeypatch) == 0  # everything is imported, and kept that is kept
     whole = files(lab)
     count = Refusing(real, error, counted=counted)
     with monkeypatch.context() as patched:
         patched.setattr(module, attribute, count)
         restore(lab, before)
-        assert main(COMMANDS[name]) == 0
+        assert run(name, patched) == 0
     for at in range(0, count.calls, max(1, count.calls // most)):
         restore(lab, before)
         capsys.readouterr()
         with monkeypatch.context() as patched:
             patched.setattr(module, attribute, Refusing(real, error, at, counted))
-            code = main(COMMANDS[name])
+            code = run(name, patched)
         err = capsys.readouterr().err
         found = files(lab)
         assert code in (0, 2), (at, err)
@@ -137,7 +153,7 @@ def test_whatever_call_is_refused(name, kind, lab, monkeypatch, capsys):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_whichever_call_is_refused(name, kind, lab, monkeypatch, capsys):
     """Every call of every command."""
-    tortured(lab, name, kind, monkeypatch, capsys, 10_000)
+    tortured(lab, name, kind, monkeypatch, capsys, COSTLY.get(name, 10_000))
 
 
 def test_a_rename_that_is_refused_leaves_results_of_before(lab, monkeypatch, capsys):

@@ -29,5 +29,5 @@ def faults(prepare: str) -> int:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a setting of glibc's")
 def test_arrays_are_not_asked_for_anew():
-    kept = faults("from hmmseg_cli.memory import keep_freed_memory; keep_freed_memory()")
+    kept = faults("from hmmseg_cli.process import keep_freed_memory; keep_freed_memory()")
     assert kept < 0.05 * faults("")

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from simgap_scenes import HAND, STACK
 
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg_cli.main import main
 from simgap.world.animation import FRAMES, Scene, Trace, animate
 from simgap.world.properties import PAPER_BLOCKS

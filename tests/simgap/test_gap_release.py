@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hmmseg.example import example_folder
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from simgap.gap.frame import CHANNELS, build

@@ -161,9 +161,67 @@ def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files
     found, log, _ = loaded(files)
     made = candidates(Setting(found.simulator, [log]))
     assert {n for n, e in made.items() if e.fitted} == found.simulator.numerics
-    assert found.simulator.numerics == {"option.timestep", "option.hold", "option.iterations"}
+    steps = {"option.timestep", "option.hold", "option.late", "option.iterations"}
+    assert found.simulator.numerics == steps
     with pytest.raises(InputError, match="option has no integratr"):
         loaded(files, "option.integratr")
+
+
+SERVO = """<mujoco>
+  <option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody><body name="arm"><joint name="turn" axis="0 0 1" armature="0.02" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.8" contype="0" conaffinity="0"/>
+    <site name="tool" pos="0.2 0 0"/>%s</body></worldbody>
+  <actuator><position name="servo" joint="turn" kp="40" kv="2"/></actuator>
+</mujoco>
+"""
+TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "servo"\nunit = "rad"\n'
+
+
+def turning(files, described: str = TURN, more: str = ""):
+    """The servo's simulator and a log in which its command swings."""
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    found = load_mjcf(*files(SERVO % more, described))
+    t = np.arange(0, 2, 0.01)
+    log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t)})
+    found.effects([log])
+    nominal = {n: p.nominal for n, p in found.simulator.parameters.items()}
+
+    def run(**changed: float) -> np.ndarray:
+        values = nominal | {n.replace("__", ".").replace("_of_", ":"): v for n, v in changed.items()}
+        return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
+
+    return found, run
+
+
+@pytest.mark.parametrize(("place", "at"), [("", 0.2), ('payload_at = {arm = "tool"}\n', 0.2),
+                                           ("payload_at = {arm = [0.1, 0.0, 0.0]}\n", 0.1)])  # fmt: skip
+def test_a_payload_is_a_point_mass_where_it_is_said_to_be(files, place, at):
+    _, run = turning(files, place + TURN)
+    ball = f'<geom size="1e-4" pos="{at} 0 0" mass="0.3" contype="0" conaffinity="0"/>'
+    _, other = turning(files, place + TURN, ball)
+    np.testing.assert_allclose(run(body_of_arm__payload=0.3), other(), atol=1e-7)
+    assert np.abs(run() - other()).max() > 1e-3
+
+
+def test_a_payload_where_nothing_is_is_said(files):
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    with pytest.raises(InputError, match=r"payload_at.arm: the model has no site tol.*tool"):
+        load_mjcf(*files(SERVO % "", 'payload_at = {arm = "tol"}\n' + TURN))
+    with pytest.raises(InputError, match=r"payload_at.arm: .*name of a site"):
+        load_mjcf(*files(SERVO % "", "payload_at = {arm = 3}\n" + TURN))
+
+
+def test_no_play_is_the_plain_model_and_play_lags_at_turns(files):
+    found, run = turning(files)
+    assert found.simulator.parameters["joint:turn.width"].effect == "command:u.backlash"
+    plain = run()
+    assert np.abs(run(joint_of_turn__width=1e-7) - plain).max() < 1e-3
+    apart = run(joint_of_turn__width=0.02) - plain
+    assert 3e-3 < np.abs(apart).max() < 0.06
+    assert np.abs(run() - plain).max() == 0.0
 
 
 def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(files):

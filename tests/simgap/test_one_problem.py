@@ -7,9 +7,9 @@ import pytest
 
 from estimation.identification import identify_aligned
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 from simgap.api import diagnose
 from simgap.gap.frame import build

@@ -4,6 +4,7 @@ import asyncio
 import base64
 import hashlib
 import json
+import os
 import socket as socketlib
 import subprocess
 import sys
@@ -17,9 +18,9 @@ from websockets.sync.client import connect
 from estimation.identification import identify_aligned
 from experiments.play_session import browser, find_browser, save, served, stack
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from hmmseg.segmentation.align import align
 from hmmseg_cli.main import main
 from hmmseg_cli.play import diagnosed
@@ -327,3 +328,23 @@ def test_the_command_ends_with_its_terminal(tmp_path):
     assert process.returncode == 0
     assert err == ""
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("at", range(4))
+def test_a_file_that_cannot_be_put_in_place_leaves_no_half_of_it(at, session, tmp_path, monkeypatch):
+    """Each rename of a session is refused in turn: what is there is whole, and the next try saves it."""
+    session.reset()
+    session.advance(1100)
+    real, calls = os.replace, iter(range(10))
+
+    def replace(old, new):
+        if next(calls) == at:
+            raise OSError(28, "No space left on device")
+        real(old, new)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "replace", replace)
+        with pytest.raises(OSError, match="No space"):
+            session.save(tmp_path)
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".") or path.suffix == ".csv"]
+    assert session.save(tmp_path)[-1].name == "trial_01.csv"

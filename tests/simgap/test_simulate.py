@@ -7,10 +7,10 @@ from simgap_scenes import STACK
 
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
+from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Finger, Noise, Rig, read_rig
 from hmmseg.io.task import GROUND, BlockTask, Move, read_task
-from hmmseg.io.trial import read_trial
 from simgap.world.operator import OperatorSettings, minimum_jerk
 from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
 from simgap.world.simulate import scene_files, simulate_trial, simulate_trials, trial_files

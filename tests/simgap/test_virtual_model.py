@@ -8,9 +8,9 @@ import pytest
 from simgap_scenes import HAND, STACK
 
 from hmmseg.contact.decompose import subtasks
+from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg.io.trial import read_trial
 from simgap.world.properties import PAPER_BLOCKS, read_properties
 from simgap.world.replay import replay, residual_summary, smooth
 from simgap.world.simulate import simulate_trial

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
-from hmmseg.io.trial import read_trial
+from hmmseg.hand.read import read_trial
 from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 from simgap.gap.frame import CHANNELS, as_from_wrist, build, shown, shown_forms

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_COLUMNS, Table
+from hmmseg.io.table import MAX_COLUMNS, Table, check_unique
 from hmmseg.io.units import known_unit
 
 COMMENTS = ("#", "%", "//")
@@ -69,13 +68,6 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     if layout.decimal == ",":
         _no_points(columns, rows, str(path))
     return Table(str(path), tuple(names), columns, rows, layout.units, notes=layout.notes)
-
-
-def check_unique(names: Sequence[str], where: str) -> None:
-    """InputError where two columns have one name."""
-    for name, count in Counter(names).items():
-        if count > 1:
-            raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
 
 
 def _plain(column) -> np.ndarray:

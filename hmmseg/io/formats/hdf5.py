@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, check_part, flat, is_wanted, plain_table
 
 MAX_WIDTH = 64  # numerics: numbers a row: images are no channels
 
@@ -32,21 +32,13 @@ def parts(path: Path) -> list[str]:
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     """Table of one demonstration, or of the file's own columns."""
     found = parts(path)
-    if part is None and len(found) > 1:
-        raise InputError(
-            str(path), f"holds {len(found)} recordings", f"{path.name}#{found[0]} for one of them"
-        )
-    if part is not None and part not in found:
-        raise InputError(f"{path}#{part}", "no such recording", ", ".join(found[:5]) or "no #")
+    check_part(path, part, found)
     with h5py.File(path, "r") as file:
         group = file.get(f"data/{part or found[0]}") if found else file
         if not isinstance(group, h5py.Group):
             raise InputError(str(path), "is no group of columns", "an HDF5 file")
         datasets = dict(_datasets(group, "", 0))
-        chosen = {
-            name: each for name, each in datasets.items()
-            if wanted is None or name in wanted or any(w.startswith(f"{name}[") for w in wanted)
-        }  # fmt: skip
+        chosen = {name: each for name, each in datasets.items() if is_wanted(name, wanted)}
         columns = flat({name: each[()] for name, each in chosen.items()})
         rate = _control_rate(file)
     if wanted is not None:
@@ -56,7 +48,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         lengths = [len(values) for values in columns.values()]
         lengths = lengths or [each.shape[0] for each in datasets.values()]
         columns = {"t": np.arange(max(lengths, key=lengths.count, default=0)) / rate, **columns}
-    return plain_table(f"{path}#{part}" if part else str(path), columns, [*columns, *rest])
+    return plain_table(f"{path}#{part}" if part else str(path), columns, rest)
 
 
 def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str, h5py.Dataset]]:

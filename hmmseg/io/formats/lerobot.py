@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from hmmseg.errors import InputError
 from hmmseg.io.formats.parquet import to_columns
-from hmmseg.io.table import Table, plain_table
+from hmmseg.io.table import Table, check_part, plain_table
 
 EPISODE = "episode_index"
 PERSISTENT, EVENTS = "language_persistent", "language_events"
@@ -57,13 +57,8 @@ def parts(path: Path) -> list[str]:
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     """Table of one episode."""
     found = parts(path)
-    if part is None and len(found) > 1:
-        raise InputError(
-            str(path), f"holds {len(found)} recordings", f"{path.name}#{found[0]} for one of them"
-        )
+    check_part(path, part, found)
     part = found[0] if part is None else part
-    if part not in found:
-        raise InputError(f"{path}#{part}", "no such recording", f"0 to {found[-1]}")
     info = read_info(path)
     for file in data_files(path):
         table = pq.read_table(file, filters=[(EPISODE, "==", int(part))])
@@ -74,10 +69,8 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
             break
     else:
         raise InputError(f"{path}#{part}", "has no samples", "an episode")
-    names = tuple(columns)
-    if wanted is not None:
-        columns = {name: values for name, values in columns.items() if name in wanted}
-    return plain_table(f"{path}#{part}", columns, names)
+    rest = [name for name in columns if wanted is not None and name not in wanted]
+    return plain_table(f"{path}#{part}", columns, rest, wanted)
 
 
 def language_rows(table: pa.Table) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, is_wanted, plain_table
 
 MAX_MEMBER = 16 * MAX_ROWS  # bytes of one array
 MAX_ARCHIVE = 8 * MAX_MEMBER  # bytes of all that are read
@@ -33,19 +33,12 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
             for info in archive.infolist()
             if info.filename.endswith(".npy")
         ]
-        # `pose[2]` is a column of the array `pose`
-        chosen = [
-            name for name in names
-            if wanted is None or name in wanted or any(each.startswith(f"{name}[") for each in wanted)
-        ]  # fmt: skip
+        chosen = [name for name in names if is_wanted(name, wanted)]
         _check_size(path, sum(_claimed(path, archive, name) for name in chosen))
         file.seek(0)
         arrays = np.load(file, allow_pickle=False)
-        columns = flat({name: arrays[name] for name in chosen})
-        rest = [name for name in names if name not in chosen]
-    if wanted is not None:
-        columns = {name: values for name, values in columns.items() if name in wanted}
-    return plain_table(str(path), columns, [*columns, *rest])
+        columns = {name: arrays[name] for name in chosen}
+    return plain_table(str(path), columns, [name for name in names if name not in chosen], wanted)
 
 
 def num_rows(path: Path) -> int | None:

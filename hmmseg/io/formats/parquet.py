@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, flat, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, check_unique, flat, is_wanted, plain_table
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -19,14 +19,10 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         if file.metadata.num_rows > MAX_ROWS:
             raise InputError(str(path), f"says it has {file.metadata.num_rows} rows", f"at most {MAX_ROWS}")
         names = file.schema_arrow.names
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"{path}: column {name}", "appears twice", "one of each name")
-        columns = to_columns(file.read(columns=_chosen(names, wanted)))
+        check_unique(names, str(path))
+        columns = to_columns(file.read(columns=[name for name in names if is_wanted(name, wanted)]))
     rest = [name for name in names if not any(c == name or c.startswith(f"{name}[") for c in columns)]
-    if wanted is not None:
-        columns = {name: values for name, values in columns.items() if name in wanted}
-    return plain_table(str(path), columns, [*columns, *rest])
+    return plain_table(str(path), columns, rest, wanted)
 
 
 def num_rows(path: Path) -> int:
@@ -39,19 +35,12 @@ def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator
     """Tables of at most `rows` rows each, in order: a long file in bounded memory."""
     with pq.ParquetFile(path, pre_buffer=False) as file:  # which would hold all of the file
         names, first = file.schema_arrow.names, 1
-        chosen = _chosen(names, wanted)  # by one thread: each has a memory of its own
+        chosen = [name for name in names if is_wanted(name, wanted)]  # by one thread: each has a memory
         for batch in file.iter_batches(batch_size=rows, columns=chosen, use_threads=False):
             columns = to_columns(pa.Table.from_batches([batch]))
             numbers = np.arange(first, first + batch.num_rows)
             first += batch.num_rows
             yield Table(str(path), tuple(names), columns, numbers)
-
-
-def _chosen(names: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
-    return [
-        name for name in names
-        if wanted is None or name in wanted or any(each.startswith(f"{name}[") for each in wanted)
-    ]  # fmt: skip
 
 
 def to_columns(table: pa.Table) -> dict[str, np.ndarray]:

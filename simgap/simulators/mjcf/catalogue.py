@@ -152,7 +152,9 @@ class _Catalogue:
         where = ", ".join(f"{1e3 * x:.0f}" for x in at)
         name = f"body:{body}.payload"
         self.add(name, SIZE * _largest(m), f"a load on {body}, at {where} mm in its frame", low=0.0)
-        self.settings[name] = body_setting(m, body, "payload", np.array(at))
+        setting = body_setting(m, body, "payload", np.array(at))
+        assert setting is not None
+        self.settings[name] = setting
 
     def add_play(
         self, joints: Sequence[int], motions: Sequence[Motion], logs: Mapping[str, Recording]

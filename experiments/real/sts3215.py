@@ -1,0 +1,236 @@
+"""What changed of a servo that swings a weight: labelled logs, cases drawn by seed, how often it is right.
+
+    python -m experiments.real.sts3215 FOLDER [--part develop|judge|all] [--cases N] [--output FILE.json]
+
+FOLDER has logs and an index.csv (file, mass, length, kp, trajectory, repeat, and motor where there are
+several). A configuration is what shares motor, mass, length and gain. Its model (experiments/real/servo.py)
+is calibrated on all of one configuration's logs, and what changed is sought in another's: nothing (second
+repeats against first ones; motions against other motions), mass, length, gain, two of these at once. Single
+samples that no servo can have made are in many logs; each must be found, and be no cause. --part takes one
+half of the configurations, split by the seed, so that what is developed on one can be judged on the other.
+
+What can be told from what, from the equations: at rest and in slow motion gravity gives m l alone. In fast
+motion the inertia m l^2 + J adds to it, J the rotor's. Say that m l grew r times. By the mass, m l^2 grew r
+times; by the length, r^2 times. The two differ by m l^2 (r^2 - r) of J + m l^2 r; where that is less than
+TOLD, as J itself is known no better, mass and length are a set by right. The gain acts on the duty that is
+recorded for the same error, as nothing else does, so it is told alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from experiments.real.servo import Servo
+from experiments.saving import save
+from simgap.robot_effects import effects_of
+from simgap.robots.calibrate import Calibration, calibrate
+from simgap.robots.changes import Changes, changes
+from simgap.robots.unchanged import without_broken
+from simgap.simulators.recording import Recording
+from simgap.simulators.user import checked
+
+TOLD = 0.1  # chosen: share of the inertia; that of the rotor is told to some 5 %
+ROTOR = 0.0275  # cited: kg m^2; fits of this servo by Rhoban/bam's users, 0.027 to 0.028
+SIGN = 10.24  # data sheet: the load register's direction stands in bit 10, in units of a hundredth
+FEW = 10  # logs of a configuration that a case takes at most
+GOAL = ">= 97 %"
+SHOWN = ("mass", "length", "kp")
+EFFECT = {"mass": "mass", "length": "length", "kp": "gain"}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Logs of `old` and `new` by file; `truth`: what differs, with its ratio."""
+
+    kind: str
+    old: tuple[str, ...]
+    new: tuple[str, ...]
+    stated: tuple[float, float, float]  # mass [kg], length [m], register of the old
+    truth: dict[str, float]
+    alone: bool  # whether the equations tell it alone
+
+
+def read(path: Path) -> Recording:
+    """A log: angle, duty with its sign, goal, supply, whether the drive is on."""
+    d = pd.read_csv(path)
+    load = d["torque"].to_numpy(float)
+    columns = {
+        "position": d["position"].to_numpy(float),
+        "duty": np.where(load >= SIGN, load - SIGN, -load) / 10,
+        "goal": d["goal_position"].to_numpy(float),
+        "volts": d["input_volts"].to_numpy(float),
+        "on": d["torque_enable"].to_numpy(float),
+    }
+    return Recording(path.name, d["t"].to_numpy(float), columns)
+
+
+def configurations(index: pd.DataFrame, part: str, seed: int) -> list[tuple[Any, pd.DataFrame]]:
+    """Motor, mass, length and gain with their logs; of one half, where a part is wanted."""
+    keys = [k for k in ("motor", *SHOWN) if k in index]
+    every = list(index.groupby(keys, sort=True))
+    order = np.random.default_rng(seed).permutation(len(every))
+    half = {"develop": order[::2], "judge": order[1::2], "all": order}[part]
+    return [every[k] for k in sorted(half)]
+
+
+def drawn(index: pd.DataFrame, part: str, count: int, seed: int) -> list[Case]:
+    """So many cases of every kind."""
+    rng = np.random.default_rng([seed, 1])
+    groups = configurations(index, part, seed)
+    out: list[Case] = []
+    for kind in ("repeats", "motions", "mass", "length", "kp", "two"):
+        made = list(_made(kind, groups, rng))
+        picked = rng.permutation(len(made))[:count]
+        out += [made[k] for k in picked]
+    return out
+
+
+def _made(kind: str, groups: Sequence[tuple[Any, pd.DataFrame]], rng: np.random.Generator) -> list[Case]:
+    out = []
+    if kind in ("repeats", "motions"):
+        for key, logs in groups:
+            by = "repeat" if kind == "repeats" else "trajectory"
+            for _ in range(2):
+                values = rng.permutation(np.unique(logs[by]))
+                half = values[: (len(values) + 1) // 2]
+                if len(half) < len(values):
+                    old, new = logs[logs[by].isin(half)], logs[~logs[by].isin(half)]
+                    out.append(_case(kind, key, key, old, new, rng))
+        return out
+    for (one, a), (two, b) in itertools.permutations(groups, 2):
+        differ = [n for n, x, y in zip(SHOWN, one[-3:], two[-3:], strict=True) if x != y]
+        same_motor = one[:-3] == two[:-3]
+        if same_motor and (differ == [kind] or (kind == "two" and len(differ) == 2)):
+            out.append(_case(kind, one, two, a, b, rng))
+    return out
+
+
+def _case(
+    kind: str, one: Any, two: Any, old: pd.DataFrame, new: pd.DataFrame, rng: np.random.Generator
+) -> Case:
+    stated, now = [tuple(float(x) for x in key[-3:]) for key in (one, two)]
+    truth = {EFFECT[n]: y / x for n, x, y in zip(SHOWN, stated, now, strict=True) if x != y}
+    files = [tuple(g["file"].iloc[np.sort(rng.permutation(len(g))[:FEW])]) for g in (old, new)]
+    return Case(kind, files[0], files[1], stated, truth, told_alone(stated, truth))
+
+
+def told_alone(stated: tuple[float, float, float], truth: dict[str, float]) -> bool:
+    """Whether the equations tell a change from any other (see above)."""
+    mass, length, _ = stated
+    if len(truth) != 1 or "gain" in truth:
+        return len(truth) == 1
+    (r,) = truth.values()
+    inertia = mass * length**2
+    now = inertia * r ** (2 if "length" in truth else 1)
+    return abs(inertia * (r**2 - r)) / (ROTOR + now) > TOLD
+
+
+def solved(case: Case, folder: Path, known: dict[Any, Calibration]) -> tuple[Changes, float]:
+    """What is found, and the processor's seconds."""
+    begun = time.process_time()
+    servo = checked(Servo(*case.stated), "servo.py:Servo")
+    old, new = ([read(folder / f) for f in files] for files in (case.old, case.new))
+    effects = effects_of(servo, old)
+    key = (case.old, case.stated)
+    if key not in known:
+        known[key] = calibrate(servo, without_broken(servo, old)[0], effects)
+    return changes(servo, old, new, effects, calibration=known[key]), time.process_time() - begun
+
+
+def scored(case: Case, found: Changes) -> dict[str, Any]:
+    """How a case was answered."""
+    told = found.sizes()
+    named = set(found.best.effects) if found.verdict != "none" else set()
+    members = [named, *(set(c.effects) for c in found.others)]
+    right = set(case.truth)
+    out: dict[str, Any] = {
+        "kind": case.kind, "truth": case.truth, "stated": case.stated, "alone": case.alone,
+        "verdict": found.verdict, "named": sorted(named), "others": [sorted(c.effects) for c in found.others],
+        "over": found.over, "broken": len(found.broken),
+        "none": found.verdict == "none",
+        "in_set": found.verdict in ("named", "set") and any(right == m for m in members),
+        "held": found.verdict in ("named", "set") and right <= set().union(*members),
+        "is_alone": found.verdict == "named" and named == right,
+        "sizes": {},
+    }  # fmt: skip
+    explanation = next((c for c in (found.best, *found.others) if set(c.effects) == right), None)
+    if explanation is not None and right:
+        told = found.sizes(explanation)
+        for name, ratio in case.truth.items():
+            one = told[name]
+            low, high = one["ratio_90"]
+            out["sizes"][name] = {
+                "ratio": one["ratio"],
+                "interval": [low, high],
+                "true": ratio,
+                "off": one["ratio"] / ratio - 1,
+                "holds": low <= ratio <= high,
+            }
+    return out
+
+
+def summary(cases: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of every figure the hits, of how many, and a 90 % interval (Clopper and Pearson)."""
+    nothing = [c for c in cases if not c["truth"]]
+    changed = [c for c in cases if c["truth"]]
+    sizes = {n: [c["sizes"][n] for c in changed if n in c["sizes"]] for n in ("mass", "gain")}
+    gains = [c for c in cases if c["kind"] == "kp"]
+    asked = (
+        *(
+            (f"nothing changed, other {kind}: none", [c["none"] for c in nothing if c["kind"] == kind], GOAL)
+            for kind in ("repeats", "motions")
+        ),
+        ("one change, named or in the set", [c["in_set"] for c in changed if c["kind"] != "two"], ">= 95 %"),
+        ("the same, two changes", [c["in_set"] for c in changed if c["kind"] == "two"], ""),
+        ("named alone where told so", [c["is_alone"] for c in changed if c["alone"]], ">= 80 %"),
+        ("mass within 5 %", [abs(s["off"]) <= 0.05 for s in sizes["mass"]], ""),
+        ("90 % interval holds the mass", [s["holds"] for s in sizes["mass"]], "85 to 95 %"),
+        ("gain: named, ratio within 5 %", [
+            c["is_alone"] and abs(c["sizes"]["gain"]["off"]) <= 0.05 for c in gains
+        ], ">= 95 %"),
+    )  # fmt: skip
+    out = []
+    for label, hits, goal in asked:
+        if hits:
+            interval = binomtest(sum(hits), len(hits)).proportion_ci(0.9)
+            out.append({"figure": label, "hits": sum(hits), "of": len(hits), "goal": goal,
+                        "interval_90": [float(interval.low), float(interval.high)]})  # fmt: skip
+    return out
+
+
+def main() -> None:
+    """Draw, solve, score and save."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--part", choices=("develop", "judge", "all"), default="all")
+    parser.add_argument("--cases", type=int, default=24, help="of every kind, at most")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path)
+    given = parser.parse_args()
+    index = pd.read_csv(given.folder / "index.csv")
+    known: dict[Any, Calibration] = {}
+    out = []
+    for case in drawn(index, given.part, given.cases, given.seed):
+        found, seconds = solved(case, given.folder, known)
+        one = scored(case, found) | {"seconds": seconds}
+        out.append(one)
+        sizes = {n: [round(v, 3) for v in (s["ratio"], *s["interval"])] for n, s in one["sizes"].items()}
+        answer = one["verdict"], one["named"], one["others"], sizes, round(found.over, 2), round(seconds)
+        print(case.kind, case.stated, case.truth, case.alone, "->", *answer, flush=True)
+    if given.output is not None:
+        settings = {"part": given.part, "seed": given.seed, "drawn": given.cases}
+        save(given.output, {**settings, "figures": summary(out), "cases": out})
+
+
+if __name__ == "__main__":
+    main()

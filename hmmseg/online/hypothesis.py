@@ -1,0 +1,443 @@
+"""One hypothesis: what it holds, how well it explains a reading, and what a reading teaches it.
+
+A hypothesis is one history of contact states with what follows from it, each quantity in the form in which
+evidence adds up: means as (precision x mean, precision), squared scales as (weighted sum of squares, weight).
+A precision of 0 is a quantity of which nothing is known.
+
+The log-likelihoods are those of hmmseg.segmentation.emissions (tested against them), with what is not yet
+known integrated out: an unknown weight, width or level has a broad density over the range seen, and known
+ones add their variance. And a hand that is free, or carries, may halt: without what follows, a halt would
+pass for a rest on something, as that predicts positions so much better. What was just lifted moves, and what
+is held still bears what it bore a reading before: a block not weighed yet, held on its support, would pass
+for one carried at rest, whose weight is what the fingers happen to bear.
+
+Everything looks back only. A reading is the mean of the last WINDOW s, as recordings are read off line;
+the vertical acceleration is the slope of the velocity over the last SLOPE s, and a velocity that is not
+measured the difference to the row before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hmmseg.contact.equations import block_width, block_y, inertia_factor
+from hmmseg.densities import EDGE, log_between, log_student
+from hmmseg.levels import MOVED, TAIL
+from hmmseg.online.compiled import compiled
+from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, SHUT, STRAY, TOUCHING, WINDOW
+
+NUM_RING = 8  # numerics: boundaries that are remembered, the last ones; a move has four
+# numerics: which scale of residuals is which, as the emissions off line name them
+SCALES = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
+FORCE, CARRY, NET_X, SHEAR, VELOCITY, LEVEL, WIDTH = range(7)
+FREE_KIND, GROUND_KIND, SLIDING_KIND, ABOVE_KIND = range(4)  # of contact states
+# What a hypothesis knows of blocks is an array of its own, (num_quantities, 2): weight [N] and width [m] of
+# every block and of any other one, then the rise [m] of every move.
+HYPOTHESIS = np.dtype([
+    ("weight", "f8"),  # its logarithm
+    ("state", "i8"),  # 0 ... of the round's subtasks, then those off the task
+    ("round", "i8"), ("crossed", "i8"),  # boundaries crossed so far
+    ("missed", "i8"), ("left_at", "f8"),  # the subtask not reached any more (-1: none), since when [s]
+    ("entered", "f8", 2), ("origin", "f8", 2),  # mean and variance: when [s], level at the pickup [m]
+    ("ring", "f8", (NUM_RING, 2)),  # the same of the last boundaries [s]
+    ("bias", "f8", (4, 2)), ("scale", "f8", (7, 2)), ("level", "f8", 2),  # evidence; where the block rests
+])  # fmt: skip
+READING = np.dtype([
+    ("t", "f8"), ("force", "f8", 4), ("vx", "f8"), ("vy", "f8"), ("ay", "f8"), ("y", "f8"), ("d", "f8"),
+    ("sd_y", "f8"), ("sd_d", "f8"), ("sd_vx", "f8"), ("sd_vy", "f8"),
+    ("last_y", "f8"), ("last_d", "f8"), ("last_fy", "f8"),  # of the reading, net fy 1 / MAX_RATE s before
+    ("sd_fx", "f8"), ("sd_fy", "f8"),  # what may be wrong with net forces (the tool on a wrist's sensor)
+    ("gripped", "f8"),  # 0: nothing is held, 2: something is, as more than forces tells; 1: none does
+])  # fmt: skip
+# Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
+RANGES = np.dtype([(name, "f8") for name in ("vx", "vy", "y", "d", "force", "press")])
+# A row that is looked back at: reach of the joints' noise (x, y), forces, vx, vy, y and d, mean net fy.
+ROW = np.dtype([("t", "f8"), ("reach", "f8", 2), ("value", "f8", 8), ("fy", "f8")])
+
+SLOPE = 1.0 / MAX_RATE
+ROWS = 512  # numerics: rows looked back at, at most: 20 kHz over SLOPE
+
+
+@compiled
+def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, before, noise, out):
+    """Take a row into the ring and fill `out` with the reading at `t` [s].
+
+    `rows` (ROWS,) is a ring whose newest row goes to `head`, `filled` of them are there; `dt` [s] since the
+    row before, whose channels are `before` (12,). `channels` (12,): q11, q12, dq11, dq12, fx1, fy1, q21, ...,
+    or x1, y1, vx1, vy1, ...; `geometry` (8,): bases and links of both fingers; `measured`: whether velocities
+    are; `noise` (2,): squared noise of one position and of one velocity [rad or m, and per s].
+    """
+    here, x = rows[head], out[0]
+    x.last_y, x.last_d = x.y, x.d
+    here.t = t
+    here.reach[:] = 0.0 if jointed else 1.0
+    for k in range(4, 8):
+        here.value[k] = 0.0
+    for i in range(2):
+        at, sign = 6 * i, 2.0 * i - 1.0
+        here.value[2 * i], here.value[2 * i + 1] = channels[at + 4], channels[at + 5]
+        tip_vx = tip_vy = math.nan
+        if jointed:
+            tip_x, tip_y, tip_vx, tip_vy = geometry[4 * i], geometry[4 * i + 1], 0.0, 0.0
+            for j in range(2):
+                link, q, dq = geometry[4 * i + 2 + j], channels[at + j], channels[at + 2 + j]
+                across, along = link * math.cos(q), link * math.sin(q)
+                tip_x, tip_y = tip_x + across, tip_y + along
+                tip_vx, tip_vy = tip_vx - along * dq, tip_vy + across * dq
+                here.reach[0] += along * along / 2  # of one finger's x, then y
+                here.reach[1] += across * across / 2
+        else:
+            tip_x, tip_y = channels[at], channels[at + 1]
+            if measured:
+                tip_vx, tip_vy = channels[at + 2], channels[at + 3]
+            elif dt > 0.0:
+                tip_vx, tip_vy = (tip_x - before[at]) / dt, (tip_y - before[at + 1]) / dt
+        here.value[4] += tip_vx / 2
+        here.value[5] += tip_vy / 2
+        here.value[6] += tip_y / 2
+        here.value[7] += sign * tip_x
+    number = 1
+    while number < filled and rows[(head - number) % ROWS].t > t - WINDOW + 1e-9:
+        number += 1
+    for k in range(4):
+        x.force[k] = _mean(rows, head, number, k)
+    x.vx, x.vy = _mean(rows, head, number, 4), _mean(rows, head, number, 5)
+    x.y, x.d = _mean(rows, head, number, 6), _mean(rows, head, number, 7)
+    here.fy = x.force[1] + x.force[3]
+    x.last_fy = math.nan
+    sum_t = sum_v = sum_tt = sum_tv = 0.0
+    num = 0
+    for back in range(filled):
+        old = rows[(head - back) % ROWS]
+        if back > 1 and old.t < t - SLOPE - 1e-9:
+            break
+        if back > 0:
+            x.last_fy = old.fy
+        if not math.isnan(old.value[5]):
+            age, v = old.t - t, old.value[5]
+            sum_t, sum_v, num = sum_t + age, sum_v + v, num + 1
+            sum_tt, sum_tv = sum_tt + age * age, sum_tv + age * v
+    spread = num * sum_tt - sum_t * sum_t
+    x.ay = (num * sum_tv - sum_t * sum_v) / spread if num > 1 and spread > 0.0 else math.nan
+    x.t = t
+    # One finger's noise is `reach` times the joints'; y and velocities are means of both, d the difference.
+    share = 1.0 / (2 * number)
+    x.sd_y = math.sqrt(noise[0] * here.reach[1] * share)
+    x.sd_d = 2 * math.sqrt(noise[0] * here.reach[0] * share)
+    velocity = noise[1] if measured else 2 * noise[0] / max(dt * dt * number, 1e-12)
+    x.sd_vx = math.sqrt(velocity * here.reach[0] * share)
+    x.sd_vy = math.sqrt(velocity * here.reach[1] * share)
+
+
+@compiled
+def _mean(rows, head, number, k):
+    """Mean of a value over the last rows, NaN where it is in none of them."""
+    total, num = 0.0, 0
+    for back in range(number):
+        value = rows[(head - back) % ROWS].value[k]
+        if not math.isnan(value):
+            total += value
+            num += 1
+    return total / num if num > 0 else math.nan
+
+
+@compiled
+def widen(extremes, ranges, least, x):
+    """Ranges that the emissions take as possible, so far and not below `least` (4,)."""
+    span, x = ranges[0], x[0]
+    for k, value in enumerate((x.vx, x.vy, x.y, x.d)):
+        if not math.isnan(value):
+            extremes[k, 0], extremes[k, 1] = min(extremes[k, 0], value), max(extremes[k, 1], value)
+    span.vx, span.vy = (
+        max(least[0], extremes[0, 1] - extremes[0, 0]),
+        max(least[1], extremes[1, 1] - extremes[1, 0]),
+    )
+    span.y, span.d = (
+        max(least[2], extremes[2, 1] - extremes[2, 0]),
+        max(least[3], extremes[3, 1] - extremes[3, 0]),
+    )
+    for c in range(4):
+        if not math.isnan(x.force[c]):
+            span.force = max(span.force, 1.5 * abs(x.force[c]))
+    if not math.isnan(x.force[1] + x.force[3]):
+        span.press = max(span.press, 1.5 * abs(x.force[1] + x.force[3]))
+
+
+STILL = 0.2  # prior: share of samples at which a hand that may move stands still,
+CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
+JUST_LIFTED = 0.05  # prior: ... times this while a lift begins: slow, but a motion
+ALIKE = 0.5  # prior: probability that a block not met yet is like one that was
+_LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
+_LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
+_LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
+_ROOT2 = math.sqrt(2.0)  # numerics: worked out once
+
+
+@compiled
+def log_sum(a, b):
+    """log(exp(a) + exp(b))."""
+    high, low = (a, b) if a > b else (b, a)
+    return high + math.log1p(math.exp(low - high)) if low > -math.inf else high
+
+
+@compiled
+def _log_rising(value, scale, span):
+    """Log density of value = w + noise (sd `scale`), w of a density that rises from 0 to `span`.
+
+    The integral of 2 w / span^2 times the normal density over w > 0 is
+    2 (v Phi(v / s) + s phi(v / s)) / span^2.
+    """
+    z = value / scale
+    tail = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+    share = z * 0.5 * math.erfc(-z / _ROOT2) + tail if z > -5.0 else tail / (z * z)
+    return math.log(2 * scale / span) - math.log(span) + max(math.log(max(share, 1e-300)), EDGE)
+
+
+@compiled
+def _log_broad(value, span):
+    """Log density of a value that may be anywhere in `span`; 0 where missing."""
+    return 0.0 if math.isnan(value) else -math.log(span)
+
+
+@compiled
+def _force(h, x, c):
+    """One force without its bias [N]."""
+    return x.force[c] - h.bias[c, 0] / h.bias[c, 1]
+
+
+@compiled
+def _square(h, which):
+    """Squared scale of one kind of residual."""
+    return h.scale[which, 0] / h.scale[which, 1]
+
+
+@compiled
+def _carry(h, x):
+    """Variance of the net vertical force of what is carried [N^2]."""
+    return _square(h, CARRY) + x.sd_fy * x.sd_fy
+
+
+@compiled
+def _held_width(h, x, pads):
+    """Width of what is held [m], as if rigid where a force is missing."""
+    width = block_width(x.d, _force(h, x, 0), _force(h, x, 2), pads)
+    return x.d if math.isnan(width) else width
+
+
+@compiled
+def _held_height(h, x, pads):
+    """Height of what is held [m], as if rigid where a force is missing."""
+    height = block_y(x.y, _force(h, x, 1), _force(h, x, 3), pads)
+    return x.y if math.isnan(height) else height
+
+
+@compiled
+def _ungripped(h, x, span):
+    """Log density of the forces without a grip: silent, or one finger's alone."""
+    silent1 = silent2 = touch1 = touch2 = 0.0
+    noise = _square(h, FORCE)
+    scale = math.sqrt(noise)
+    for c in range(4):
+        force = _force(h, x, c)
+        silent = log_student(force, math.sqrt(noise + 1.0 / h.bias[c, 1]))
+        if c % 2 == 0:
+            touch = log_between(force if c == 0 else -force, 0.0, span, scale)
+        else:
+            touch = log_between(force, -span, span, scale)
+        if c < 2:
+            silent1, touch1 = silent1 + silent, touch1 + touch
+        else:
+            silent2, touch2 = silent2 + silent, touch2 + touch
+    one = log_sum(touch1 + silent2, silent1 + touch2)
+    return log_sum(_LOG_SILENT + silent1 + silent2, _LOG_ONE + one)
+
+
+@compiled
+def _log_known(value, factor, known, q, others, variance, share, span, rising):
+    """Log density of value = factor x quantity `q`, of which `known` is the evidence; broad where unknown.
+
+    It may be like that of `others` further blocks. `rising`: what is unknown has a density that rises from 0,
+    as a block of no weight is none.
+    """
+    if math.isnan(value):
+        return 0.0
+    precision = known[q, 1]
+    if precision > 0.0:
+        mean = known[q, 0] / precision
+        if rising:
+            mean = max(mean, 0.0)
+        close = log_student(value - factor * mean, math.sqrt(variance + factor * factor / precision))
+        return log_sum(math.log1p(-share) + close, math.log(share) - math.log(span)) if share > 0 else close
+    flat = _log_rising(value, math.sqrt(variance), span) if rising else -math.log(span)
+    met, alike = 0, -math.inf
+    for o in range(q % 2, 2 * others, 2):
+        if known[o, 1] > 0.0:
+            met += 1
+            total = variance + factor * factor / known[o, 1]
+            alike = log_sum(alike, log_student(value - factor * known[o, 0] / known[o, 1], math.sqrt(total)))
+    if met == 0:
+        return flat
+    return log_sum(math.log(1 - ALIKE) + flat, math.log(ALIKE / met) + alike)
+
+
+@compiled
+def _halting(h, x, span):
+    """Log density of the velocities and the height of a hand that halts, over that of one that moves."""
+    out, moving = 0.0, _square(h, VELOCITY)
+    if not math.isnan(x.vx):
+        out += log_student(x.vx, math.sqrt(x.sd_vx**2 + moving)) + math.log(span.vx)
+    if not math.isnan(x.vy):
+        out += log_student(x.vy, math.sqrt(x.sd_vy**2 + moving)) + math.log(span.vy)
+    if not math.isnan(x.y - x.last_y):
+        sd = math.sqrt(2 * x.sd_y**2 + _square(h, LEVEL))
+        out += log_student(x.y - x.last_y, sd) + math.log(span.y)
+    return out
+
+
+@compiled
+def free(h, x, span):
+    """Log-likelihood of a reading in free motion."""
+    still = _halting(h, x, span)
+    if not math.isnan(x.d - x.last_d):
+        sd = math.sqrt(2 * x.sd_d**2 + _square(h, WIDTH))
+        still += log_student(x.d - x.last_d, sd) + math.log(span.d)
+    broad = _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy)
+    broad += _log_broad(x.y, span.y) + _log_broad(x.d, span.d)
+    out = _ungripped(h, x, span.force) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
+    return out + SHUT if x.gripped == 2.0 else out
+
+
+@compiled
+def held(h, known, block, num_blocks, x, span, pads):
+    """Log-likelihood of what a reading of any grip of this block shows."""
+    fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
+    out = log_between((fx1 - fx2) / 2, 0.0, span.force, math.sqrt(_square(h, FORCE)))
+    if x.gripped == 0.0:
+        out += SHUT
+    out += log_student(fx1 + fx2, math.sqrt(_square(h, NET_X) + x.sd_fx * x.sd_fx))
+    out += log_student((_force(h, x, 1) - _force(h, x, 3)) / 2, math.sqrt(_square(h, SHEAR)))
+    spread = x.sd_d * x.sd_d + _square(h, WIDTH)
+    width = _held_width(h, x, pads)
+    return out + _log_known(width, 1.0, known, 2 * block + 1, num_blocks, spread, TOUCHING, span.d, False)
+
+
+@compiled
+def lifted(h, known, block, num_blocks, x, span, gravity, settled):
+    """Log-likelihood of what a reading shows besides of a block above the ground.
+
+    `settled`: probability that it has been there for a while, and may halt.
+    """
+    factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
+    fy = _force(h, x, 1) + _force(h, x, 3)
+    out = _log_known(fy, factor, known, 2 * block, num_blocks, _carry(h, x), 0.0, span.force, True)
+    out += _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy) + _log_broad(x.y, span.y)
+    still = STILL * max(settled, JUST_LIFTED)
+    return out + log_sum(math.log1p(-still), math.log(still) + _halting(h, x, span))
+
+
+@compiled
+def supported(h, known, kind, block, x, span, pads, levels):
+    """Log-likelihood of what a reading shows besides of a block on its support.
+
+    `levels`: whether the height at which the block rests counts.
+    """
+    weighed = known[2 * block, 1] > 0.0
+    most, variance = span.press, _carry(h, x)
+    if weighed:
+        most, variance = known[2 * block, 0] / known[2 * block, 1], variance + 1.0 / known[2 * block, 1]
+    force = log_between(_force(h, x, 1) + _force(h, x, 3), -span.press, most, math.sqrt(variance))
+    moving = _square(h, VELOCITY)
+    upward, broad = log_student(x.vy, math.sqrt(x.sd_vy**2 + moving)), _log_broad(x.vy, span.vy)
+    resting, change = force + upward, x.force[1] + x.force[3] - x.last_fy
+    if not weighed and not math.isnan(change):  # what stands bears what it bore
+        same = log_student(change, 2 * math.sqrt(_square(h, FORCE)))
+        same += log_student(x.vy, math.sqrt(x.sd_vy**2 + CREEP**2))
+        resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same)
+    if levels and h.level[1] > 0.0:
+        spread = x.sd_y * x.sd_y + _square(h, LEVEL) + 1.0 / h.level[1]
+        risen = _held_height(h, x, pads) - h.level[0] / h.level[1]
+        level = log_student(risen, math.sqrt(spread))
+        resting, upward = resting + level, upward + level
+        broad += log_student(risen, MOVED)
+    else:
+        force += _log_broad(x.y, span.y)
+        resting += _log_broad(x.y, span.y)
+    aside = _log_broad(x.vx, span.vx)
+    if kind != GROUND_KIND:
+        return aside + log_sum(_LOG_CLOSE + resting, _LOG_STRAY + broad + force)
+    still = log_student(x.vx, math.sqrt(x.sd_vx**2 + moving))
+    return log_sum(_LOG_REST + still + resting, force + _LOG_STRAY + aside + log_sum(upward, broad))
+
+
+MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
+MOST_SCALE = 200.0  # chosen: and a scale
+LEAST = 1e-12  # numerics: N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
+FLOOR = 0.09  # chosen: ... 0.3 of a sample's own noise
+
+
+@compiled
+def _learn_mean(evidence, value, variance, share, most):
+    """Robust conjugate update of a mean by a value of this variance, worth `share` of a reading."""
+    if math.isnan(value):
+        return
+    robust = 1.0
+    if evidence[1] > 0.0:
+        residual = value - evidence[0] / evidence[1]
+        robust = (TAIL + 1) / (TAIL + residual * residual / (variance + 1.0 / evidence[1]))
+    add = share * robust / variance
+    evidence[0] += add * value
+    evidence[1] += add
+    if evidence[1] > most / variance:
+        forget = most / variance / evidence[1]
+        evidence[0] *= forget
+        evidence[1] *= forget
+
+
+@compiled
+def _learn_scale(evidence, residual, share, least):
+    """Robust update of a squared scale, which stays above `least`."""
+    if math.isnan(residual):
+        return
+    square = residual * residual
+    robust = (TAIL + 1) / (TAIL + square / (evidence[0] / evidence[1]))
+    evidence[0] += share * robust * square
+    evidence[1] += share
+    if evidence[1] > MOST_SCALE:
+        forget = MOST_SCALE / evidence[1]
+        evidence[0] *= forget
+        evidence[1] *= forget
+    evidence[0] = max(evidence[0], max(least, LEAST) * evidence[1])
+
+
+@compiled
+def learn(h, known, kind, block, x, pads, gravity, share, levels):
+    """Update a hypothesis by a reading taken in its state; `share`: of an independent reading."""
+    noise = _square(h, FORCE)
+    if kind == FREE_KIND:
+        for c in range(4):
+            residual = _force(h, x, c)
+            _learn_mean(h.bias[c], x.force[c], noise, share, MOST_BIAS)
+            _learn_scale(h.scale[FORCE], residual, share / 4, LEAST)
+        return
+    fy1, fy2 = _force(h, x, 1), _force(h, x, 3)
+    _learn_scale(h.scale[NET_X], _force(h, x, 0) + _force(h, x, 2), share, noise)
+    _learn_scale(h.scale[SHEAR], (fy1 - fy2) / 2, share, noise)
+    weight, width, found = known[2 * block], known[2 * block + 1], _held_width(h, x, pads)
+    if width[1] > 0.0:
+        _learn_scale(h.scale[WIDTH], found - width[0] / width[1], share, FLOOR * x.sd_d**2)
+    _learn_mean(width, found, x.sd_d * x.sd_d + _square(h, WIDTH), share, math.inf)
+    if kind == ABOVE_KIND:
+        factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
+        if weight[1] > 0.0:
+            _learn_scale(h.scale[CARRY], fy1 + fy2 - factor * weight[0] / weight[1], share, noise)
+        if factor > 0.1:  # in free fall a force says nothing of the weight
+            _learn_mean(weight, (fy1 + fy2) / factor, _carry(h, x) / (factor * factor), share, math.inf)
+        return
+    _learn_scale(h.scale[VELOCITY], x.vy, share, FLOOR * x.sd_vy**2)
+    if levels:
+        height = _held_height(h, x, pads)
+        if h.level[1] > 0.0:
+            _learn_scale(h.scale[LEVEL], height - h.level[0] / h.level[1], share, FLOOR * x.sd_y**2)
+        _learn_mean(h.level, height, x.sd_y**2 + _square(h, LEVEL), share, math.inf)

@@ -1,0 +1,117 @@
+"""What changed between two sets of logs: a small servo whose changes are planted, as oracle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from experiments.real.servo import Servo
+from hmmseg.errors import InputError
+from simgap.robot_effects import effects_of
+from simgap.robots.changes import Changes, by_chance, changes
+from simgap.robots.unchanged import without_broken
+from simgap.simulators.recording import Recording
+from simgap.simulators.user import checked
+
+KNOWN = ("mass", "length", "gain", "coulomb")
+TRUE = {"mass": 0.5, "length": 0.12, "gain": 2.6, "coulomb": 0.15}
+SIMULATOR = checked(Servo(0.5, 0.12, 16.0), "servo.py:Servo")
+
+
+def recorded(motion: str, seed: int, changed: dict[str, float]) -> Recording:
+    """A log of 2 s at 50 Hz of the servo with its true parameters."""
+    t = np.arange(100) / 50
+    goal = {
+        "slow": 1.2 * np.sin(1.5 * t),
+        "slower": 0.9 * t / 2,
+        "slowest": -0.7 * np.sin(0.8 * t), "fast": 0.8 * np.sin(7 * t), "step": np.where(t > 0.4, 1.3, 0.0),
+        "drop": np.where(t < 1, 1.4 * np.minimum(t / 0.8, 1), 1.4),
+    }[motion]  # fmt: skip
+    on = np.where((motion == "drop") & (t > 1), 0.0, 1.0)
+    columns = {"goal": goal, "volts": np.full(t.size, 12.0), "on": on, "position": np.zeros(t.size)}
+    nominal = {n: p.nominal for n, p in SIMULATOR.parameters.items()} | TRUE | changed
+    start = {"position": 0.0, "position_rate": 0.0}
+    rng = np.random.default_rng(seed)
+    log = Recording(f"{motion}_{seed}.csv", t, columns)
+    angle = SIMULATOR.simulate(nominal, log, start)["position"] + 0.001 * rng.normal(size=t.size)
+    log = log.with_columns({"position": angle})
+    duty = SIMULATOR.simulate(nominal, log, start)["duty"] + 0.002 * rng.normal(size=t.size)
+    return log.with_columns({"duty": duty})
+
+
+def logs(
+    seed: int, motions: tuple[str, ...] = ("slow", "fast", "step", "drop"), **changed: float
+) -> list[Recording]:
+    """One log of every motion."""
+    return [recorded(m, seed + k, changed) for k, m in enumerate(motions)]
+
+
+@cache
+def compared(**changed: float) -> Changes:
+    """What is found of planted changes."""
+    old, new = logs(0), logs(100, **changed)
+    every = effects_of(SIMULATOR, old)
+    effects = {n: replace(e, fitted=n in ("gain", "coulomb")) for n, e in every.items() if n in KNOWN}
+    return changes(SIMULATOR, old, new, effects)
+
+
+def test_nothing_changed_is_none():
+    found = compared()
+    body = found.body()
+    assert (body["verdict"], body["causes"]) == ("none", [])
+    assert sum(body["probabilities"].values()) == pytest.approx(1.0)
+
+
+def test_a_gain_doubled_is_named_with_its_ratio():
+    found = compared(gain=5.2)
+    assert found.verdict == "named" and found.best.effects == ("gain",)
+    size = found.sizes()["gain"]
+    low, high = size["ratio_90"]
+    assert low <= 2.0 <= high and size["ratio"] == pytest.approx(2.0, rel=0.03)
+    assert found.body()["changes"][0].startswith("gain +")
+
+
+@pytest.mark.slow
+def test_a_mass_is_named_or_in_a_set_with_length_and_its_interval_holds():
+    found = compared(mass=0.7)
+    members = {c.effects for c in (found.best, *found.others)}
+    assert ("mass",) in members and members <= {("mass",), ("length",)}
+    mass = next(c for c in (found.best, *found.others) if c.effects == ("mass",))
+    low, high = found.sizes(mass)["mass"]["interval_90"]
+    assert low <= 0.7 <= high
+
+
+@pytest.mark.slow
+def test_mass_and_length_are_a_set_where_only_gravity_tells():
+    slow = ("slow", "slower", "slowest")
+    heavy = {"armature": 0.5}  # m l^2 is 2 % of it
+    old, new = logs(0, slow, **heavy), logs(50, slow, mass=0.9, **heavy)
+    every = effects_of(SIMULATOR, old)
+    effects = {n: replace(every[n], fitted=n == "coulomb") for n in ("mass", "length", "coulomb")}
+    known = {**SIMULATOR.parameters, "armature": replace(SIMULATOR.parameters["armature"], nominal=0.5)}
+    found = changes(replace(SIMULATOR, parameters=known), old, new, effects)
+    assert found.verdict == "set"
+    assert {("mass",), ("length",)} <= {c.effects for c in (found.best, *found.others)}
+
+
+def test_a_single_wild_sample_is_found_and_is_no_cause():
+    (log,) = logs(3, ("fast",))
+    wild = log["position"].copy()
+    wild[57] = -3.14
+    (clean,), broken = without_broken(SIMULATOR, [log.with_columns({"position": wild})])
+    assert [(b.channel, b.time, b.value) for b in broken] == [("position", 1.14, -3.14)]
+    assert np.isnan(clean["position"][57]) and np.isfinite(np.delete(clean["position"], 57)).all()
+    assert without_broken(SIMULATOR, [log])[1] == []
+
+
+def test_signs_drawn_anew_are_as_rare_as_counted():
+    assert by_chance(np.array([1.0, 2.0, 9.0])) == pytest.approx(1 / 8)
+    assert by_chance(np.array([1.0, 1.0, -1.0, 1.0])) == pytest.approx(5 / 16)
+
+
+def test_one_old_log_is_too_few():
+    with pytest.raises(InputError, match="--healthy: has 1 log; expected two"):
+        changes(SIMULATOR, logs(0, ("slow",)), logs(1, ("slow",)), {})
