@@ -107,7 +107,9 @@ def diagnose(
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.
     every = [whole] if forced or (calm := whole.calm()) is whole else [calm, whole]
     for composed in every:
-        found = _diagnosed(composed, parts, calibrated, forced, seed, tell, warn, groups)
+        found = _diagnosed(
+            composed.among(composed.thinned()), parts, calibrated, forced, seed, tell, warn, groups
+        )
         if found.verdict.causes:
             break
     return found

@@ -22,10 +22,11 @@ from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import moved_to, prior_cost
 from simgap.robots.identifiable import Identifiability, identifiability
-from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary
+from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
 from simgap.robots.model import Composed, Point
 from simgap.robots.sets import Names, Sets, cancelling, log_odds, neighbours, pairs, point_of, without
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
+from simgap.robots.windows import STRIKES
 from simgap.simulators.protocol import Parameter
 
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
@@ -162,6 +163,9 @@ class Search:
         """What is fitted along, alone; the simulator's own numbers are straight lines about where they are
         then."""
         point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
+        if any(w.regime == STRIKES for w in self.composed.windows):
+            every = linearise(self.composed, point, [*self.along, *self.wanted])
+            self.composed = wobbling(self.composed, every)
         last = -np.inf
         for _ in range(RESETS if any(map(self.composed.numeric, self.along)) else 1):
             self.composed, self.known = self.composed.moved(point), {}
