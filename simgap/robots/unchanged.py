@@ -29,6 +29,7 @@ from simgap.simulators.recording import Recording
 
 BROKEN = 10.0  # chosen: of what 5 % of samples leave the mean of their neighbours by, a sample that is broken
 SCATTER = 0.05  # prior: of a parameter's usual size, by which a model's error moves it from motion to motion
+MOST = 0.2  # prior: likewise, at most; what is larger is for the processes
 WEIGHT = 3.0  # prior: motions that this is worth
 FEW = 3.0  # numerics: factor on the scatter that is learned from few motions, at most
 ALIKE = 0.1  # chosen: of a command's usual size; logs whose commands are closer than this are of one motion
@@ -368,6 +369,7 @@ def _learned(composed: Composed, point: Point, fitted: Sequence[str], candidates
             mean = np.einsum("nij,nj->ni", inside, pull - told[:, :, :p] @ d)
             square = mean**2 + np.diagonal(inside, axis1=1, axis2=2)
             tau = np.sqrt((square.sum(0) + WEIGHT * SCATTER**2) / (len(told) + WEIGHT - 2))
+            tau = np.minimum(tau, MOST)
         left = old.residual - old.columns[:, :p] @ d - np.einsum("ij,ij->i", old.columns, mean[old.motion])
         old.by(processes, tau, scale)
         columns, white = old.whiten(old.columns[:, :p]), old.whiten(old.residual)
