@@ -180,6 +180,10 @@ def diagnose_robot(
 
         folder = own.patch
         given = found.composed, found.linear.point, document, document["causes"], own.mjcf
+        if document["verdict"] == "unknown" and found.calibrated is not None:  # the best model there is
+            whole, point = found.calibrated.composed, found.calibrated.point
+            moved = [n for n in point if not whole.numeric(n)]
+            given = whole, point, document["calibrated"], moved, own.mjcf
         write_patch(*given, lambda name: out.stage(folder / name))
         import json
 
