@@ -480,10 +480,12 @@ def _concluded(
     odds = np.array([c.odds for c in tried])
     chance = np.exp(odds - odds.max())
     chance /= chance.sum()
-    best = tried[int(np.argmax(odds))]
+    best = top = tried[int(np.argmax(odds))]
     for simpler in sorted(tried, key=lambda c: -c.odds):
-        if len(simpler.effects) < len(best.effects) and not _beats(best, simpler):
+        if simpler.effects and len(simpler.effects) < len(best.effects) and not _beats(best, simpler):
             best = simpler
+    if not _beats(top, nothing):
+        best = nothing
     helps = best is nothing or float((best.held - nothing.held).sum()) > 0
     if not helps:
         best = nothing
