@@ -65,7 +65,7 @@ SIZE = np.log(2.0)  # prior: a change that is usual, as a logarithm
 TRIED, PAIRED = 8, 4  # numerics: of single changes fitted exactly, and of those joined in pairs
 ODDS = np.log(20.0)  # chosen: against what is rejected
 SURE = 0.95  # chosen: likewise, that it holds from log to log
-CHANGED = 0.99  # chosen: the same of any change over none, the best of many that are tried
+CHANGED = 0.97  # chosen: the same of any change over none: 3 % of unchanged robots may be called changed
 ALARM = 0.01  # chosen: of logs of what did not change, those whose misfit is called unknown
 Kalman = tuple[np.ndarray, np.ndarray, np.ndarray]  # spread, gain, decay from the row before, (N,) each
 STEPS = 12  # numerics: of a fit
@@ -480,10 +480,12 @@ def _concluded(
     odds = np.array([c.odds for c in tried])
     chance = np.exp(odds - odds.max())
     chance /= chance.sum()
-    best = tried[int(np.argmax(odds))]
+    best = top = tried[int(np.argmax(odds))]
     for simpler in sorted(tried, key=lambda c: -c.odds):
-        if len(simpler.effects) < len(best.effects) and not _beats(best, simpler):
+        if simpler.effects and len(simpler.effects) < len(best.effects) and not _beats(best, simpler):
             best = simpler
+    if not _beats(top, nothing):
+        best = nothing
     helps = best is nothing or float((best.held - nothing.held).sum()) > 0
     if not helps:
         best = nothing
