@@ -13,7 +13,7 @@ from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, alike, cut, st
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 
-# numerics: windows of a regime that a search takes, at most
+# numerics: windows of a regime from which on a search takes some of them alone
 FIRST = 48
 SETTLE = 0.2  # numerics: s that a model has to come to rest where a window is of rest
 
@@ -87,13 +87,13 @@ class Composed:
         return [made.count(self.motion[w.log]) for w in self.windows]
 
     def thinned(self) -> list[int]:
-        """Numbers of windows that a search takes: of every regime evenly chosen ones, FIRST at most."""
+        """Numbers of windows that a search takes: of every regime evenly chosen ones, FIRST at least."""
         if any(w.start is None for w in self.windows):
             return [*range(len(self.windows))]
         kept: list[int] = []
         for regime in sorted({w.regime for w in self.windows}):
             mine = [k for k, w in enumerate(self.windows) if w.regime == regime]
-            kept += mine[:: -(-len(mine) // FIRST)]
+            kept += mine[:: max(1, len(mine) // FIRST)]
         return sorted(kept)
 
     def commanded(self, point: Point) -> list[Recording]:
