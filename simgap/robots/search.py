@@ -34,7 +34,7 @@ TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 RESETS = 3  # numerics: fits of the simulator's own numbers, each about where the last one ended
 USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
-CANCEL = 24  # numerics: pairs that nearly cancel, rolled out along their difference
+CANCEL = 64  # numerics: pairs that nearly cancel, rolled out along their difference
 LEAVES = (
     2.0  # numerics: squares over the noise's; a set that leaves more may be better begun from the calibration
 )
