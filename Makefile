@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -162,6 +162,10 @@ robots-check: robots-models  ## seeded faults in these models, diagnosed (in bui
 	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 30977 --cases 24 --robots pendulum reacher acrobot --out build/robots_check
 	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 64901 --cases 3 --robots ur5e manipulator --out build/robots_check
 	$(BIN)/python -m experiments.robots_check $(ROBOTS) --score build/robots_check
+	$(BIN)/python -m experiments.write_tables
+
+robots-given: $(INSTALLED)  ## faulty robots of another generator, in the folder SET, diagnosed and scored; fills docs/robots_results.md
+	$(BIN)/python -m experiments.robots_check.given $(or $(SET),../shared/robots_check)
 	$(BIN)/python -m experiments.write_tables
 
 bench-robot: robots-models  ## time of a diagnosis of a minute of an arm of six joints; fills docs/robots_results.md

@@ -79,3 +79,27 @@ def changed() -> str | None:
         f"{seconds[len(seconds) // 2]:.0f} s. Code of {found['made_by']}."
     )
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+
+
+def given() -> str | None:
+    """Faulty robots of another generator, case by case."""
+    found = load("robots_check_given")
+    if found is None:
+        return None
+    rows = []
+    for name, one in found.items():
+        if not isinstance(one, dict):
+            continue
+        causes = ", ".join(f"{cause} {value:.4g}" for cause, value in one["causes"].items()) or "none"
+        others = f"; or {', '.join(one['indistinguishable'])}" if one["indistinguishable"] else ""
+        rows.append([name, one["verdict"], causes + others, "yes" if one["right"] else "no",
+                     f"{one['over_noise']:.2f}", f"{one['seconds']:.0f} s"])  # fmt: skip
+    head = [
+        "case",
+        "verdict",
+        "causes, with their parameters",
+        "as the answer",
+        "left, over noise",
+        "processor",
+    ]
+    return markdown(head, rows)

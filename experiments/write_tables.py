@@ -115,6 +115,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
     ("docs/robots_results.md", "minute", table_robots.minute, "bench-robot"),
+    ("docs/robots_results.md", "robots_check_given", table_robots.given, "robots-given"),
     ("docs/robots_results.md", "robots_check", table_robots.check, "robots-check"),
     ("docs/robots_results.md", "sts3215", table_robots.changed, "sts3215"),
     ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
