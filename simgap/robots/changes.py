@@ -517,7 +517,7 @@ def _concluded(
 def _beats(one: Change, other: Change) -> bool:
     """Whether a change rules another out: by its odds, and in its log likelihood from log to log."""
     sure = SURE if other.effects else CHANGED
-    return one.odds - other.odds > ODDS and by_chance(one.held - other.held) <= 1 - sure
+    return bool(one.odds - other.odds > ODDS) and by_chance(one.held - other.held) <= 1 - sure
 
 
 def by_chance(gain: np.ndarray) -> float:
