@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,11 @@ from simgap.report.finding import sentence
 from simgap.report.finding import tables as usual_tables
 
 if TYPE_CHECKING:
+    from simgap.progress import Progress
     from simgap.robots.diagnose import RobotDiagnosis
+    from simgap.simulators.mjcf.load import Loaded
+    from simgap.simulators.protocol import Simulator
+    from simgap.simulators.recording import Recording
 
 ROBOT = "A robot against your own model of it"
 SimulatorOption = Annotated[
@@ -104,6 +109,53 @@ class OwnSimulator:
             check_folder("--patch", self.patch)
 
 
+def _read(
+    out: Output, paths: Sequence[Path], own: OwnSimulator
+) -> tuple[Simulator, list[Recording], Loaded | None]:
+    """The simulator, the logs of its channels, and what was loaded of an MJCF."""
+    if own.simulator is not None:
+        from simgap.simulators.recording import read_recording
+        from simgap.simulators.user import load_simulator
+
+        loaded, simulator = None, load_simulator(own.simulator)
+        commands = [name for name, channel in simulator.channels.items() if channel.kind == "command"]
+        logs = [read_recording(path, list(simulator.channels), commands=commands) for path in paths]
+    else:
+        from simgap.simulators.mjcf.load import load_mjcf
+
+        assert own.mjcf is not None and own.map_file is not None
+        loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
+        simulator, logs = loaded.simulator, [loaded.read(path) for path in paths]
+    for warning in (*(() if loaded is None else loaded.warnings), *(w for log in logs for w in log.warnings)):
+        out.warn(warning)
+    return simulator, logs, loaded
+
+
+@contextmanager
+def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
+    """Progress by stages, with what a long one is at; yields what is told of each stage that begins."""
+    from simgap.progress import heard
+
+    stage = text
+
+    def tell(text: str) -> None:
+        nonlocal stage
+        stage = text
+        advance(1, text)
+
+    with out.progress(text, total=total) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
+        yield tell
+
+
+def _warn_of_engine(out: Output, own: OwnSimulator) -> None:
+    """What MuJoCo warned of, each once."""
+    if own.mjcf is not None:
+        from simgap.simulators.mjcf.engine import warned
+
+        for line in warned():
+            out.warn(line)
+
+
 def diagnose_robot(
     out: Output,
     paths: Sequence[Path],
@@ -112,48 +164,19 @@ def diagnose_robot(
     effect: Sequence[str],
 ) -> None:
     """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
-    from simgap.progress import heard
     from simgap.robots.describe import body
     from simgap.robots.diagnose import STAGES, diagnose
-    from simgap.simulators.recording import read_recording
 
-    more: list = []
-    length = None
-    if own.simulator is not None:
-        from simgap.simulators.user import load_simulator
-
-        simulator = load_simulator(own.simulator)
-        wanted = list(simulator.channels)
-        commands = [name for name, channel in simulator.channels.items() if channel.kind == "command"]
-        recordings = [read_recording(path, wanted, commands=commands) for path in paths]
-        at_risk = simulator
-    else:
-        from simgap.simulators.mjcf.load import load_mjcf
-
-        assert own.mjcf is not None and own.map_file is not None
-        loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
-        recordings = [loaded.read(path) for path in paths]
-        at_risk, length = loaded.simulator, loaded.map.length
-        for warning in loaded.warnings:
-            out.warn(warning)
-        more = loaded.effects(recordings)
-    for recording in recordings:
-        for warning in recording.warnings:
-            out.warn(warning)
+    at_risk, recordings, loaded = _read(out, paths, own)
+    more = [] if loaded is None else loaded.effects(recordings)
+    length = None if loaded is None else loaded.map.length
     phases = None
     if task is not None:
         from hmmseg.io.task import read_task
         from simgap.robots.task_phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
-    stage = "diagnosing"
-
-    def tell(text: str) -> None:
-        nonlocal stage
-        stage = text
-        advance(1, text)
-
-    with out.progress(stage, total=STAGES) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
+    with _stages(out, "diagnosing", STAGES) as tell:
         found = diagnose(
             at_risk,
             recordings,
@@ -166,11 +189,7 @@ def diagnose_robot(
             warn=out.warn,
         )
     document = body(found)
-    if own.mjcf is not None:
-        from simgap.simulators.mjcf.engine import warned
-
-        for line in warned():
-            out.warn(line)
+    _warn_of_engine(out, own)
     left = document["remainder"]["rms_over_noise"]
     out.print(sentence(document), f"What is left is {left:.3g} times the noise.", *tables(document, found))
     if out.figures is not None or out.report is not None:
@@ -196,39 +215,15 @@ def diagnose_robot(
 
 def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], own: OwnSimulator) -> None:
     """What changed of a robot since its `healthy` logs: table, figure, page, patch and document."""
-    from simgap.progress import heard
     from simgap.robot_effects import UNMEASURED, effects_of
     from simgap.robots.changes import STAGES, changes
 
-    every = [*paths, *healthy]
-    if own.simulator is not None:
-        from simgap.simulators.recording import read_recording
-        from simgap.simulators.user import load_simulator
-
-        simulator = load_simulator(own.simulator)
-        commands = [n for n, c in simulator.channels.items() if c.kind == "command"]
-        logs = [read_recording(path, list(simulator.channels), commands=commands) for path in every]
-        effects = effects_of(simulator, logs)
-    else:
-        from simgap.simulators.mjcf.load import load_mjcf
-
-        assert own.mjcf is not None and own.map_file is not None
-        loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
-        logs, simulator = [loaded.read(path) for path in every], loaded.simulator
-        for warning in loaded.warnings:
-            out.warn(warning)
-        effects = effects_of(simulator, logs, loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
-    for warning in (w for log in logs for w in log.warnings):
-        out.warn(warning)
-    stage = "comparing"
-
-    def tell(text: str) -> None:
-        nonlocal stage
-        stage = text
-        advance(1, text)
-
-    with out.progress(stage, total=STAGES) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
+    simulator, logs, loaded = _read(out, [*paths, *healthy], own)
+    own_effects = () if loaded is None else (loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
+    effects = effects_of(simulator, logs, *own_effects)
+    with _stages(out, "comparing", STAGES) as tell:
         found = changes(simulator, logs[len(paths) :], logs[: len(paths)], effects, tell=tell)
+    _warn_of_engine(out, own)
     document = found.body()
     for b in document["broken"]:
         out.warn(f"{b['trial']}: {b['channel']} is {b['value']:.4g} at {b['time']:.3f} s, left out")
