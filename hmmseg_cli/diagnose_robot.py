@@ -219,8 +219,10 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
     from simgap.robots.changes import STAGES, changes
 
     simulator, logs, loaded = _read(out, [*paths, *healthy], own)
-    own_effects = () if loaded is None else (loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
-    effects = effects_of(simulator, logs, *own_effects)
+    if loaded is None:
+        effects = effects_of(simulator, logs)
+    else:
+        effects = effects_of(simulator, logs, loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
     with _stages(out, "comparing", STAGES) as tell:
         found = changes(simulator, logs[len(paths) :], logs[: len(paths)], effects, tell=tell)
     _warn_of_engine(out, own)
