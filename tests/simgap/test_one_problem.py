@@ -65,8 +65,8 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
     )
     # Its document has the properties that were identified, and shifts them from there.
     forced = diagnose(found, effects=("force_gain",)).body["effects"]["force_gain"]["property_shift"]
-    assert set(forced) == {".".join(name) for name in found.means}
-    for name, mean in found.means.items():
+    assert set(forced) == {".".join(name) for name in found.centres}
+    for name, mean in found.centres.items():
         assert abs(forced[".".join(name)]["before"] - mean) < found.of(*name).std(), name
     # A result like others: it reads like the terminal, and its draws are what its document sums up.
     assert repr(told).startswith(told.words()) and "probabilities" in repr(told)
