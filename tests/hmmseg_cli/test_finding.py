@@ -174,3 +174,40 @@ def test_every_verdict_has_a_page(verdict):
         assert text.count(">61 %<") == 1 and ">61<" in text  # heat map and table, the same number
     if causes:
         assert "3985 ± 180 N/m" in text and "1.6200 cm" in text
+
+
+ROBOT = {
+    "verdict": "unknown", "causes": [], "indistinguishable": [], "effects": {}, "numerics": {},
+    "detection": {"p_value": 0.0, "resolution": 0.0}, "next_experiment": None, "shrinkage": None,
+    "probabilities": {"none": 0.0, "unknown": 1.0}, "remainder": {"share": 1.0, "rms_over_noise": 11.5},
+    "explanation": {"effects": ["joint:slew.armature"], "doubts": ["11.5 times the noise is left"]},
+    "attribution": {"joint:slew.armature": {"probability": 0.68, "share": 0.0, "interval_90": [0.0, 0.0]}},
+    "where": [{"trial": "a.csv", "channel": "q1", "subtask": "moving", "band": [0.0, 50.0], "share": 1.0,
+               "z": 9.0}],
+}  # fmt: skip
+
+
+def test_an_unknown_gap_of_a_robot_names_the_best_and_why_it_is_none():
+    said = " ".join([*sentences(ROBOT), *remains(ROBOT)])
+    assert "slew: rotor inertia, is doubted: 11.5 times the noise is left" in said
+    assert "while it moves: 100 % of the gap" in said
+    shown = page(ROBOT, Setting(["a.csv"], ["moving"]), lambda path: None)
+    assert "None explains a hundredth of the gap" in shown and "68 %" not in shown
+    assert "Logs of a robot that is as its model differ" in shown
+
+
+def test_causes_that_act_together_are_listed_once_in_units_that_read_well():
+    found = {"body:arm.payload": (0.0894, 0.0, "kg"), "joint:slew.frictionloss": (0.451, 0.05, "N m")}
+    parameters = {
+        f"{n}.{n.rpartition('.')[2]}": {
+            "mean": m, "sd": 0.001, "interval_90": [m, m], "unit": unit, "nominal": nominal
+        }
+        for n, (m, nominal, unit) in found.items()
+    }  # fmt: skip
+    pair, act = "+".join(found), {"probability": 0.5, "share": 0.5, "interval_90": None}
+    body = ROBOT | {
+        "verdict": "named", "causes": list(found), "effects": {pair: {"parameters": parameters}},
+        "probabilities": {pair: 0.99}, "attribution": dict.fromkeys(found, act), "explanation": None,
+    }  # fmt: skip
+    assert headline(body) == "Arm: a load 89.4 g (model: 0) and slew: dry friction 0.451 N m (model: 0.0500)"
+    assert chances(body) == dict.fromkeys(found, 0.99)
