@@ -45,7 +45,7 @@ def accelerator() -> str | None:
     shares = ", ".join(f"{n} {percent(share, 2)}" for n, share in same.items())
     far = max(max(c["largest difference"].values(), default=0.0) for c in cases)
     return (
-        f"{table}\n\nWall time on one {found['device']}, JAX {found['jax']}. Trials in which all starts are those "
+        f"{table}\n\nWall time on one {found['device']}, JAX {found['jax']}. Trials with all starts as "
         f"found row by row, least of all cases (torchaudio and torbi in single precision): {shares}. "
         f"Posteriors differ by {far:.0e} at most."
     )
