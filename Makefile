@@ -37,8 +37,8 @@ typecheck: $(INSTALLED)  ## static types
 tests: $(INSTALLED)  ## tests alone, without those marked slow
 	$(BIN)/pytest -n auto --dist loadfile tests
 
-slow: $(INSTALLED)  ## the tests marked slow
-	$(BIN)/pytest -n auto --dist loadfile -m slow tests
+slow: $(INSTALLED)  ## the tests marked slow, and every call's annotations checked
+	CHECK_CALLS=1 $(BIN)/pytest -n auto --dist loadfile -m slow tests
 
 golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ against those pinned in tests/data/golden
 	$(BIN)/python -m experiments.golden compare
