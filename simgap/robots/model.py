@@ -125,7 +125,7 @@ class Composed:
 
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """True channels of every window from these starts; None where a rollout diverged."""
-        there = {n: v for n, v in self.about.items() if self.numeric(n)}
+        there = {n: v for n, v in self._about().items() if self.numeric(n)}
         plain = {n: v for n, v in point.items() if not self.numeric(n)}
         out = self._rolled({**plain, **there}, self.windows, starts)
         for name, theta in point.items():
@@ -134,6 +134,13 @@ class Composed:
                 for short, value in theta.items():
                     out = self.stepped(out, name, short, value - from_there[short])
         return out
+
+    def _about(self) -> Point:
+        """`about` without what costs a second run of every window: of that the proportion is enough."""
+        dear = getattr(self.simulator, "dear", ())
+        return {
+            n: v for n, v in self.about.items() if not any(p in dear for p in self.effects[n].model.values())
+        }
 
     def stepped(
         self, true: Sequence[Channels | None], name: str, short: str, by: float
@@ -149,10 +156,11 @@ class Composed:
         new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
         if new:
             known = self.effects[name].parameters[short]
-            now = {**self.effects[name].neutral(), **self.about.get(name, {})}
+            about = self._about()
+            now = {**self.effects[name].neutral(), **about.get(name, {})}
             step = known.sd if now[short] + known.sd <= known.high else -known.sd
-            there = {**self.about, name: {**now, short: now[short] + step}}
-            both = [self._rolled(p, new, [w.start for w in new]) for p in (self.about, there)]
+            there = {**about, name: {**now, short: now[short] + step}}
+            both = [self._rolled(p, new, [w.start for w in new]) for p in (about, there)]
             for w, here, moved in zip(new, *both, strict=True):
                 change = {} if here is None or moved is None else _sum(moved, here, -1.0)
                 found = {n: v / step for n, v in (change or {}).items()}

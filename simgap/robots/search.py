@@ -86,6 +86,7 @@ class Search:
     known: dict[frozenset[str], Settled] = field(default_factory=dict)
     starts: dict = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
+    columns: dict[str, Moved | None] = field(default_factory=dict)  # of candidates where a search began
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
 
@@ -106,6 +107,7 @@ class Search:
         if best.squares.sum() < LEAVES * best.covariances.floor():
             return best
         tell("from the calibration")
+        self.columns.clear()
         other = self._calibrated()
         if other is not None and other.squares.sum() < best.squares.sum():
             other = self._from(other, tell)
@@ -230,16 +232,18 @@ class Search:
         """All candidates about a point, by the discrepancy there and less of it.
 
         Those that do not act yet are secants of their usual size: a joint that sticks follows no small
-        change.
+        change. They stay as they were where the search began; those that lead are rolled out anew.
         """
         composed, point, held = self.composed, at.point, at.names
         linear = linearise(composed, point, [*self.along, *held], self.starts)
         base, more = base_at(composed, point), {}
         for name in names:
             if name not in held:
-                say(f"what {name} would do")
-                size = np.full(len(composed.effects[name].parameters), USUAL)
-                one = vary(composed, base, linear.starts, name, step=size)
+                if name not in self.columns:
+                    say(f"what {name} would do")
+                    size = np.full(len(composed.effects[name].parameters), USUAL)
+                    self.columns[name] = vary(composed, base, linear.starts, name, step=size)
+                one = self.columns[name]
                 more |= {} if one is None else {name: one}
         linear = linear.with_moved(more)
         cov = covariances(composed, linear)
@@ -263,26 +267,34 @@ class Search:
         bends, which no straight line has. They are rolled out along it."""
         more, both = {}, {}
         for one, other, against in cancelling(sets)[:CANCEL]:
+            name = f"{one}{JOINED}{other}"
             if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
                 continue
-            for sign in (1.0, -1.0):
-                point = dict(base.point)
-                for name, size in ((one, sign), (other, sign * against)):
-                    ((short, p),) = self.composed.effects[name].parameters.items()
-                    point[name] = {short: p.nominal + size * p.sd}
-                    if not p.low <= point[name][short] <= p.high:
-                        break
-                else:
+            if name not in self.columns:
+                self.against[name] = against
+                self.columns[name] = self._difference(base, one, other, against)
+            moved = self.columns[name]
+            if moved is not None:
+                more[name] = moved
+                both[name] = RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
+        return linear.with_moved(more), both
+
+    def _difference(self, base: Base, one: str, other: str, against: float) -> Moved | None:
+        """How the rows move by a usual size of one and so much `against` it of the other; None where that is
+        not to be had."""
+        for sign in (1.0, -1.0):
+            point = dict(base.point)
+            for name, size in ((one, sign), (other, sign * against)):
+                ((short, p),) = self.composed.effects[name].parameters.items()
+                point[name] = {short: p.nominal + size * p.sd}
+                if not p.low <= point[name][short] <= p.high:
                     break
             else:
-                continue
-            rows = base_at(self.composed, point).rows
-            if np.isfinite(rows[np.isfinite(base.rows)]).all():
-                name = f"{one}{JOINED}{other}"
-                more[name] = Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
-                both[name] = RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
-                self.against[name] = against
-        return linear.with_moved(more), both
+                rows = base_at(self.composed, point).rows
+                if not np.isfinite(rows[np.isfinite(base.rows)]).all():
+                    return None
+                return Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
+        return None
 
     def _where_they_act(self, base: Base, linear: Linear, sets: Sets, held: Names) -> Linear:
         """The candidates that come near, rolled out where they fit best: what kinks or saturates is a

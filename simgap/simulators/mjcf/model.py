@@ -152,6 +152,11 @@ class MjcfSimulator:
         return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n in (HOLD, LATE))
 
     @property
+    def dear(self) -> frozenset[str]:
+        """Those of them that cost a second run, of steps as fine as they are to be had."""
+        return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
+
+    @property
     def uncertain(self) -> tuple[str, ...]:
         """Patterns of what was never measured, as the map has it."""
         return self.map.uncertain
