@@ -292,6 +292,13 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
     return np.asarray(_whitened(world, arrays, w, jnp.asarray(given.properties(u)))[0])
 
 
+def residual_of(given: Problem, world: World) -> np.ndarray:
+    """Whitened residuals (n,) of a world that effects were taken out of, properties as expected."""
+    _, arrays, w = given.constants
+    usual = jnp.asarray(given.properties(neutral(given)))
+    return np.asarray(_whitened(world, arrays, w, usual)[0]).ravel()[given.existing]
+
+
 @jax.jit
 def _in_contact(world):
     return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
