@@ -76,6 +76,7 @@ bench: $(INSTALLED)  ## alignment beside hmmlearn and dynamax, stages of the com
 	$(BIN)/python -m experiments.write_tables
 
 bench-accelerator: $(INSTALLED)  ## the same recursions on this machine's accelerator; fills docs/benchmarks.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[accelerator]'
 	$(BIN)/python -m experiments.benchmarks.hmm --parallel
 	$(BIN)/python -m experiments.write_tables
 
