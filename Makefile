@@ -155,7 +155,6 @@ results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables o
 	$(BIN)/python -m experiments.score_recordings recordings
 	$(BIN)/python -m experiments.calibration recordings
 	$(BIN)/python -m experiments.benchmarks.moves
-	$(BIN)/python -m experiments.benchmarks.identify
 	$(BIN)/python -m experiments.write_tables
 
 ROBOTS := build/robots

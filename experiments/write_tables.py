@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from experiments import (
@@ -120,6 +121,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/robots_results.md", "robots_check", table_robots.check, "robots-check"),
     ("docs/robots_results.md", "sts3215", table_robots.changed, "sts3215"),
     ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
+    ("docs/tables/wrist.csv", "", partial(wrist.wrist, every=True), "wrist"),
     ("docs/sequences.md", "sequences", table_sequences.table, "sequences"),
 )
 
