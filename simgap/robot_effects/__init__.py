@@ -36,6 +36,8 @@ def candidates(setting: Setting) -> dict[str, RobotEffect]:
 
 # prior: what a model states and nobody measured may be off by so many usual sizes of what it has wrong
 WIDE = 30.0
+# prior: by unit, factors on what a model states that no robot is off by: beyond is no value at all
+MOST = {"kg": 3.0, "kg m^2": 10.0}
 UNMEASURED = (  # of a model, whatever it states of them
     "joint:*.damping", "joint:*.frictionloss", "joint:*.armature", "actuator:*.gain", "actuator:*.damping",
     "geom:*.stiffness", "command.delay",
@@ -61,7 +63,17 @@ def effects_of(
             if not any(fnmatchcase(n, name) for n in known):
                 where = f"{getattr(getattr(simulator, 'map', None), 'file', 'simulator')}: {what}"
                 raise InputError(where, f"nothing is called {name}", nearest(name, list(known)))
-    return doubted(known, (*named, *uncertain), sds)
+    return doubted({n: _plausible(e) for n, e in known.items()}, (*named, *uncertain), sds)
+
+
+def _plausible(effect: RobotEffect) -> RobotEffect:
+    """The effect with masses and inertias that are stated kept within what a robot can have."""
+    bounded = {}
+    for name, p in effect.parameters.items():
+        if p.nominal > 0 and p.unit in MOST:
+            low, high = p.nominal / MOST[p.unit], p.nominal * MOST[p.unit]
+            bounded[name] = replace(p, low=max(p.low, low), high=min(p.high, high))
+    return replace(effect, parameters={**effect.parameters, **bounded}) if bounded else effect
 
 
 def doubted(
