@@ -136,7 +136,7 @@ class Composed:
 
     def _dear(self, effect: str) -> bool:
         """Whether an effect of the simulator's own numerics costs another run of every window."""
-        dear = getattr(self.simulator, "dear", ())
+        dear = getattr(self.simulator, "dear", getattr(self.simulator, "numerics", ()))
         return any(p in dear for p in self.effects[effect].model.values())
 
     def _without_dear(self, point: Point) -> Point:
