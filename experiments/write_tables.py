@@ -110,6 +110,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/tables/special_cases.csv", "", ablation.table, "ablation"),
     ("docs/hmm.md", "hiro_network", hiro_network, "real"),
     ("docs/benchmarks.md", "alignment", table_speed.alignment, "bench"),
+    ("docs/benchmarks.md", "accelerator", table_speed.accelerator, "bench-accelerator"),
     ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),
     ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
     ("docs/benchmarks.md", "batch", table_speed.batch, "bench-batch"),

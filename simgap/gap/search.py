@@ -223,7 +223,7 @@ def search(
     aligned, warnings = _complete(aligned)
     if identified is None:
         tell("identifying properties")
-        identified = identify_aligned(aligned).means
+        identified = identify_aligned(aligned).centres
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, Start((), neutral(given)))
