@@ -18,7 +18,7 @@ from simgap.report.finding import (
     settles,
     to_do,
 )
-from simgap.robot_effects import families
+from simgap.robot_effects import FAMILIES
 from simgap.simulators.mjcf.settable import KNOWN
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
@@ -65,8 +65,8 @@ def test_numbers_have_one_unit_and_no_exponent():
 def test_every_effect_has_a_plain_name_and_a_check():
     for name, effect in catalogue().items():
         assert effect.called and checks([name]) == [effect.check] and effect.check.endswith(".")
-    for family in families().values():
-        for kind, (called, check) in getattr(family, "WORDS", {}).items():
+    for family in FAMILIES:
+        for kind, (called, check) in family.WORDS.items():
             whole = kind.replace(".", ":arm x.") if kind.split(".")[0] in ("readout", "pose") else kind
             assert plain_name(whole) == called + (" (arm x)" if whole != kind else "")
             assert checks([whole]) == [check] and check.endswith(".")

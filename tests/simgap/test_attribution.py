@@ -107,7 +107,8 @@ def test_twins_are_taken_until_the_answer_is_clear():
     assert len(taken) == 8 and found.p_value >= 0.5
     rare = detected(5.0, [0.0] * 19)
     assert rare.resolution == pytest.approx(1 / 20) and rare.p_value == pytest.approx(np.exp(-5))
-    assert detected(50.0, twins()).resolution == pytest.approx(1 / 5)  # a few leave no doubt
+    assert detected(50.0, twins()).resolution == pytest.approx(1 / 2)  # the first leaves no doubt
+    assert detected(50.0, [20.0] * 6).resolution == pytest.approx(1 / 7)  # as large ones do
 
 
 def test_twins_tell_by_how_much_the_bayes_factor_is_off():
