@@ -180,3 +180,13 @@ def unrepeated(design: Design) -> list[str]:
         f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
         "from its prior; a second trial would show it"
     ]
+
+
+def unchecked(design: Design, rig: Rig) -> list[str]:
+    """What nothing in a recording contradicts if the rig has it wrong."""
+    if not rig.jointed or not any(u.prop == "width" for u in design.unknowns):
+        return []
+    return [
+        "widths take the distance of the fingers' bases from rig.toml, and bases that stand closer than it "
+        "says would not show; a block of known width would check it"
+    ]

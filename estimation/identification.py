@@ -14,6 +14,7 @@ from estimation.checks import (
     dense,
     misfits,
     soft_pads,
+    unchecked,
     unnamed,
     unrepeated,
     unstated_pads,
@@ -190,7 +191,7 @@ def identify_aligned(
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings
-            notes += [*unrepeated(design), *unstated_pads(design)]
+            notes += [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
             contradicted = contradictions(aligned, weighed, design)
             reasons |= contradicted | impossible(design, sampled)
             kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
