@@ -204,6 +204,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         images=images | {n: None for n in ("gap_signal", "gap_before_after") if n not in images},
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
+        robot=finding.of_robot(body),
         calibrated=_calibrated(body),
         numerics=_numerics(body),
         properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
