@@ -9,9 +9,10 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-from hmmseg.jaxconfig import configure
+from hmmseg.jaxconfig import configure, keep_programs
 
 configure()
+keep_programs()  # one worker's compiled programs are the others'
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
