@@ -257,7 +257,9 @@ def remains(body: Body) -> list[str]:
         ]
     p = rest.get("p_value")
     sure = "" if p is None else f" ({p_text(p)})"
-    if rest["share"] < 0.01 or _noise(rest):
+    if rest["share"] < 0.01 and not _noise(rest):
+        return [f"Under 1 % of the gap remains{sure}, which is more than noise.{size}"]
+    if _noise(rest):
         return [
             f"What remains, {percent(rest['share'])} of the gap, does not stand out of the noise{sure}.{size}"
         ]

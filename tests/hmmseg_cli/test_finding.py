@@ -211,3 +211,12 @@ def test_causes_that_act_together_are_listed_once_in_units_that_read_well():
     }  # fmt: skip
     assert headline(body) == "Arm: a load 89.4 g (model: 0) and slew: dry friction 0.451 N m (model: 0.0500)"
     assert chances(body) == dict.fromkeys(found, 0.99)
+
+
+def test_what_remains_is_called_noise_by_its_p_value_alone():
+    left = {"remainder": {"share": 0.003, "p_value": 1e-15, "where": []}}
+    assert remains(body("named", ["table_compliance"], **left)) == [
+        "Under 1 % of the gap remains (p = 1e-15), which is more than noise."
+    ]
+    left["remainder"]["p_value"] = 0.6
+    assert "does not stand out of the noise (p = 0.60)" in remains(body("named", ["cable_force"], **left))[0]

@@ -131,6 +131,24 @@ def test_degrees_where_radians_are_declared_are_named(files, tmp_path):
         found.read(path)
 
 
+def test_goals_in_degrees_are_named_by_where_the_joint_goes(files, tmp_path):
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    servo = XML.replace('<motor name="m" joint="pivot"/>', '<position name="m" joint="pivot" kp="5"/>')
+    found = load_mjcf(*files(servo, MAP.replace('unit = "Nm"\n', "")))
+    path = tmp_path / "log.csv"
+    for factor, fails in ((1.0, False), (180 / np.pi, True)):
+        rows = "".join(
+            f"{k / 50:.2f},{0.5 * np.sin(k / 9):.4f},{0.55 * factor * np.sin(k / 9):.4f}\n" for k in range(60)
+        )
+        path.write_text("t,q,u\n" + rows)
+        if fails:
+            with pytest.raises(InputError, match=r"column u: sends m to 31.* rad, where pivot goes to 0\.49"):
+                found.read(path)
+        else:
+            assert found.read(path).t.size == 60
+
+
 def test_a_patch_touches_only_what_changes(files):
     from simgap.simulators.mjcf.patch import attribute_set, option_set
 

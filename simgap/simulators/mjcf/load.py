@@ -47,6 +47,7 @@ class Loaded:
         for pose in self.simulator.free.values():
             log = continuous(log, [pose[a] for a in ("qw", "qx", "qy", "qz")])
         _check_ranges(self.simulator.model, columns, log, str(path))
+        _check_goals(self.simulator.model, columns, log, str(path))
         return log
 
     def turns(self, joint: str) -> bool:
@@ -264,6 +265,7 @@ def _check_unit(described: Map, column: Mapped, si: str) -> None:
 
 SHORTEST = 1e-6  # limit: s of a solver's step; a second of it would take minutes
 LATITUDE = 0.2  # limit: share of a joint's range by which a log may exceed it
+TOO_FAR = 20.0  # limit: times as far as its joint goes that a servo is sent: degrees are 57 of a radian
 
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
@@ -293,6 +295,32 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
             f"{low:.4g} to {high:.4g} {unit}, beyond joint {column.name}'s {reach[0]:.4g} to {reach[1]:.4g}",
             guess,
         )
+
+
+def _check_goals(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
+    """InputError where a servo's goals are so far beyond where its joint goes that they must be degrees."""
+    from simgap.simulators.mjcf.engine import mujoco
+
+    places = {c.name: c for c in columns.values() if c.thing == "joint" and c.kind == "position"}
+    for column in columns.values():
+        if column.kind != "command":
+            continue
+        servo = model.actuator(column.name)
+        joint = (
+            model.joint(int(servo.trnid[0])) if servo.trntype.item() == mujoco.mjtTrn.mjTRN_JOINT else None
+        )
+        follows = servo.gainprm[0] > 0 and servo.biasprm[1] == -servo.gainprm[0]
+        if joint is None or not follows or joint.name not in places:
+            continue
+        if joint.type.item() != int(mujoco.mjtJoint.mjJNT_HINGE) or abs(servo.gear[0]) != 1:
+            continue
+        goes, sent = (float(np.nanmax(np.abs(log[c.column]))) for c in (places[joint.name], column))
+        if sent > TOO_FAR * goes > 0 and sent > math.pi:
+            raise InputError(
+                f"{file}: column {column.column}",
+                f"sends {column.name} to {sent:.4g} rad, where {joint.name} goes to {goes:.4g}",
+                'unit = "deg" in the map?',
+            )
 
 
 def continuous(log: Recording, turn: Sequence[str]) -> Recording:
