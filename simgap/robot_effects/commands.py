@@ -121,11 +121,11 @@ def _late_by_time(names: list[str], acts: str):
     """Of a simulator that is told when each row's commands are carried out: the very ones, as much later."""
 
     def late(recording: Recording, theta: Theta) -> Recording:
-        t, delay = recording.t, theta["delay"]
-        row = np.searchsorted(t, t - delay + TICK, side="right") - 1
+        delay, given = theta["delay"], recording.columns.get(acts, recording.t)
+        row = np.searchsorted(given, recording.t - delay + TICK, side="right") - 1
         begun = row >= 0
         row = np.maximum(row, 0)
-        times = {acts: np.where(begun, t[row] + delay, t)}
+        times = {acts: np.where(begun, given[row] + delay, recording.t)}
         return recording.with_columns({n: recording[n][row] for n in names} | times)
 
     return late

@@ -35,7 +35,7 @@ class Loaded:
         columns = self.map.columns
         raw = read_recording(
             path, columns, self.map.time, self.map.time_factor,
-            [name for name, mapped in columns.items() if mapped.kind == "command"],
+            [name for name, mapped in columns.items() if mapped.kind == "command"], self.simulator.acts,
         )  # fmt: skip
         values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
         told = list(raw.warnings)
