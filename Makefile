@@ -110,8 +110,9 @@ gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in th
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
 	$(BIN)/python -m experiments.write_tables
 
-gap-forms: $(INSTALLED)  ## how far true effects are from their own forms, in CASES; fills docs/gap_results.md
-	$(BIN)/python -m experiments.gap_forms $(or $(CASES),$(addprefix ../shared/recordings_,$(addprefix labs/case_,180 085 065) $(addprefix spent/case_,033 009 000 012 026 005)))
+gap-forms: $(INSTALLED)  ## how far true effects are from their own forms, and what each test of a cause buys; fills docs/gap_results.md
+	$(BIN)/python -m experiments.gap_forms $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 085 065) $(addprefix spent/case_,033 009 000 012 026 005))
+	$(BIN)/python -m experiments.gap_detectors $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 065 080 045) $(addprefix spent/case_,009 033))
 	$(BIN)/python -m experiments.write_tables
 
 gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md
