@@ -35,7 +35,7 @@ from experiments.saving import save
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.changes import Changes, changes
-from simgap.robots.unchanged import without_broken
+from simgap.robots.unchanged import Old, without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
@@ -120,7 +120,8 @@ def _case(
 ) -> Case:
     stated, now = [tuple(float(x) for x in key[-3:]) for key in (one, two)]
     truth = {EFFECT[n]: y / x for n, x, y in zip(SHOWN, stated, now, strict=True) if x != y}
-    files = [tuple(g["file"].iloc[np.sort(rng.permutation(len(g))[:FEW])]) for g in (old, new)]
+    own = np.random.default_rng(0)  # OLD's logs are the same in all cases, and calibrated on once
+    files = [tuple(g["file"].iloc[np.sort(r.permutation(len(g))[:FEW])]) for g, r in ((old, own), (new, rng))]
     return Case(kind, files[0], files[1], stated, truth, told_alone(stated, truth))
 
 
@@ -135,7 +136,9 @@ def told_alone(stated: tuple[float, float, float], truth: dict[str, float]) -> b
     return abs(inertia * (r**2 - r)) / (ROTOR + now) > TOLD
 
 
-def solved(case: Case, folder: Path, known: dict[Any, Calibration]) -> tuple[Changes, float]:
+def solved(
+    case: Case, folder: Path, known: dict[Any, tuple[Calibration, Old | None]]
+) -> tuple[Changes, float]:
     """What is found, and the processor's seconds."""
     begun = time.process_time()
     servo = checked(Servo(*case.stated), "servo.py:Servo")
@@ -143,8 +146,11 @@ def solved(case: Case, folder: Path, known: dict[Any, Calibration]) -> tuple[Cha
     effects = effects_of(servo, old)
     key = (case.old, case.stated)
     if key not in known:
-        known[key] = calibrate(servo, without_broken(servo, old)[0], effects)
-    return changes(servo, old, new, effects, calibration=known[key]), time.process_time() - begun
+        known[key] = calibrate(servo, without_broken(servo, old)[0], effects), None
+    calibration, before = known[key]
+    found = changes(servo, old, new, effects, calibration=calibration, known=before)
+    known[key] = calibration, found.old
+    return found, time.process_time() - begun
 
 
 def scored(case: Case, found: Changes) -> dict[str, Any]:
@@ -218,7 +224,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
     index = pd.read_csv(given.folder / "index.csv")
-    known: dict[Any, Calibration] = {}
+    known: dict[Any, tuple[Calibration, Old | None]] = {}
     out = []
     for case in drawn(index, given.part, given.cases, given.seed):
         found, seconds = solved(case, given.folder, known)
