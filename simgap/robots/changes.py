@@ -160,17 +160,17 @@ class Comparison:
         before[:, :p, :p] = self.old.information
         tug = np.zeros((len(self.old.units), p + k))
         tug[:, :p] = self.old.pull - self.old.information @ z[:p]
-        total = information.sum(0) + bend
+        total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
 
         left, moved = np.zeros(len(self.runs.units)), [np.zeros((n, k)) for n in map(len, (pull, tug))]
         none = np.zeros(len(self.old.units), bool)
         for number in range(len(self.runs.units)):
-            step = np.linalg.lstsq(total - information[number], -pull[number], rcond=None)[0]
+            step = np.linalg.lstsq(total - information[number], rest - pull[number], rcond=None)[0]
             there = self._without(z, of, mine, number, step, none)
             left[number] = self.runs.losses(of.point(self.old.point, self._at(there, of, mine)), number)[1]
             moved[0][number] = (there - z)[p:]
         for number in range(len(self.old.units) if k else 0):
-            step = np.linalg.lstsq(total - before[number], -tug[number], rcond=None)[0]
+            step = np.linalg.lstsq(total - before[number], rest - tug[number], rcond=None)[0]
             without = np.arange(len(self.old.units)) == number
             moved[1][number] = (self._without(z, of, mine, -1, step, without) - z)[p:]
         sd, freedom = jackknife(moved)

@@ -281,7 +281,7 @@ def descended(
 
 def halved(cost: Callable[[np.ndarray], float], x: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Where a step leads that straight lines took too far: it is halved until it costs least."""
-    tried = [x + part * np.clip(step, -FAR, FAR) for part in (1.0, 0.5, 0.25, 0.0)]
+    tried = [x + part * np.clip(step, -FAR, FAR) for part in (1.0, 0.5, 0.25, 0.125)]
     return min(tried, key=cost)
 
 
@@ -340,8 +340,9 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
             dependence = max(1.0, float(np.trace(spread)) * m / (m - 1) / p)
     prior = dependence * np.diag(slope**2) + 1e-9 * np.eye(p)
     total, missed = information.sum(0) + prior, np.zeros(m)
+    rest = pull.sum(0) - dependence * slope * (theta.values(np.zeros(p)) - nominal) / sd
     for u in range(m):
-        step = np.linalg.lstsq(total - information[u], -pull[u], rcond=None)[0]
+        step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
 
         def without(z: np.ndarray, u=u) -> tuple[float, float]:
             kept, out = runs.losses(theta.point(point, z), u)
