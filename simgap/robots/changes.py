@@ -10,7 +10,8 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
   delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
   degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
   how little theta is known.
-* *Whether*: a change is one where delta is that far from nothing, by Bonferroni over all candidates.
+* *Whether*: a change is one where delta is that far from nothing, by Bonferroni over all candidates, and
+  where it predicts motions of NEW that took no part better than nothing does, by a paired t.
 * *Which*: every explanation predicts each motion of NEW from OLD and NEW's others; one is ruled out where
   another predicts better from motion to motion, by a paired t.
 * *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
@@ -451,14 +452,16 @@ def _concluded(
     every = sorted(tried[1:], key=lambda c: c.left.mean())
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
     changed = min((c.p_value for c in singles), default=1.0) < CHANGED
+    changed = changed and by_chance(nothing.left - singles[0].left) < CHANGED
     best = singles[0] if changed else nothing
-    pairs = [c for c in pairs if c.p_value < CHANGED]
-    if changed and pairs and by_chance(best.left - pairs[0].left) * len(pairs) < RIVAL:
+    both = min((c.p_value for c in pairs), default=1.0) < CHANGED
+    if changed and both and by_chance(best.left - pairs[0].left) * len(pairs) < RIVAL:
         best = pairs[0]
     others = [
-        c for c in (singles if len(best.effects) == 1 else pairs)
+        c
+        for c in (singles if len(best.effects) == 1 else pairs)
         if c is not best and best.effects and by_chance(c.left - best.left) > RIVAL
-    ]  # fmt: skip
+    ]
     excess = found.excess(best)
     paired = np.isin(found.runs.units, old.units).all()
     worse = by_chance(excess) if paired else _unlike(best.left, old.missed)
