@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs gap-forms
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -108,6 +108,11 @@ gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn 
 
 gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in the folder LABS; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
+	$(BIN)/python -m experiments.write_tables
+
+gap-forms: $(INSTALLED)  ## how far true effects are from their own forms, and what each test of a cause buys; fills docs/gap_results.md
+	$(BIN)/python -m experiments.gap_forms $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 085 065) $(addprefix spent/case_,033 009 000 012 026 005))
+	$(BIN)/python -m experiments.gap_detectors $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 065 080 045) $(addprefix spent/case_,009 033))
 	$(BIN)/python -m experiments.write_tables
 
 gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md

@@ -15,6 +15,7 @@ from pathlib import Path
 from experiments import (
     ablation,
     gap_arm,
+    gap_detectors,
     gap_drawn,
     gap_forms,
     patch_heldout,
@@ -105,6 +106,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
     ("docs/gap_results.md", "labs", gap_drawn.labs_table, "gap-labs"),
     ("docs/gap_results.md", "forms", gap_forms.table, "gap-forms"),
+    ("docs/gap_results.md", "detectors", gap_detectors.table, "gap-forms"),
     ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),

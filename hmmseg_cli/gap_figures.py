@@ -214,7 +214,7 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
 
 def draw_changes(found: Changes, path: Path) -> None:
     """Recorded, the model of the old logs, and with what changed, in the new log that parts most."""
-    rows, point = found.composed.rows, found.null.point
+    rows, point = found.composed.rows, found.old.point
     runs = [base_at(found.composed, p).rows for p in (point, found.point())]
     size = np.sqrt(rows.variance)
     log = int(np.bincount(rows.log, ((rows.observed - runs[0]) / size) ** 2).argmax())

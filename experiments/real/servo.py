@@ -1,17 +1,17 @@
 """A hobby servo that turns a weight on a rod, as a plain Python simulator of your own.
 
 Torques at the shaft, q the angle from hanging down, w its rate, V the supply, g the goal that the drive
-follows, which is the command, `delay` late, at `pace` at most:
+follows, which is the command, `delay` late, at `pace` at most; `on` is 1 while the drive is on, as late:
 
-    duty = clip(gain (g - q) + start sign(g - q), -1, 1)
-    J w' = stall duty V / 12 - emf w - viscous w - friction(w, load) - m G l sin(q - zero)
+    duty = on clip(gain (g - q) + start sign(g - q), -1, 1)
+    J w' = stall duty V / 12 - on emf w - viscous w - friction(w, load) - m G l sin(q - zero)
     J = m l^2 + armature
 
 `gain` has the firmware's register of the P gain in it, as duty per radian. Friction is Coulomb's, larger near
 standstill (Stribeck) and under load, the torque that the gears pass on: Duclusaud et al., Extended friction
-models for the physics simulation of servo actuators (2024), model 4. With the drive off the shaft swings
-freely, with a friction of its own. The duty is that of the recorded angle, so that it tells of the drive
-alone. Mass and length are stated; all else was never measured and is fitted along.
+models for the physics simulation of servo actuators (2024), model 4. It is one law, of the gears: with the
+drive off all that goes is the motor's torque and the back-EMF. The duty is that of the recorded angle, so
+that it tells of the drive alone. Mass and length are stated; all else was never measured and is fitted along.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 G = 9.80665
-STEP = 1e-3  # s, at most
+STEP = 5e-3  # s, at most
 SUPPLY = 12.0  # V
 COUNTS = 0.003  # rad; two of the encoder, within which the drive starts gradually
 UNIT = 4096 / (2 * np.pi) / 4000  # duty per radian and unit of the gain's register
@@ -48,9 +48,9 @@ class Servo:
             "mass": {"nominal": mass, "sd": 0.02 * mass, "unit": "kg", "low": 0.01},
             "length": {"nominal": length, "sd": 0.02 * length, "unit": "m", "low": 0.01},
             "gain": _wide(UNIT * register, UNIT * register, "1/rad", 0.01),
-            "stall": _wide(4.0, 2.0, "N m"),
-            "emf": _wide(0.8, 0.4, "N m s/rad"),
-            "viscous": _wide(0.05, 0.1, "N m s/rad"),
+            "stall": _wide(6.0, 2.0, "N m"),
+            "emf": _wide(1.0, 0.4, "N m s/rad"),
+            "viscous": _wide(0.02, 0.05, "N m s/rad"),
             "coulomb": _wide(0.1, 0.1, "N m"),
             "load": _wide(0.05, 0.1, "1"),
             "load_stribeck": _wide(0.05, 0.1, "1"),
@@ -62,12 +62,10 @@ class Servo:
             "delay": _wide(0.02, 0.01, "s"),
             "pace": _wide(5.0, 2.0, "rad/s", 0.5),
             "age": _wide(0.004, 0.005, "s", -0.03),
-            "free_viscous": _wide(0.03, 0.03, "N m s/rad"),
-            "free_coulomb": _wide(0.1, 0.1, "N m"),
         }  # fmt: skip
 
     def simulate(self, parameters, recording, start=None):
-        """Semi-implicit Euler at 1 ms or less; friction holds where it can."""
+        """Semi-implicit Euler at 5 ms or less; friction holds where it can."""
         begin = (0.0, 0.0) if start is None else (start["position"], start["position_rate"])
         values = np.array([parameters[n] for n in self.parameters])
         columns = [np.ascontiguousarray(recording[n], dtype=float) for n in ("goal", "volts", "on")]
@@ -79,7 +77,7 @@ class Servo:
 
 
 @njit(cache=True)
-def drive(gain, start, error):
+def asked(gain, start, error):
     """The duty that the firmware makes of an error [rad]."""
     return min(1.0, max(-1.0, gain * error + start * min(1.0, max(-1.0, error / COUNTS))))
 
@@ -87,35 +85,37 @@ def drive(gain, start, error):
 @njit(cache=True)
 def turn(p, t, goal, volts, on, angle, q, w):
     """Angles, and duties at the recorded `angle`, (num_timesteps,) at times t; parameters in the order of
-    `Servo.parameters`."""
+    `Servo.parameters`. A command that comes within a step acts for its part of it, so that angles have a
+    derivative by the delay."""
     (mass, length, gain, stall, emf, viscous, coulomb, load, load_extra, extra, speed, armature, zero,
-     start, delay, pace, _, free_viscous, free_coulomb) = p  # fmt: skip
+     start, delay, pace, _) = p  # fmt: skip
     inertia = mass * length**2 + armature
     position, duties = np.empty(t.size), np.empty(t.size)
     follow, sent = goal[0], 0
     for i in range(t.size):
         position[i] = q
-        duties[i] = drive(gain, start, follow - angle[i]) if on[i] > 0.5 else 0.0
+        duties[i] = asked(gain, start, follow - angle[i]) if on[i] > 0.5 else 0.0
         if i == t.size - 1:
             break
         steps = max(1, int(np.ceil((t[i + 1] - t[i]) / STEP - 1e-9)))
         h = (t[i + 1] - t[i]) / steps
         for k in range(steps):
-            while sent + 1 < t.size and t[sent + 1] + delay <= t[i] + k * h + 1e-12:
+            begin = t[i] + k * h
+            while sent + 1 < t.size and t[sent + 1] + delay <= begin:
                 sent += 1
-            follow += min(max(goal[sent] - follow, -pace * h), pace * h)
+            target, drive = goal[sent], on[sent]
+            if sent + 1 < t.size and t[sent + 1] + delay < begin + h:
+                part = (begin + h - t[sent + 1] - delay) / h
+                target += part * (goal[sent + 1] - target)
+                drive += part * (on[sent + 1] - drive)
+            follow += min(max(target - follow, -pace * h), pace * h)
             weight = -mass * G * length * np.sin(q - zero)
-            if on[i] > 0.5:
-                duty = drive(gain, start, follow - q)
-                motor, drag = stall * duty * volts[i] / SUPPLY, viscous + emf
-                slow = np.exp(-((w / speed) ** 2))
-                pressed = abs(motor - emf * w - weight)
-                hold = coulomb + extra * slow + (load + load_extra * slow) * pressed
-            else:
-                motor, drag = 0.0, free_viscous
-                hold = free_coulomb + load * abs(weight)
+            slow = np.exp(-((w / speed) ** 2))
+            motor = stall * drive * asked(gain, start, follow - q) * volts[i] / SUPPLY
+            pressed = abs(motor - drive * emf * w - weight)
+            hold = coulomb + extra * slow + (load + load_extra * slow) * pressed
             w += h * (motor + weight) / inertia
-            w /= 1 + h * drag / inertia
+            w /= 1 + h * (viscous + drive * emf) / inertia
             brake = h * hold / inertia
             w = 0.0 if abs(w) <= brake else w - np.sign(w) * brake
             q += h * w

@@ -118,15 +118,18 @@ def _late(names: list[str]):
 
 
 def _late_by_time(names: list[str], acts: str):
-    """Of a simulator that is told when each row's commands are carried out: the very ones, as much later."""
+    """Of a simulator that is told when each row's commands are carried out: the very ones, as much later,
+    and with each row those that follow."""
 
     def late(recording: Recording, theta: Theta) -> Recording:
-        t, delay = recording.t, theta["delay"]
-        row = np.searchsorted(t, t - delay + TICK, side="right") - 1
+        delay, given = theta["delay"], recording.columns.get(acts, recording.t)
+        row = np.searchsorted(given, recording.t - delay + TICK, side="right") - 1
         begun = row >= 0
         row = np.maximum(row, 0)
-        times = {acts: np.where(begun, t[row] + delay, t)}
-        return recording.with_columns({n: recording[n][row] for n in names} | times)
+        after = np.minimum(row + begun, len(given) - 1)
+        times = {acts: np.where(begun, given[row] + delay, recording.t), f"{acts}next": given[after] + delay}
+        following = {f"{acts}{n}": recording[n][after] for n in names}
+        return recording.with_columns({n: recording[n][row] for n in names} | times | following)
 
     return late
 

@@ -1,23 +1,23 @@
 """What changed of a robot between two sets of its logs: OLD, which a model is calibrated on, and NEW.
 
-One generative model. A log i of OLD is read as
+A log is read as y = f(theta, its commands) + what the model gets wrong, f the simulator run freely along the
+whole log and theta its parameters (their prior is the map's); NEW has theta + delta, delta nothing or in one
+or two effects. theta and delta are fitted together, OLD's part in theta as a quadratic about its own fit.
+What the model gets wrong has long tails and is alike all along a motion (`simgap.robots.unchanged`), so how
+sure anything is cannot be counted in rows. It is learned between motions, and by one principle:
 
-    y_i = f(theta + b_i, commands of i) + g_i + e_i,    b_i ~ N(0, diag tau^2),
+* *How large*: delta's variance is what leaving out OLD's motions one by one makes of it, and NEW's (the
+  delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
+  degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
+  how little theta is known.
+* *Whether*: a change is one where delta is that far from nothing, by Bonferroni over all candidates, and
+  where it predicts motions of NEW that took no part better than nothing does, by a paired t.
+* *Which*: every explanation predicts each motion of NEW from OLD and NEW's others; one is ruled out where
+  another predicts better from motion to motion, by a paired t.
+* *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
+  to motion, and most of that is left.
 
-f the simulator run freely along the whole log, theta its parameters (their prior is the map's), b_i what
-the model's own error makes of them from log to log, g_i what of that error no parameter can take, by
-channel an Ornstein-Uhlenbeck process, and e_i noise: the sensors', and what a jitter in time makes of what
-moves. A log of NEW has theta + delta + c in theta's place; c ~ N(0, diag tau^2) is what the model's error
-makes of all of them, and delta is nothing, or in one or two effects: spike and slab. theta, tau and the
-processes are learned on OLD: the gap by leaving motions out, each log with a size of its own, tau by EM. So
-other repeats and other motions of what did not change have a distribution, and a change must stand out of
-that and not of the sensors' noise alone. theta enters NEW as a Gaussian about OLD's fit, which for a
-quadratic log likelihood is the joint fit of OLD and NEW.
-
-A change of what is positive is of its logarithm (a gain doubled: log 2), of all else in usual sizes; the
-slab is Cauchy's. Evidence is by Laplace. A log likelihood of a model that is never quite right counts for
-more than it should: that one explanation beats another has to hold on logs that took no part, from log to
-log (a sign test in the spirit of Vuong, Econometrica 57, 1989), or the two stay a set.
+A change of what is positive is of its logarithm (a gain doubled: log 2), of all else in usual sizes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from hmmseg.errors import InputError
@@ -39,13 +38,17 @@ from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import noises
 from simgap.robots.unchanged import (
+    WIDER,
     Broken,
     Coordinates,
-    Null,
-    Whitened,
+    Local,
+    Old,
+    Runs,
+    descended,
+    halved,
     learned,
-    of_one_motion,
-    sums,
+    loss,
+    units_of,
     without_broken,
 )
 from simgap.robots.windows import LENGTH
@@ -53,214 +56,221 @@ from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 STAGES = 8  # look: what a progress bar counts
-COMMON = 0.1  # prior: of usual sizes; what a model's error makes of all new logs, at most
-LEAST = 0.2  # numerics: of a log's own size over that of OLD's logs
-GROUPS, MANY = (
-    10,
-    12,
-)  # numerics: logs or stretches held out, at least, and of those whose signs are all tried
-PRIOR = (0.5, 0.3, 0.2)  # prior: that nothing changed, one thing, two
-LADDER = (-1.4, -0.7, -0.35, 0.35, 0.7, 1.4)  # numerics: logarithms from which a fit may begin
-SIZE = np.log(2.0)  # prior: a change that is usual, as a logarithm
-TRIED, PAIRED = 8, 4  # numerics: of single changes fitted exactly, and of those joined in pairs
-ODDS = np.log(20.0)  # chosen: against what is rejected
-SURE = 0.95  # chosen: likewise, that it holds from log to log
-CHANGED = 0.97  # chosen: the same of any change over none: 3 % of unchanged robots may be called changed
-ALARM = 0.01  # chosen: of logs of what did not change, those whose misfit is called unknown
-Kalman = tuple[np.ndarray, np.ndarray, np.ndarray]  # spread, gain, decay from the row before, (N,) each
-STEPS = 12  # numerics: of a fit
+LADDER = (-1.2, -0.6, -0.25, 0.25, 0.6, 1.2)  # numerics: changes to rank candidates by
+RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: from which one is fitted; a free swing has narrow valleys
+TRIED, PAIRED = 5, 2  # numerics: of single changes fitted exactly, and of those joined in pairs
+CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
+RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
+UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
 
 
 @dataclass(frozen=True)
 class Change:
-    """One explanation: changed coordinates `x` (k,) of `effects` with covariance (k, k), its log posterior
-    odds but for a constant, the mean squares that it leaves of each log of NEW in units of OLD's
-    processes, and log likelihoods `held` of logs, or stretches of few, that took no part."""
+    """One explanation: coordinates `x` (k,) of changed `effects`, by how much they change, standard
+    deviations `sd` (k,) with `freedom` (k,) degrees, `p_value` of no change, `left` (M,): how motions of NEW
+    that took no part are missed [nats a row], and `theta` (p,): OLD's coordinates as NEW's logs have moved
+    them."""
 
     effects: tuple[str, ...]
     x: np.ndarray
-    covariance: np.ndarray
-    odds: float
+    sd: np.ndarray
+    freedom: np.ndarray
+    p_value: float
     left: np.ndarray
-    held: np.ndarray
+    theta: np.ndarray
 
 
 class Comparison:
-    """NEW logs against what is known of OLD: exact fits of changes, and their odds."""
+    """NEW logs against what is known of OLD: exact fits of changes."""
 
-    def __init__(
-        self, composed: Composed, null: Null, candidates: Sequence[str], about: Change | None = None
-    ) -> None:
-        self.composed, self.null, self.candidates = composed, null, candidates
-        self.logs, point, scale = len(composed.recordings), null.point, np.ones(len(composed.recordings))
-        if about is not None:
-            point, scale = self.coordinates(about.effects).point(null.point, about.x), np.sqrt(about.left)
-        self.new = Whitened(composed, point, null.every.about(composed, point))
-        self.new.by(null.processes, null.tau, np.maximum(scale, LEAST))
-        p, rows = len(null.theta.names), composed.rows
-        self.loose = self.new.whiten(self.new.columns)
-        # NEW's logs have in common what a model's error makes of any of them, where that is known to be small
-        spread = np.diag(np.minimum(null.tau, COMMON) ** 2)
-        spread[:p, :p] += null.covariance
-        self.prior = np.linalg.inv(spread)
-        self.inside = np.linalg.inv(self.loose.T @ self.loose + self.prior)
-        motion = self.new.motion
-        # Few motions are held out by stretches, but what a model gets wrong all along a motion that OLD never
-        # made says the same in every stretch: of such a motion there is one.
-        pieces = -(-GROUPS // (motion.max() + 1)) if self.known_motions else 1
-        self.group = np.zeros(rows.log.size, int)
-        for i in range(self.logs):
-            mine = rows.log == i
-            order = np.argsort(np.argsort(rows.time[mine], kind="stable"), kind="stable")
-            self.group[mine] = motion[mine] * pieces + order * pieces // mine.sum()
+    def __init__(self, composed: Composed, old: Old, candidates: Sequence[str], unit: np.ndarray) -> None:
+        self.composed, self.old, self.candidates = composed, old, candidates
+        self.runs = Runs(composed, old.point, unit, old.scale)
+        self.p = len(old.theta.names)
 
-    @property
-    def known_motions(self) -> bool:
-        """Whether OLD made every motion of NEW."""
-        old = self.null.motions
-        return all(any(of_one_motion(one, other) for other in old) for one in self.new.motions)
+    def _coordinates(self, effects: Sequence[str]) -> tuple[Coordinates, np.ndarray]:
+        """Of all that is fitted and of some effects, and which of them are the effects'."""
+        fitted = [*dict.fromkeys(e for e, _ in self.old.theta.names)]
+        both = [*fitted, *(e for e in effects if e not in fitted)]
+        of = Coordinates.of(self.composed, self.old.point, both)
+        return of, np.array([of.names.index(n) for e in effects for n in of.names if n[0] == e], int)
 
-    def coordinates(self, effects: Sequence[str]) -> Coordinates:
-        """Of some effects about OLD's point."""
-        return Coordinates.of(self.composed, self.null.point, effects)
+    def _at(self, z: np.ndarray, of: Coordinates, mine: np.ndarray) -> np.ndarray:
+        """NEW's coordinates, of theta (p,) and changes (k,)."""
+        full = np.zeros(len(of.names))
+        full[: self.p] = z[: self.p]
+        full[mine] += z[self.p :]
+        return full
 
-    def projected(self, white: np.ndarray) -> np.ndarray:
-        """What is left of whitened rows or columns when theta has followed, as far as OLD lets it."""
-        return white - self.loose @ (self.inside @ (self.loose.T @ white))
-
-    def cost(self, of: Coordinates, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Minus the log posterior of a change, constants left out, and whitened rows."""
-        rows = self.new.rows(of.point(self.null.point, x))
+    def cost(self, z: np.ndarray, of: Coordinates, mine: np.ndarray) -> float:
+        """Minus the log likelihood of NEW and, as a quadratic, OLD."""
+        rows, theta = self.runs.rows(of.point(self.old.point, self._at(z, of, mine))), z[: self.p]
         if not np.isfinite(rows).all():
-            return np.inf, rows
-        white = self.new.whiten(rows)
-        return 0.5 * float(white @ self.projected(white)) + float(
-            np.log1p((x / self.size(of)) ** 2).sum()
-        ), white
+            return np.inf
+        bend = self.old.information.sum(0) + self.old.prior
+        return float(loss(rows).sum() + 0.5 * theta @ bend @ theta)
 
-    def size(self, of: Coordinates) -> np.ndarray:
-        """Usual changes (k,)."""
-        return np.where(of.log, SIZE, 1.0)
+    def _columns(
+        self, z: np.ndarray, of: Coordinates, mine: np.ndarray, effects: Sequence[str] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (N,) and columns (N, p + k); theta's are 0 where only the `effects`' are wanted."""
+        full = self._at(z, of, mine)
+        point = of.point(self.old.point, full)
+        slopes = self.runs.slopes(point, of, full, effects)
+        theta = slopes[:, : self.p] if effects is None else np.zeros((slopes.shape[0], self.p))
+        return self.runs.rows(point), np.hstack([theta, slopes[:, mine]])
+
+    def _without(
+        self, z: np.ndarray, of: Coordinates, mine: np.ndarray, new: int, step: np.ndarray, old: np.ndarray
+    ) -> np.ndarray:
+        """Where theta and changes go by a step without a unit of NEW (none: -1) and units of OLD."""
+        bend = self.old.information[~old].sum(0) + self.old.prior
+        pull = self.old.pull[~old].sum(0) - self.old.pull.sum(0)
+
+        def cost(there: np.ndarray) -> float:
+            theta = there[: self.p]
+            kept = self.runs.losses(of.point(self.old.point, self._at(there, of, mine)), new)[0]
+            return kept + float(0.5 * theta @ bend @ theta - pull @ theta)
+
+        return halved(cost, z, step)
 
     def fit(self, effects: tuple[str, ...], starts: Sequence[np.ndarray]) -> Change:
-        """The best of the fits that begin at the best two of some coordinates."""
-        of = self.coordinates(effects)
-        first = sorted(starts, key=lambda x: self.cost(of, x)[0])[:2]
-        ends = [self._descended(of, x) for x in first]
-        return min(ends, key=lambda end: end[0])[1]
+        """An explanation, from the best of some starts of its coordinates."""
+        of, mine = self._coordinates(effects)
+        p, k = self.p, mine.size
+        bend = np.zeros((p + k, p + k))
+        bend[:p, :p] = self.old.information.sum(0) + self.old.prior
+        bend[range(p, p + k), range(p, p + k)] = 1e-6
 
-    def _descended(self, of: Coordinates, x: np.ndarray) -> tuple[float, Change]:
-        cost, white = self.cost(of, x)
-        damping, k = 0.0, x.size
-        columns = np.zeros((white.size, k))
-        bend = np.eye(k)
-        for _ in range(STEPS):
-            if not np.isfinite(cost):
-                break
-            columns = self.new.whiten(self.new.slopes(of.point(self.null.point, x), of, x))
-            lean = self.projected(columns)
-            shape = 2 / (self.size(of) ** 2 + x**2)
-            bend = columns.T @ lean
-            pull = lean.T @ white - shape * x
-            matrix = bend + np.diag(shape + 1e-9)
-            for _ in range(6):
-                move = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), pull)
-                there, new = self.cost(of, x + np.clip(move, -1.5, 1.5))
-                if there < cost:
-                    break
-                damping = max(10 * damping, 0.1)
-            else:
-                break
-            x, gained, cost, white = x + np.clip(move, -1.5, 1.5), cost - there, there, new
-            damping = damping / 10 if damping > 0.1 else 0.0
-            if gained < 0.05:
-                break
-        return cost, self._told(of, x, cost, white, columns)
+        begun = [np.concatenate([np.zeros(p), x]) for x in starts]
+        for wider in (WIDER[0], 1.0):
+            self.runs.scaled(wider * self.old.scale)
+            z = min(begun, key=lambda z: self.cost(z, of, mine))
+            theta = self._columns(z, of, mine)[1]
+            theta[:, p:] = 0.0
 
-    def _told(
-        self, of: Coordinates, x: np.ndarray, cost: float, white: np.ndarray, columns: np.ndarray
-    ) -> Change:
-        """A change with its evidence, covariance, and what every log says of it."""
-        effects, k = tuple(dict.fromkeys(e for e, _ in of.names)), x.size
-        count = len(self.candidates)
-        log_prior = np.log(PRIOR[len(effects)]) - np.log(
-            (1, count, count * max(count - 1, 1) / 2)[len(effects)]
-        )
-        bend = columns.T @ self.projected(columns) + np.eye(k) / (1e3 * self.size(of)) ** 2
-        odds = -cost - float(np.log(np.pi * self.size(of)).sum()) + log_prior
-        odds += 0.5 * (k * np.log(2 * np.pi) - np.linalg.slogdet(bend)[1]) if k else 0.0
-        both, p = np.column_stack([self.loose, columns]), self.loose.shape[1]
-        prior = np.zeros((p + k,) * 2)
-        prior[:p, :p], prior[p:, p:] = self.prior, np.diag(1 / (1e2 * self.size(of)) ** 2)
-        told, pull = sums(both, white, self.group)
-        inverse = np.linalg.inv(told.sum(0) + prior)
-        d = inverse @ pull.sum(0)
-        d[p:] = 0.0
-        left = white - both @ d
-        apart = np.array([
-            np.linalg.solve(told.sum(0) - told[i] + prior, pull.sum(0) - pull[i]) for i in range(len(told))
-        ]).reshape(len(told), p + k)  # fmt: skip
-        rest = white - np.einsum("ij,ij->i", both, apart[self.group])
-        count = np.bincount(self.new.log)
-        squares = np.bincount(self.new.log, left**2) / count * self.new.scale**2
-        return Change(effects, x, inverse[p:, p:], odds, squares, -0.5 * np.bincount(self.group, rest**2))
+            def local(z: np.ndarray, theta=theta) -> Local:  # theta moves little, and its columns less
+                rows, columns = self._columns(z, of, mine, effects)
+                information, pull = self.runs.told(rows, theta + columns)
+                return information.sum(0) + bend, pull.sum(0) - bend @ z
 
-    def nothing(self) -> Change:
-        """No change."""
-        of = self.coordinates(())
-        cost, white = self.cost(of, np.zeros(0))
-        return self._told(of, np.zeros(0), cost, white, np.zeros((white.size, 0)))
+            z = descended(lambda z: self.cost(z, of, mine), local, z)
+            begun = [z]
+        information, pull = self.runs.told(*self._columns(z, of, mine))
+        before = np.zeros((len(self.old.units), p + k, p + k))
+        before[:, :p, :p] = self.old.information
+        tug = np.zeros((len(self.old.units), p + k))
+        tug[:, :p] = self.old.pull - self.old.information @ z[:p]
+        total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
 
-    def single(self, effect: str) -> Change:
-        """One effect changed."""
-        of = self.coordinates((effect,))
-        k = len(of.names)
-        columns = self.new.whiten(self.new.slopes(self.null.point, of))
-        lean, white = self.projected(columns), self.new.whiten(self.new.rows(self.null.point))
-        shape = np.diag(2 / self.size(of) ** 2)
-        straight = np.clip(np.linalg.solve(columns.T @ lean + shape, lean.T @ white), -2, 2)
-        starts = [straight, np.zeros(k)]
-        if k == 1 and of.log[0]:
-            starts += [np.array([s]) for s in LADDER]
-        return self.fit((effect,), starts)
+        left, moved = np.zeros(len(self.runs.units)), [np.zeros((n, k)) for n in map(len, (pull, tug))]
+        none = np.zeros(len(self.old.units), bool)
+        for number in range(len(self.runs.units)):
+            step = np.linalg.lstsq(total - information[number], rest - pull[number], rcond=None)[0]
+            there = self._without(z, of, mine, number, step, none)
+            left[number] = self.runs.losses(of.point(self.old.point, self._at(there, of, mine)), number)[1]
+            moved[0][number] = (there - z)[p:]
+        for number in range(len(self.old.units) if k else 0):
+            step = np.linalg.lstsq(total - before[number], rest - tug[number], rcond=None)[0]
+            without = np.arange(len(self.old.units)) == number
+            moved[1][number] = (self._without(z, of, mine, -1, step, without) - z)[p:]
+        sd, freedom = jackknife(moved)
+        x = z[p:]
+        p_value = 1.0
+        if k:
+            each = 2 * student.sf(np.abs(x) / np.maximum(sd, 1e-12), freedom)
+            by_effect = [
+                each[[of.names[m][0] == e for m in mine]].min() * sum(of.names[m][0] == e for m in mine)
+                for e in effects
+            ]
+            p_value = min(1.0, len(self.candidates) * float(max(by_effect)))
+        return Change(effects, x, sd, freedom, p_value, left, z[:p])
 
-    def pair(self, one: Change, two: Change) -> Change:
-        """Both changed, from where each ended by itself."""
-        effects = (*one.effects, *two.effects)
-        at, more = one.x, two.x
-        starts = [np.concatenate([at, more])]
-        for mine, other, order in ((at, more, 1), (more, at, -1)):
-            for s in (0.0, *LADDER) if other.size == 1 else (0.0,):
-                starts.append(np.concatenate([mine, np.full(other.size, s)][::order]))
-        return self.fit(effects, starts)
-
-    def promising(self, about: Change, count: int) -> list[str]:
-        """The effects that promise most about a change, by straight lines."""
-        of = self.coordinates(about.effects)
-        point = of.point(self.null.point, about.x)
-        white = self.projected(self.new.whiten(self.new.rows(point)))
-        gains = {}
+    def scanned(self, about: Change | None = None) -> dict[str, tuple[float, np.ndarray]]:
+        """By candidate the least cost over a ladder of changes of it, theta held, and where that is."""
+        out = {}
+        known = () if about is None else about.effects
+        first = np.zeros(self.p) if about is None else about.theta
+        held = np.zeros(0) if about is None else about.x
         for name in self.candidates:
-            if name not in about.effects:
-                mine = Coordinates.of(self.composed, point, (name,))
-                columns = self.new.whiten(self.new.slopes(point, mine))
-                lean = self.projected(columns)
-                shape = np.diag(1 / self.size(mine) ** 2)
-                gains[name] = float(
-                    white @ columns @ np.linalg.solve(columns.T @ lean + shape, columns.T @ white)
-                )
-        return sorted(gains, key=lambda n: -gains[n])[:count]
+            if name in known:
+                continue
+            of, mine = self._coordinates((*known, name))
+            k = mine.size - held.size
+            steps = [np.zeros(k)]
+            for j in range(k):
+                for s in LADDER:
+                    steps.append(s * np.eye(k)[j])
+            tried = [np.concatenate([first, held, x]) for x in steps]
+            costs = [self.cost(z, of, mine) for z in tried]
+            best = int(np.argmin(costs))
+            out[name] = (costs[best], steps[best])
+        return out
 
-    def again(self, change: Change) -> Change:
-        """The same change fitted from where it ended."""
-        return self.fit(change.effects, [change.x]) if change.effects else self.nothing()
+    @staticmethod
+    def _rungs(x: np.ndarray) -> list[np.ndarray]:
+        """Changes to begin a fit from: of one coordinate many."""
+        return [np.zeros(x.size)] if x.size > 1 else [np.array([r]) for r in RUNGS]
+
+    def excess(self, change: Change) -> np.ndarray:
+        """By how much more each motion of NEW is missed (M,) than OLD's, the same one where OLD made all."""
+        same = np.isin(self.runs.units, self.old.units)
+        mine = np.searchsorted(self.old.units, self.runs.units)
+        return change.left - (self.old.missed[mine] if same.all() else self.old.missed.mean())
+
+    def searched(self) -> list[Change]:
+        """Nothing, the most promising single changes, and pairs about the best of them."""
+        nothing = self.fit((), [np.zeros(0)])
+        self.runs.scaled(WIDER[0] * self.old.scale)
+        scan = self.scanned()
+        names = sorted(scan, key=lambda n: scan[n][0])[:TRIED]
+        singles = [self.fit((n,), [scan[n][1], *self._rungs(scan[n][1])]) for n in names]
+        best = sorted(singles, key=lambda c: c.left.mean())[:PAIRED]
+        if not best or not self.excess(best[0]).mean() > 0:  # no more is left than of old logs
+            return [nothing, *singles]
+        self.runs.scaled(WIDER[0] * self.old.scale)
+        scan = self.scanned(best[0])
+        pairs = {}
+        for name in sorted(scan, key=lambda n: scan[n][0])[:PAIRED]:
+            pairs[frozenset((best[0].effects[0], name))] = (best[0], name, scan[name][1])
+        for one, two in itertools.combinations(best, 2):
+            pairs.setdefault(frozenset((*one.effects, *two.effects)), (one, two.effects[0], two.x))
+        both = [
+            self.fit((*one.effects, name), [np.concatenate([one.x, r]) for r in (x, *self._rungs(x))])
+            for one, name, x in pairs.values()
+        ]
+        return [nothing, *singles, *both]
+
+
+def jackknife(strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations (k,) and Welch's degrees of freedom of what was computed with one unit left out, by
+    stratum (M, k); nothing is known where a stratum of one is left without."""
+    k = strata[0].shape[1]
+    parts, freedom = [], []
+    for left in strata:
+        m = left.shape[0]
+        parts.append(np.full(k, np.inf) if m < 2 else (m - 1) / m * np.sum((left - left.mean(0)) ** 2, 0))
+        freedom.append(max(m - 1, 1))
+    each = np.maximum(np.array(parts), 1e-300)
+    total = each.sum(0)
+    share = np.divide(each, total, out=np.ones_like(each), where=np.isfinite(total))
+    return np.sqrt(total), 1 / np.sum(share**2 / np.array(freedom)[:, None], 0)
+
+
+def by_chance(gains: np.ndarray) -> float:
+    """How often as much is gained in the mean (M,) from motion to motion where there is nothing to gain: by
+    Student's t, one-sided."""
+    if gains.size < 2:
+        return 0.5
+    sd = max(float(gains.std(ddof=1)), 1e-12)
+    return float(student.sf(gains.mean() / sd * np.sqrt(gains.size), gains.size - 1))
 
 
 @dataclass(frozen=True)
 class Changes:
     """What was found: `verdict` none, named, set or unknown; the `best` explanation and `others` that NEW's
-    logs do not rule out, `nothing` for comparison, all `tried` with their probabilities; `over`: how far
-    NEW's logs are met worse than OLD's, as a factor on root mean squares."""
+    logs do not rule out, `nothing` for comparison, all `tried` with their probabilities; `worse`: how often
+    an unchanged robot is missed by as much as the best leaves."""
 
     verdict: str
     best: Change
@@ -268,8 +278,10 @@ class Changes:
     nothing: Change
     tried: tuple[Change, ...]
     probabilities: Mapping[str, float]
-    over: float
-    null: Null
+    worse: float
+    old: Old
+    units: np.ndarray
+    runs: Runs
     composed: Composed
     broken: tuple[Broken, ...]
     calibration: Calibration | None
@@ -278,78 +290,65 @@ class Changes:
         """The document, with the keys of every diagnosis; `changes` are its causes in a line each."""
         best, nothing, names = self.best, self.nothing, sorted(self.best.effects)
         others = sorted({n for c in self.others for n in c.effects} - {*names})
-        before, after = (-2 * float(c.held.sum()) / self.new_rows for c in (nothing, best))
-        floor = float(np.exp(self.null.left.mean()))
-        fraction = None if not names else 1 - (after - floor) / max(before - floor, 1e-9)
-        worse = self.null.tail(best.left)
-        unknown = ALARM / (ALARM + worse)
-        chances = {n: p * (1 - unknown) for n, p in self.probabilities.items()}
+        before, after, floor = (float(v.mean()) for v in (nothing.left, best.left, self.old.missed))
+        fraction = (
+            None if not names else float(np.clip(1 - (after - floor) / max(before - floor, 1e-9), 0, 1))
+        )
         explanations = {"+".join(sorted(c.effects)): c for c in (best, *self.others) if c.effects}
-        where = self.where() if self.verdict != "none" else []
+        chances = self.probabilities
         effects = {
             name: {
                 "parameters": {n: v | {"nominal": v["old"]} for n, v in self.sizes(c).items()},
-                "log_evidence": c.odds - nothing.odds, "property_shift": {},
-                "heldout_score": float((c.held - nothing.held).sum()),
+                "log_evidence": float(np.sum(nothing.left - c.left)), "property_shift": {},
+                "heldout_score": float(np.mean(nothing.left - c.left)),
             } for name, c in explanations.items()
         }  # fmt: skip
         calibrated = {} if self.calibration is None else self.calibration.body()
         acting = {n: sum(p for e, p in chances.items() if n in e.split("+")) for n in (*names, *others)}
+        p_none = min((c.p_value for c in (best, *self.others) if c.effects), default=1.0)
         return {
             "verdict": self.verdict, "causes": names if self.verdict in ("named", "set") else [],
             "indistinguishable": others if self.verdict == "set" else [],
-            "probabilities": {"none": 0.0} | chances | {"unknown": unknown},
-            "detection": {"p_value": self.p_value(), "statistic": max(0.0, best.odds - nothing.odds),
-                          "resolution": 0.0},
-            "remainder": {"share": None if fraction is None else 1 - fraction, "p_value": worse, "where": [],
-                          "rms_over_noise": self.over},
+            "probabilities": dict(chances),
+            "detection": {"p_value": p_none, "statistic": max(0.0, before - after), "resolution": 0.0},
+            "remainder": {"share": None if fraction is None else 1 - fraction, "p_value": self.worse,
+                          "where": [], "rms_over_noise": self.over},
             "attribution": {n: {"probability": p, "share": fraction if names == [n] else None,
                                 "interval_90": None} for n, p in acting.items()},
-            "where": where, "effects": effects, "changes": self.lines(),
+            "where": self.where() if self.verdict != "none" else [], "effects": effects,
+            "changes": self.lines(),
             "broken": [{"trial": b.log, "channel": b.channel, "time": b.time, "value": b.value}
                        for b in self.broken],
             "shrinkage": None if fraction is None else {
-                "evaluated_on": "held-out new logs", "before": before, "after": after, "noise_floor": floor,
-                "fraction": fraction, "interval_90": None, "flexible_ceiling": None},
+                "evaluated_on": "held-out new motions", "before": before, "after": after,
+                "noise_floor": floor, "fraction": fraction, "interval_90": None, "flexible_ceiling": None},
             "stands_in": {n: others for n in names} if self.verdict == "set" else {},
             "calibrated": calibrated.get("parameters", {}), "numerics": calibrated.get("numerics", {}),
             "next_experiment": None,
         }  # fmt: skip
 
     @property
-    def new_rows(self) -> int:
-        """Rows of NEW's logs."""
-        return int(self.composed.rows.log.size)
-
-    def p_value(self) -> float:
-        """Of no change, from log to log (see `by_chance`) and by Ville's bound on the odds, the larger."""
-        best = max(self.tried, key=lambda c: c.odds)
-        if not best.effects:
-            return 1.0
-        bound = float(np.exp(min(0.0, self.nothing.odds - best.odds)))
-        return max(bound, by_chance(best.held - self.nothing.held))
+    def over(self) -> float:
+        """How far NEW's logs are met worse than OLD's, as a factor on root mean squares of medium rows."""
+        return float(np.exp((self.best.left.mean() - self.old.missed.mean()) / 2))
 
     def where(self) -> list[dict[str, Any]]:
-        """Logs whose gap stands out of what logs of an unchanged robot leave."""
-        rest = np.log(self.nothing.left) - self.null.left.mean()
-        z = rest / max(float(self.null.left.std(ddof=1)), 0.1)
-        excess = np.where(z > 2, np.maximum(np.exp(rest) - 1, 0), 0.0)
+        """Logs that an unchanged robot would have to miss by more than OLD's motions are missed."""
+        rows = self.runs.rows(self.old.point)
+        size = np.array([float(np.mean(loss(rows[self.runs.log == i]))) for i in np.unique(self.runs.log)])
+        spread = max(float(np.std(self.old.missed, ddof=1)) if self.old.missed.size > 1 else 0.0, 1e-3)
+        z = (size - self.old.missed.mean()) / spread
+        excess = np.where(z > 2, size - self.old.missed.mean(), 0.0)
         share = excess / max(excess.sum(), 1e-300)
-        logs = self.composed.recordings
-        channel = ", ".join(self.composed.rows.channels)
-        found = [
+        logs, channel = self.composed.recordings, ", ".join(self.composed.rows.channels)
+        return [
             {
-                "trial": logs[i].name,
-                "channel": channel,
-                "subtask": "all",
+                "trial": logs[i].name, "channel": channel, "subtask": "all",
                 "band": [0.0, 0.5 / float(np.median(np.diff(logs[i].t)))],
-                "share": float(share[i]),
-                "z": float(z[i]),
+                "share": float(share[i]), "z": float(z[i]),
             }
-            for i in np.argsort(-share)
-            if excess[i] > 0
-        ]
-        return found  # fmt: skip
+            for i in np.argsort(-share) if excess[i] > 0
+        ]  # fmt: skip
 
     def lines(self) -> list[str]:
         """Every change of the best explanation in a line: by how much, from what to what."""
@@ -364,16 +363,15 @@ class Changes:
 
     def point(self) -> Point:
         """NEW's parameters by the best explanation, and all else as it was."""
-        at = Coordinates.of(self.composed, self.null.point, self.best.effects)
-        return at.point(self.null.point, self.best.x)
+        at = Coordinates.of(self.composed, self.old.point, self.best.effects)
+        return at.point(self.old.point, self.best.x)
 
     def sizes(self, of: Change | None = None) -> dict[str, dict[str, Any]]:
         """Of an explanation (the best by default) each parameter as it was and is, with 90 % intervals, and
         as a ratio where it is changed by factors."""
         change = self.best if of is None else of
-        at = Coordinates.of(self.composed, self.null.point, change.effects)
-        sd = np.sqrt(np.diag(change.covariance)).reshape(-1)
-        reach = student.ppf(0.95, max(self.null.left.size - 1, 1)) * sd
+        at = Coordinates.of(self.composed, self.old.point, change.effects)
+        reach = student.ppf(0.95, change.freedom) * np.minimum(change.sd, 1e6) if change.x.size else change.x
         low, now, high = (at.values(change.x + r) for r in (-reach, 0 * reach, reach))
         out = {}
         for k, (effect, short) in enumerate(at.names):
@@ -381,7 +379,8 @@ class Changes:
             name = effect if len(known.parameters) == 1 else f"{effect}.{short}"
             ratio = at.log[k]
             out[name] = {
-                "old": float(at.at[k]), "mean": float(now[k]), "sd": float(sd[k] * at.slopes(change.x)[k]),
+                "old": float(at.at[k]), "mean": float(now[k]),
+                "sd": float(change.sd[k] * at.slopes(change.x)[k]),
                 "interval_90": [float(low[k]), float(high[k])], "unit": known.parameters[short].unit,
                 "ratio": float(now[k] / at.at[k]) if ratio else None,
                 "ratio_90": [float(low[k] / at.at[k]), float(high[k] / at.at[k])] if ratio else None,
@@ -397,6 +396,7 @@ def changes(
     *,
     tell: Progress = silent,
     calibration: Calibration | None = None,
+    known: Old | None = None,
 ) -> Changes:
     """What changed between OLD logs of a robot and NEW ones.
 
@@ -407,6 +407,7 @@ def changes(
         effects: what may have changed, by name; those that are `fitted` are calibrated on OLD.
         tell: hears what is being done.
         calibration: of the same old logs, where that is known.
+        known: what was learned of the same old logs before, where NEW makes the same motions as then.
 
     Raises:
         InputError: there are too few logs, or the simulator does not follow them.
@@ -419,7 +420,7 @@ def changes(
     if calibration is None and any(e.fitted for e in effects.values()):
         tell("calibrating on the old logs")
         calibration = calibrate(simulator, old, effects)
-    noise = noises(simulator, [*old, *new])
+    noise = noises(simulator, old)
     point: Point = {} if calibration is None else calibration.point
     candidates = [n for n, e in effects.items() if not _numeric(simulator, e)]
 
@@ -429,104 +430,72 @@ def changes(
             made = Composed.of(simulator, logs, effects, noise, LENGTH)
         return made.moved(point)
 
-    tell("how far the old logs differ")
-    null = learned(along(old), calibration, candidates)
+    before, composed = along(old), along(new)
+    units = units_of(before, composed)
+    if known is None or not np.array_equal(known.units, np.unique(units[0])):
+        tell("how far the old logs differ")
+        known = learned(before, calibration, units[0])
     tell("changes in the new logs")
-    composed = along(new)
-    found = Comparison(composed, null, candidates)
-    tried = _searched(found)
-    best = max(tried, key=lambda c: c.odds)
-    if best.effects:
-        tell("about the best of them")
-        tried = _searched(Comparison(composed, null, candidates, best), tried)
-    return _concluded(tried, null, composed, (*broken, *more), calibration)
+    found = Comparison(composed, known, candidates, units[1])
+    return _concluded(found.searched(), found, (*broken, *more), calibration)
 
 
 def _numeric(simulator: Simulator, effect: RobotEffect) -> bool:
     return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
 
 
-def _searched(found: Comparison, before: Sequence[Change] = ()) -> list[Change]:
-    """Nothing, the most promising single changes, and pairs about the best of them; from where they ended
-    `before`."""
-    nothing = found.nothing()
-    singles = {c.effects[0]: found.again(c) for c in before if len(c.effects) == 1}
-    singles |= {n: found.single(n) for n in found.promising(nothing, TRIED) if n not in singles}
-    best = sorted(singles.values(), key=lambda c: -c.odds)
-    tried = [nothing, *best]
-    if best and best[0].odds > nothing.odds:
-        for name in found.promising(best[0], PAIRED):
-            if name not in singles:
-                singles[name] = found.single(name)
-        more = [singles[n] for n in found.promising(best[0], PAIRED)]
-        pairs = {
-            frozenset((a.effects[0], b.effects[0])): (a, b)
-            for a, b in itertools.combinations(best[:PAIRED], 2)
-        }
-        pairs |= {frozenset((best[0].effects[0], b.effects[0])): (best[0], b) for b in more}
-        tried += [found.pair(a, b) for a, b in pairs.values()]
-    return tried
-
-
 def _concluded(
-    tried: Sequence[Change],
-    null: Null,
-    composed: Composed,
-    broken: Sequence[Broken],
-    calibration: Calibration | None,
+    tried: Sequence[Change], found: Comparison, broken: Sequence[Broken], calibration: Calibration | None
 ) -> Changes:
-    """The verdict: the simplest explanation that no other beats, in the mean and from log to log."""
-    nothing = next(c for c in tried if not c.effects)
-    odds = np.array([c.odds for c in tried])
-    chance = np.exp(odds - odds.max())
-    chance /= chance.sum()
-    best = top = tried[int(np.argmax(odds))]
-    for simpler in sorted(tried, key=lambda c: -c.odds):
-        if simpler.effects and len(simpler.effects) < len(best.effects) and not _beats(best, simpler):
-            best = simpler
-    if not _beats(top, nothing):
-        best = nothing
-    helps = best is nothing or float((best.held - nothing.held).sum()) > 0
-    if not helps:
-        best = nothing
+    """The verdict: the simplest explanation that no other beats from motion to motion."""
+    nothing, old = tried[0], found.old
+    every = sorted(tried[1:], key=lambda c: c.left.mean())
+    singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
+    changed = min((c.p_value for c in singles), default=1.0) < CHANGED
+    changed = changed and by_chance(nothing.left - singles[0].left) < CHANGED
+    best = singles[0] if changed else nothing
+    both = min((c.p_value for c in pairs), default=1.0) < CHANGED
+    if changed and both and by_chance(best.left - pairs[0].left) * len(pairs) < RIVAL:
+        best = pairs[0]
     others = [
         c
-        for c in tried
-        if c is not best and len(c.effects) == len(best.effects) and c.effects and not _beats(best, c)
+        for c in (singles if len(best.effects) == 1 else pairs)
+        if c is not best and best.effects and by_chance(c.left - best.left) > RIVAL
     ]
+    excess = found.excess(best)
+    paired = np.isin(found.runs.units, old.units).all()
+    worse = by_chance(excess) if paired else _unlike(best.left, old.missed)
     verdict = "none" if not best.effects else "set" if others else "named"
-    if null.tail(best.left) < ALARM:
+    if worse < UNKNOWN and excess.mean() > (nothing.left - best.left).mean():
         verdict = "unknown"
-    names = {"+".join(sorted(c.effects)) or "none": float(p) for c, p in zip(tried, chance, strict=True)}
-    over = float(np.exp(0.5 * (np.log(best.left).mean() - null.left.mean())))
     return Changes(
-        verdict,
-        best,
-        tuple(others),
-        nothing,
-        tuple(tried),
-        names,
-        over,
-        null,
-        composed,
-        tuple(broken),
-        calibration,
-    )
+        verdict, best, tuple(others), nothing, tuple(tried), _chances(tried, best, worse), worse, old,
+        found.runs.units, found.runs, found.composed, tuple(broken), calibration,
+    )  # fmt: skip
 
 
-def _beats(one: Change, other: Change) -> bool:
-    """Whether a change rules another out: by its odds, and in its log likelihood from log to log."""
-    sure = SURE if other.effects else CHANGED
-    return bool(one.odds - other.odds > ODDS) and by_chance(one.held - other.held) <= 1 - sure
+def _unlike(new: np.ndarray, old: np.ndarray) -> float:
+    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t."""
+    if old.size < 2:
+        return 0.5
+    sd = max(float(old.std(ddof=1)), 1e-12) * np.sqrt(1 / old.size + 1 / new.size)
+    return float(student.sf((new.mean() - old.mean()) / sd, old.size - 1))
 
 
-def by_chance(gain: np.ndarray) -> float:
-    """How often as much is gained in the mean where each of these logs might as well have lost it: of signs
-    drawn anew. Of the gains, which are of squares and far larger on some logs than on others, it is the
-    roots.
-    """
-    root = np.sqrt(np.abs(gain))
-    if root.size <= MANY:
-        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=root.size)))
-        return float(np.mean(signs @ root >= np.sign(gain) @ root - 1e-9))
-    return float(normal.sf((np.sign(gain) @ root) / max(np.linalg.norm(root), 1e-300)))
+def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, float]:
+    """A probability of nothing, of the unknown, and of every explanation. Of a p-value the odds of nothing
+    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations share
+    what is left as the paired tests have it."""
+
+    def odds(p: float) -> float:
+        p = max(p, 1e-12)
+        return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
+
+    changed = [c for c in tried if c.effects]
+    none, unknown = odds(best.p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
+    weight = {"+".join(sorted(c.effects)): by_chance(c.left - best.left) for c in changed if c is not best}
+    weight |= {"+".join(sorted(best.effects)): 1.0} if best.effects else {}
+    total = max(sum(weight.values()), 1e-300)
+    seen = 1 - none / (1 + none) if best.effects else min(0.5, total)
+    out = {"none": (1 - seen) * (1 - unknown), "unknown": unknown}
+    return out | {n: seen * (1 - unknown) * w / total for n, w in weight.items()}

@@ -173,18 +173,23 @@ class Search:
         self.starts = dict(linear.starts)
         return self.settled((), point, [covariances(self.composed, linear).whitener()])
 
-    def settled(self, names: Names, begin: Point, scales: Sequence[Whitener]) -> Settled:
-        """A set at its best, from a start: by each of these scales, and once more by what that leaves."""
+    def settled(
+        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
+    ) -> Settled:
+        """A set at its best, from a start: by each of these scales, and once more by what that leaves. What
+        stays further behind a `rival`'s score than that can mend is not gone on with."""
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        here = self.composed.moved(begin)
-        found = [self._judged(here, names, begin)] if frozenset(names) not in self.known else []
+        here, best, key = self.composed.moved(begin), None, frozenset(names)
         for whiten in scales:
-            found.append(self._judged(here, names, self._moved(here, begin, whiten)))
-        best = max(found, key=lambda one: one.score)
-        there = self.composed.moved(best.point)
-        again = self._moved(there, best.point, best.whiten)
-        best = max((self._judged(there, names, p) for p in (best.point, again)), key=lambda one: one.score)
-        key = frozenset(names)
+            one = self._judged(here, names, self._moved(here, begin, whiten))
+            best = one if best is None or one.score > best.score else best
+            if best.score < rival - NEAR:
+                break
+        assert best is not None
+        if best.score >= rival - NEAR:
+            there = self.composed.moved(best.point)
+            again = self._judged(there, names, self._moved(there, best.point, best.whiten))
+            best = max((best, again), key=lambda one: one.score)
         if key not in self.known or self.known[key].score < best.score:
             self.known[key] = best
         return self.known[key]
@@ -342,7 +347,8 @@ class Search:
             one = self._apart(near[k], begin)
             if frozenset(one) in self.known or (at is not best and {*best.names} < {*one}):
                 continue
-            found.append(self.settled(one, begin, [levels[i] for i in {level[k], len(levels) - 1}]))
+            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
+            found.append(self.settled(one, begin, scales, best.score))
         good = [s for s in found if self._is_better(s, best)]
         return max(good, key=lambda s: s.score, default=None)
 

@@ -1,26 +1,23 @@
-"""What is known of a robot that did not change, from logs of it: how far a model of it is off, how surely.
+"""What is known of a robot that did not change, from logs of it run freely.
 
 See `simgap.robots.changes` for the model. A sample that jumps away from both neighbours and back is no
-reading and left out. What is left of logs, run freely, is whitened: by a channel's process (a Kalman
-filter), by what uncertain starts make of a log, and by the scatter of all parameters from motion to motion,
-which logs of one motion share.
+reading and left out. Rows are recorded less simulated values in units of their channel's scale, less what the
+uncertain start of their log makes of them. What a model leaves has long tails (a command that comes late, an
+arm that sticks), so rows are Student-t (Lange, Little & Taylor, Journal of the American Statistical
+Association 84, 1989). They are far from independent: what is sure is judged between motions, never by the
+number of rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import norm as normal
-from scipy.stats import t as student
 
 from hmmseg.errors import InputError
-from hmmseg.online.compiled import compiled
 from hmmseg.robust import robust_sd
 from simgap.robots.calibrate import Calibration
-from simgap.robots.fit import moved_to
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.noise import resolution
@@ -28,14 +25,19 @@ from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 BROKEN = 10.0  # chosen: of what 5 % of samples leave the mean of their neighbours by, a sample that is broken
-SCATTER = 0.05  # prior: of a parameter's usual size, by which a model's error moves it from motion to motion
-MOST = 0.2  # prior: likewise, at most; what is larger is for the processes
-WEIGHT = 3.0  # prior: motions that this is worth
-FEW = 3.0  # numerics: factor on the scatter that is learned from few motions, at most
+TAILS = 4.0  # cited: degrees of freedom of what a model leaves, as Lange et al. fix them
 ALIKE = 0.1  # chosen: of a command's usual size; logs whose commands are closer than this are of one motion
-PASSES, ROUNDS = 3, 60  # numerics: of learning the processes, and of EM
-POSITIVE = 0.05  # numerics: of its sd, above which a parameter that cannot be negative is varied by factors
+UNITS = 4  # numerics: motions, below which each is cut into stretches
+POSITIVE = 0.3  # numerics: of its sd, above which a parameter that cannot be negative is varied by factors
 STEP = 0.02  # numerics: of a finite difference
+STEPS, FAR = 10, 1.0  # numerics: of a fit, and how far each goes at most, in coordinates
+GAINED = 1e-3  # numerics: of a fit's cost, what a step must gain for it to go on
+WIDER = (
+    8.0,
+    4.0,
+    2.0,
+    1.0,
+)  # numerics: of scales and parameters in turn, tails' scales first wider than they are
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def without_broken(
             if seen.size < 5:
                 continue
             v = values[seen]
-            before, after = np.concatenate([[v[1]], v[:-1]]), np.concatenate([v[1:], [v[-2]]])
+            before, after = np.append(v[0], v[:-1]), np.append(v[1:], v[-1])  # an end has one neighbour only
             off = v - (before + after) / 2
             out_of = (np.sign(v - before) == np.sign(v - after)) & (v != before) & (v != after)
             size = np.abs(off)
@@ -101,10 +103,6 @@ class Coordinates:
         log = (low >= 0) & (at > POSITIVE * np.minimum(sd, np.maximum(at, 1e-300) * 1e3)) & (at > 0)
         return cls(names, at, np.where(log, 1.0, sd), log, low, np.array([q.high for q in known]))
 
-    def about(self, composed: Composed, point: Point) -> Coordinates:
-        """The same parameters about another point."""
-        return Coordinates.of(composed, point, [*dict.fromkeys(e for e, _ in self.names)])
-
     def values(self, x: np.ndarray) -> np.ndarray:
         """Values (k,) at coordinates, within bounds."""
         moved = np.where(self.log, self.at * np.exp(np.clip(x, -7, 7)), self.at + self.scale * x)
@@ -120,123 +118,6 @@ class Coordinates:
         for (effect, short), value in zip(self.names, self.values(x), strict=True):
             out.setdefault(effect, {})[short] = float(value)
         return out
-
-
-@dataclass(frozen=True)
-class Process:
-    """A channel's gap: standard deviation `sd` and correlation time `time` [s] of what drifts, `white`: the
-    factor on the sensors' noise, `jitter` [s]: how far off the channel is in time, row by row."""
-
-    sd: float
-    time: float
-    white: float
-    jitter: float
-
-    @classmethod
-    def at(cls, z: np.ndarray, usual: float) -> Process:
-        """From logarithms, of residuals of a usual size."""
-        sd, time, white, jitter = np.exp(np.clip(z, -9, 5))
-        return cls(float(usual * sd), float(time), float(max(white, 1.0)), float(jitter))
-
-
-class Sequences:
-    """The rows of every log's channels in order of time, side by side; `rates` (N,) of the channels."""
-
-    def __init__(self, composed: Composed, rates: np.ndarray) -> None:
-        rows = composed.rows
-        key = rows.log * len(rows.channels) + rows.channel
-        self.order = np.lexsort((rows.time, key))
-        self.first = np.diff(key[self.order], prepend=-1) != 0
-        self.channel, self.count = rows.channel[self.order], len(rows.channels)
-        self.apart = np.where(self.first, 0.0, np.diff(rows.time[self.order], prepend=0.0))
-        self.variance, self.rates = rows.variance[self.order], rates[self.order]
-
-    def gains(self, processes: Sequence[Process], mine: slice | np.ndarray = slice(None)) -> Kalman:
-        """Kalman's gains and the innovations' standard deviations, of all rows or some sequences."""
-        sd, time, white, jitter = (
-            np.array([getattr(p, n) for p in processes])[self.channel[mine] if len(processes) > 1 else 0]
-            for n in ("sd", "time", "white", "jitter")
-        )
-        noise = self.variance[mine] * white**2 + (jitter * self.rates[mine]) ** 2
-        decay = np.where(self.first[mine], 0.0, np.exp(-self.apart[mine] / time))
-        return (*_gains(decay, noise, np.broadcast_to(sd**2, noise.shape)), decay)
-
-    def filtered(self, kalman: Kalman, values: np.ndarray) -> np.ndarray:
-        """Innovations in units of their standard deviations, of values (N,) or (N, c)."""
-        out = np.empty((values.shape[0], values[0].size))
-        out[self.order] = _innovations(*kalman, values.reshape(out.shape)[self.order])
-        return out.reshape(values.shape)
-
-    def learned(self, values: np.ndarray) -> list[Process]:
-        """The process of every channel, from what a model leaves (N,), by maximum likelihood."""
-        out, sorted_values = [], values[self.order]
-        for c in range(self.count):
-            mine = self.channel == c
-            seen = sorted_values[mine, None]
-            usual = float(np.sqrt(np.mean(seen**2))) + 1e-300
-
-            def cost(z: np.ndarray, mine=mine, seen=seen, usual=usual) -> float:
-                kalman = self.gains([Process.at(z, usual)], mine)
-                return float(np.log(kalman[0]).sum() + 0.5 * np.sum(_innovations(*kalman, seen) ** 2))
-
-            noise = float(np.sqrt(self.variance[mine].mean()))
-            speed = float(np.sqrt(np.mean(self.rates[mine] ** 2))) + 1e-300
-            start = np.log([1.0, 0.1, max(0.3 * usual / noise, 1.1), 0.3 * usual / speed])
-            options = {"maxfev": 400, "xatol": 0.02, "fatol": 0.5}
-            out.append(Process.at(minimize(cost, start, method="Nelder-Mead", options=options).x, usual))
-        return out
-
-
-Kalman = tuple[np.ndarray, np.ndarray, np.ndarray]  # spread, gain, decay from the row before, (N,) each
-
-
-@compiled
-def _gains(decay, noise, variance):
-    spread, gain = np.empty_like(noise), np.empty_like(noise)
-    left = 0.0
-    for k in range(noise.size):
-        ahead = decay[k] ** 2 * left + (1 - decay[k] ** 2) * variance[k]
-        gain[k] = ahead / (ahead + noise[k])
-        spread[k] = np.sqrt(ahead + noise[k])
-        left = ahead - gain[k] * ahead
-    return spread, gain
-
-
-@compiled
-def _innovations(spread, gain, decay, values):
-    out, mean = np.empty_like(values), np.zeros(values.shape[1])
-    for k in range(values.shape[0]):
-        for c in range(values.shape[1]):
-            ahead = decay[k] * mean[c]
-            new = values[k, c] - ahead
-            out[k, c] = new / spread[k]
-            mean[c] = ahead + gain[k] * new
-    return out
-
-
-@dataclass(frozen=True)
-class Null:
-    """What is known of a robot that did not change: its `point`, the coordinates of what was fitted with
-    their covariance (p, p), by channel the `processes`, all coordinates' scatter `tau` from log to log, and
-    how well logs that took no part are met: logarithms of whitened mean squares (num_old,). `motions`: every
-    log's."""
-
-    point: Point
-    theta: Coordinates
-    covariance: np.ndarray
-    processes: tuple[Process, ...]
-    every: Coordinates
-    tau: np.ndarray
-    left: np.ndarray
-    motions: list[Motion]
-
-    def tail(self, left: np.ndarray) -> float:
-        """The share of unchanged robots whose logs are met no better than those that leave squares `left`
-        (num_logs,), by the mean of logarithms."""
-        n, new = self.left.size, np.log(left)
-        sd = max(float(self.left.std(ddof=1)), 0.1)
-        far = float(new.mean() - self.left.mean()) / (sd * np.sqrt(1 / n + 1 / new.size))
-        return float(student.sf(far, n - 1))
 
 
 Motion = list[tuple[np.ndarray, np.ndarray, float]]  # by command times [s], values, and their usual size
@@ -263,141 +144,244 @@ def of_one_motion(one: Motion, other: Motion) -> bool:
     return bool(far) and max(far) < ALIKE
 
 
-class Whitened:
-    """Logs as whitened rows about a point: `composed` runs, `whiten` (see the module) and columns."""
+class Runs:
+    """Logs run freely about a model: standardised rows, their derivatives, and how units of logs tell of
+    parameters.
 
-    def __init__(self, composed: Composed, point: Point, every: Coordinates) -> None:
-        self.composed, self.point, self.every = composed, point, every
-        linear = linearise(composed, point, [])
-        self.sequences, self.log = Sequences(composed, linear.rates), composed.rows.log
-        self.linear, self.starts, self.residual = linear, linear.starts, linear.residual
-        if not np.isfinite(self.residual).all():
+    `unit` (N,): the motion that a row's log makes, or a stretch of it; units with the same number make the
+    same motion in other logs too.
+    """
+
+    def __init__(
+        self, composed: Composed, point: Point, unit: np.ndarray, scale: np.ndarray | None = None
+    ) -> None:
+        self.composed, self.unit, self.log = composed, unit, composed.rows.log
+        self.linear = linearise(composed, point, [])
+        if not np.isfinite(self.linear.residual).all():
             raise InputError("simulator", "does not follow a whole log", "a model that stays finite")
-        window, doubts = composed.rows.window, []
-        for state, column in self.starts.items():
-            doubts.append(column * np.array([w.doubt.get(state, 0.0) for w in composed.windows])[window])
-        own = [np.where(self.log == i, d, 0.0) for d in doubts for i in np.unique(self.log)]
-        self.doubts = np.array(own).T.reshape(self.log.size, -1)
-        self.columns = self.slopes(point, every)
-        self.motions = motions_of(composed)
-        first: list[Motion] = []
-        number = np.zeros(len(self.motions), int)
-        for log, motion in enumerate(self.motions):
-            same = next((k for k, other in enumerate(first) if of_one_motion(motion, other)), len(first))
-            first += [motion] if same == len(first) else []
-            number[log] = same
-        self.motion = number[self.log]  # (N,)
+        self.units = np.unique(unit)
+        self.scaled(self._scales() if scale is None else scale)
 
-    def slopes(self, point: Point, of: Coordinates, x: np.ndarray | None = None) -> np.ndarray:
-        """Derivatives (N, k) of the simulated rows by coordinates, at a point that holds them at x."""
-        base, out = base_at(self.composed, point), np.zeros((self.log.size, len(of.names)))
-        sizes = of.slopes(np.zeros(len(of.names)) if x is None else x)
-        for effect in dict.fromkeys(e for e, _ in of.names):
-            mine = np.array([e == effect for e, _ in of.names])
-            sd = np.array([p.sd for p in self.composed.effects[effect].parameters.values()])
-            one = vary(
-                self.composed,
-                base,
-                self.starts,
-                effect,
-                step=STEP * np.maximum(sizes[mine], 1e-6 * sd) / sd,
-                shifted=False,
-            )
-            if one is not None:
-                out[:, mine] = np.nan_to_num(one.jacobian) * sizes[mine]
+    def scaled(self, scale: np.ndarray) -> None:
+        """Use these scales by channel (C,); starts are taken out in their units."""
+        rows, starts = self.composed.rows, self.linear.starts
+        self.scale, self.parts = scale, []
+        for i in np.unique(self.log):
+            mine = np.flatnonzero(self.log == i)
+            doubt = []
+            for number in np.unique(rows.window[mine]):
+                for state, sd in self.composed.windows[number].doubt.items():
+                    doubt.append(np.where(rows.window[mine] == number, starts[state][mine] * sd, 0.0))
+            if doubt:
+                left, value, _ = np.linalg.svd(
+                    np.array(doubt).T / scale[rows.channel[mine], None], full_matrices=False
+                )
+                self.parts.append((mine, left, value**2 / (1 + value**2)))
+
+    def _scales(self, values: np.ndarray | None = None) -> np.ndarray:
+        """Student's scale of every channel (C,), by expectation and maximisation."""
+        rows = self.composed.rows
+        left = self.linear.residual if values is None else values
+        out = np.ones(len(rows.channels))
+        for c in range(out.size):
+            mine = left[rows.channel == c]
+            floor = np.sqrt(rows.variance[rows.channel == c].mean())
+            s2 = float(np.median(mine**2)) + floor**2
+            for _ in range(30):
+                s2 = max(float(np.mean((TAILS + 1) / (TAILS + mine**2 / s2) * mine**2)), floor**2)
+            out[c] = np.sqrt(s2)
         return out
 
-    def by(self, processes: Sequence[Process], tau: np.ndarray, scale: np.ndarray) -> None:
-        """Learn how to whiten; `scale` (num_logs,): how much more of the processes each log has."""
-        self.kalman, self.scale = self.sequences.gains(processes), scale
-        self.parts = []
-        loose = self.filtered(np.column_stack([self.columns * tau, self.doubts]))
-        for number in np.unique(self.motion):
-            rows = np.flatnonzero(self.motion == number)
-            left, value, _ = np.linalg.svd(loose[rows], full_matrices=False)
-            self.parts.append((rows, left, 1 - 1 / np.sqrt(1 + value**2)))
+    def rescaled(self, point: Point, wider: float = 1.0) -> None:
+        """Learn scales from what the model leaves at a point, and take so many times as wide ones."""
+        left = self.rows(point)
+        self.scaled(wider * self._scales(left * self.scale[self.composed.rows.channel]))
 
-    def filtered(self, values: np.ndarray) -> np.ndarray:
-        """Rows or columns in units of the processes, of each log's own size."""
-        return self.sequences.filtered(self.kalman, (values.T / self.scale[self.log]).T)
-
-    def whiten(self, values: np.ndarray) -> np.ndarray:
-        """Rows (N,) or columns (N, c) of independent unit noise."""
-        out = self.filtered(values)
+    def standard(self, values: np.ndarray) -> np.ndarray:
+        """Rows (N,) or columns (N, c) in units of their scale, starts taken out."""
+        size = self.scale[self.composed.rows.channel]
+        out = values / (size if values.ndim == 1 else size[:, None])
         for rows, left, less in self.parts:
-            inner = (left.T @ out[rows]).T * less
-            out[rows] -= left @ inner.T
+            out[rows] -= left @ ((left.T @ out[rows]).T * less).T
         return out
 
     def rows(self, point: Point) -> np.ndarray:
-        """Recorded less simulated (N,); NaN where a run diverged."""
-        return self.composed.rows.observed - base_at(self.composed, point).rows
+        """Recorded less simulated, standardised (N,); not finite where a run diverged."""
+        return self.standard(self.composed.rows.observed - base_at(self.composed, point).rows)
+
+    def slopes(
+        self, point: Point, of: Coordinates, x: np.ndarray, only: Collection[str] | None = None
+    ) -> np.ndarray:
+        """Derivatives (N, k) of what is simulated, standardised, at a point that has coordinates x; 0 for all
+        but some effects, where these are named."""
+        base, out = base_at(self.composed, point), np.zeros((self.log.size, len(of.names)))
+        sizes = of.slopes(x)
+        for effect in dict.fromkeys(e for e, _ in of.names if only is None or e in only):
+            mine = np.array([e == effect for e, _ in of.names])
+            sd = np.array([p.sd for p in self.composed.effects[effect].parameters.values()])
+            step = STEP * np.maximum(sizes[mine], 1e-6 * sd) / sd
+            one = vary(self.composed, base, self.linear.starts, effect, step=step, shifted=False)
+            if one is not None:
+                out[:, mine] = np.nan_to_num(one.jacobian) * sizes[mine]
+        return self.standard(out)
+
+    def told(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By unit the information (M, q, q) of columns' coordinates and the pull (M, q) on them."""
+        heavy = weights(rows)
+        each = [self.unit == u for u in self.units]
+        return (
+            np.array([columns[m].T @ (heavy[m, None] * columns[m]) for m in each]),
+            np.array([columns[m].T @ (heavy[m] * rows[m]) for m in each]),
+        )
+
+    def losses(self, point: Point, number: int) -> tuple[float, float]:
+        """The summed loss of all rows but a unit's, and the mean of that unit's, at a point [nats]; those of
+        a model that diverges are large."""
+        each = loss(np.nan_to_num(self.rows(point), nan=1e6, posinf=1e6, neginf=-1e6))
+        mine = self.unit == self.units[number] if number >= 0 else np.zeros(each.size, bool)
+        return float(each[~mine].sum()), float(each[mine].mean()) if mine.any() else np.nan
 
 
-def learned(composed: Composed, calibration: Calibration | None, candidates: Sequence[str]) -> Null:
-    """What OLD logs tell of a robot that does not change, about the point of its calibration."""
-    point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
+def weights(rows: np.ndarray) -> np.ndarray:
+    """Of standardised rows in a step of least squares."""
+    return (TAILS + 1) / (TAILS + rows**2)
+
+
+def loss(rows: np.ndarray) -> np.ndarray:
+    """Minus the log likelihood of standardised rows, but for a constant."""
+    return (TAILS + 1) / 2 * np.log1p(rows**2 / TAILS)
+
+
+Local = tuple[np.ndarray, np.ndarray]  # information (q, q) and pull (q,)
+
+
+def descended(
+    cost: Callable[[np.ndarray], float], local: Callable[[np.ndarray], Local], x: np.ndarray
+) -> np.ndarray:
+    """Where a cost is least, from x, by Levenberg's and Marquardt's steps."""
+    now, damping = cost(x), 0.0
+    for _ in range(STEPS if x.size else 0):
+        if not np.isfinite(now):
+            break
+        bend, pull = local(x)
+        for _ in range(6):
+            move = np.linalg.solve(bend + np.diag(damping * np.diag(bend) + 1e-9), pull)
+            there = cost(x + np.clip(move, -FAR, FAR))
+            if there < now:
+                break
+            damping = max(10 * damping, 0.01)
+        else:
+            break
+        x, gained, now = x + np.clip(move, -FAR, FAR), now - there, there
+        damping /= 10
+        if gained < GAINED * now:
+            break
+    return x
+
+
+def halved(cost: Callable[[np.ndarray], float], x: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Where a step leads that straight lines took too far: it is halved until it costs least."""
+    tried = [x + part * np.clip(step, -FAR, FAR) for part in (1.0, 0.5, 0.25, 0.125)]
+    return min(tried, key=cost)
+
+
+@dataclass(frozen=True)
+class Old:
+    """What is known of a robot that did not change: its `point`, coordinates `theta` (p) about it of what is
+    fitted, by unit the information (M, p, p) and pull (M, p) on them, their `prior` (p, p), `dependence`: as
+    how many rows that depend on each other one counts (units' pulls scatter so much more than those of
+    independent rows would, and the prior has so much more weight), how logs of a unit that took no part are
+    `missed` (M,) [nats a row], the channels' `scale` (C,), and the logs' `motions`."""
+
+    point: Point
+    theta: Coordinates
+    units: np.ndarray
+    information: np.ndarray
+    pull: np.ndarray
+    prior: np.ndarray
+    dependence: float
+    missed: np.ndarray
+    scale: np.ndarray
+    motions: list[Motion]
+
+
+def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
+    """What OLD logs tell of a robot that does not change, from the point of its calibration."""
+    point: Point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
     fitted = [e for e in point if not composed.numeric(e)]
-    if fitted:  # once more, by what is learned about where a calibration by plain squares ends
-        first = _learned(composed, point, fitted, candidates)
-        whitened = Whitened(composed, point, first.every)
-        whitened.by(first.processes, first.tau, np.exp(0.5 * first.left))
-        point = moved_to(composed, whitened.linear, whitened.whiten, point, fitted).point
-    return _learned(composed, point, fitted, candidates)
+    runs = Runs(composed, point, unit)
+    known = [composed.effects[e].parameters[s] for e in fitted for s in composed.effects[e].parameters]
+    nominal, sd = np.array([q.nominal for q in known]), np.array([q.sd for q in known])
+    p, m, dependence = len(known), len(runs.units), 1.0
+    for wider in WIDER if p else (1.0,):  # so that a log that is far off is not taken for a tail of others
+        runs.rescaled(point, wider)
+        theta = Coordinates.of(composed, point, fitted)
 
+        def cost(z: np.ndarray, theta=theta, point=point, dependence=dependence) -> float:
+            rows = runs.rows(theta.point(point, z))
+            prior = 0.5 * dependence * np.sum(((theta.values(z) - nominal) / sd) ** 2)
+            return float(loss(rows).sum() + prior) if np.isfinite(rows).all() else np.inf
 
-def _learned(composed: Composed, point: Point, fitted: Sequence[str], candidates: Sequence[str]) -> Null:
-    """The same about a point."""
-    theta = Coordinates.of(composed, point, fitted)
-    every = Coordinates.of(composed, point, [*fitted, *(n for n in candidates if n not in fitted)])
-    p, n = len(theta.names), len(composed.recordings)
-    old = Whitened(composed, point, every)
-    sd = np.array([composed.effects[e].parameters[s].sd for e, s in theta.names])
-    prior = np.diag((theta.slopes(np.zeros(p)) / sd) ** 2) if p else np.zeros((0, 0))
-    tau, left, scale = np.full(len(every.names), SCATTER), old.residual, np.ones(n)
-    squares, level, processes = np.ones(n), 1.0, ()
-    for _ in range(PASSES):
-        processes = tuple(old.sequences.learned(left / scale[old.log]))
-        old.by(processes, 0 * tau, scale)
-        columns, white = old.filtered(old.columns), old.filtered(old.residual)
-        told, pull = sums(columns, white, old.motion)
-        for _ in range(ROUNDS):
-            inside = np.linalg.inv(told + np.diag(tau**-2.0))
-            less = told - told @ inside @ told
-            drawn = pull - np.einsum("nij,njk,nk->ni", told, inside, pull)
-            d = np.linalg.solve(less[:, :p, :p].sum(0) + prior, drawn[:, :p].sum(0))
-            mean = np.einsum("nij,nj->ni", inside, pull - told[:, :, :p] @ d)
-            square = mean**2 + np.diagonal(inside, axis1=1, axis2=2)
-            tau = np.sqrt((square.sum(0) + WEIGHT * SCATTER**2) / (len(told) + WEIGHT - 2))
-            tau = np.minimum(tau, MOST)
-        left = old.residual - old.columns[:, :p] @ d - np.einsum("ij,ij->i", old.columns, mean[old.motion])
-        old.by(processes, tau, scale)
-        columns, white = old.whiten(old.columns[:, :p]), old.whiten(old.residual)
-        told, pull = sums(columns, white, old.motion)
-        apart = np.array([
-            np.linalg.solve(told.sum(0) - told[i] + prior, pull.sum(0) - pull[i]) for i in range(len(told))
-        ]).reshape(len(told), p)  # fmt: skip
-        alone = white - np.einsum("ij,ij->i", columns, apart[old.motion])
-        squares = np.bincount(old.log, alone**2) / np.bincount(old.log) * scale**2
-        level = np.exp(np.mean(np.log(squares)))
-        scale = np.sqrt(squares / level)
-    size = level**0.5
-    processes = tuple(
-        Process(size * q.sd, q.time, max(size * q.white, 1.0), size * q.jitter) for q in processes
-    )
-    old.by(processes, tau, scale)
-    columns = old.whiten(old.columns[:, :p])
-    covariance = np.linalg.inv(columns.T @ columns + prior)
-    few = float(student.ppf(0.975, max(len(told) - 1, 1)) / normal.ppf(0.975))  # of so few motions
-    return Null(
-        point, theta, covariance, processes, every, min(few, FEW) * tau, np.log(squares / level), old.motions
+        def local(z: np.ndarray, theta=theta, point=point, dependence=dependence) -> Local:
+            there, slope = theta.point(point, z), theta.slopes(z) / sd
+            bend, pull = runs.told(runs.rows(there), runs.slopes(there, theta, z))
+            push = slope * (theta.values(z) - nominal) / sd
+            return bend.sum(0) + dependence * np.diag(slope**2), pull.sum(0) - dependence * push
+
+        z = descended(cost, local, np.zeros(p))
+        point = theta.point(point, z) if p else point
+        runs.rescaled(point)
+        theta = Coordinates.of(composed, point, fitted)
+        rows, columns = runs.rows(point), runs.slopes(point, theta, np.zeros(p))
+        information, pull = runs.told(rows, columns)
+        slope = theta.slopes(np.zeros(p)) / sd
+        if p and m > 1:  # as if every row were so many
+            spread = np.linalg.solve(information.sum(0) + dependence * np.diag(slope**2), pull.T @ pull)
+            dependence = max(1.0, float(np.trace(spread)) * m / (m - 1) / p)
+    prior = dependence * np.diag(slope**2) + 1e-9 * np.eye(p)
+    total, missed = information.sum(0) + prior, np.zeros(m)
+    rest = pull.sum(0) - dependence * slope * (theta.values(np.zeros(p)) - nominal) / sd
+    for u in range(m):
+        step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
+
+        def without(z: np.ndarray, u=u) -> tuple[float, float]:
+            kept, out = runs.losses(theta.point(point, z), u)
+            return kept + 0.5 * dependence * float(np.sum(((theta.values(z) - nominal) / sd) ** 2)), out
+
+        missed[u] = without(halved(lambda z, f=without: f(z)[0], np.zeros(p), step))[1]
+    return Old(
+        point,
+        theta,
+        runs.units,
+        information,
+        pull,
+        prior,
+        dependence,
+        missed,
+        runs.scale,
+        motions_of(composed),
     )
 
 
-def sums(columns: np.ndarray, white: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """By group of rows the columns' products with each other and with the rows."""
-    each = [group == i for i in range(group.max() + 1)]
-    return (
-        np.array([columns[m].T @ columns[m] for m in each]),
-        np.array([columns[m].T @ white[m] for m in each]),
-    )
+def units_of(old: Composed, new: Composed) -> tuple[np.ndarray, np.ndarray]:
+    """The unit of every row of OLD and of NEW: the motion, or where NEW makes few, which OLD makes too, a
+    stretch of it; what a model gets wrong all along a motion that OLD never made says the same in each."""
+    first: list[Motion] = []
+    number: list[list[int]] = [[], []]
+    for mine, motions in zip(number, (motions_of(old), motions_of(new)), strict=True):
+        for motion in motions:
+            same = next((k for k, one in enumerate(first) if of_one_motion(motion, one)), len(first))
+            first += [motion] if same == len(first) else []
+            mine.append(same)
+    few = len(set(number[1]))
+    pieces = -(-UNITS // few) if set(number[1]) <= set(number[0]) else 1
+    out = []
+    for composed, mine in zip((old, new), number, strict=True):
+        log, time = composed.rows.log, composed.rows.time
+        unit = np.zeros(log.size, int)
+        for i in np.unique(log):
+            its = log == i
+            order = np.argsort(np.argsort(time[its], kind="stable"), kind="stable")
+            unit[its] = mine[i] * pieces + order * pieces // its.sum()
+        out.append(unit)
+    return out[0], out[1]

@@ -11,7 +11,7 @@ from planted_gaps import gap_of, linear, rows_of
 
 from simgap.attribution.attribute import _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import Heldout
-from simgap.attribution.posterior import Background, fitted, forms
+from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import Candidate, Gap, cosines
 from simgap.attribution.search import detected, leniently, sought, statistic, weights
 from simgap.attribution.verdict import known, significant
@@ -93,6 +93,15 @@ def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
     assert np.mean(np.exp(-np.maximum(values, 0)) < 0.05) <= 0.1
     assert statistic(forms(gap_of({0: 3.0}))) > 20
     assert detected(1e3).p_value == 0.0 and detected(-2.0).p_value == 1.0
+
+
+def test_neighbours_are_screened_by_what_one_step_of_each_gives():
+    f = forms(gap_of({0: 3.0, 2: -2.0}))
+    m = fitted(f, (0,))
+    sets = [(), (0, 2), (1,), (1, 3), (0, 1, 2)]
+    each = [mode(f, quadratic_forms(f, e), m.precision, steps=1).score for e in sets]
+    # but for the volume of the mode, by how groups count before the step
+    np.testing.assert_allclose(screened(f, m, sets), each, atol=0.2)
 
 
 def test_twins_are_taken_until_the_answer_is_clear():

@@ -7,11 +7,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_1samp, ttest_ind
 
 from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
-from simgap.robots.changes import Changes, by_chance, changes
+from simgap.robots.changes import Changes, by_chance, changes, jackknife
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -105,9 +106,31 @@ def test_a_single_wild_sample_is_found_and_is_no_cause():
     assert without_broken(SIMULATOR, [log])[1] == []
 
 
-def test_signs_drawn_anew_are_as_rare_as_counted():
-    assert by_chance(np.array([1.0, 2.0, 9.0])) == pytest.approx(1 / 8)
-    assert by_chance(np.array([1.0, 1.0, -1.0, 1.0])) == pytest.approx(5 / 16)
+def test_the_end_of_a_log_is_not_broken_as_it_has_one_neighbour():
+    (log,) = logs(3, ("step",))
+    ends = log["duty"].copy()
+    ends[[0, -1]] = 0.9
+    assert without_broken(SIMULATOR, [log.with_columns({"duty": ends})])[1] == []
+
+
+def test_leaving_one_out_of_means_is_welchs_test():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=5), 3 * rng.normal(size=4)
+    without = [np.array([[np.delete(v, k).mean()] for k in range(v.size)]) for v in (a, b)]
+    sd, freedom = jackknife(without)
+    welch = ttest_ind(a, b, equal_var=False)
+    assert (a.mean() - b.mean()) / sd[0] == pytest.approx(welch.statistic)
+    assert freedom[0] == pytest.approx(welch.df)
+
+
+def test_gains_from_motion_to_motion_are_judged_by_student():
+    gains = np.array([0.3, 0.1, 0.5, -0.1])
+    assert by_chance(gains) == pytest.approx(ttest_1samp(gains, 0, alternative="greater").pvalue)
+
+
+def test_of_one_unit_nothing_is_sure():
+    sd, _ = jackknife([np.zeros((5, 1)), np.zeros((1, 1))])
+    assert np.isinf(sd[0])
 
 
 def test_one_old_log_is_too_few():
