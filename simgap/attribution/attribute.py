@@ -210,6 +210,9 @@ def attribute(
     rest = significant(gap.rows, f.spectrum.band, left, sd)
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, model, by_group, rng)
+    # Noise that differs from part to part can show a gap somewhere, and none in all squares together.
+    shown = explained.before > explained.floor or verdict.verdict == "none"
+    remains = explained.remainder if shown else 1.0
     far = others.how_far(causes) if others is not None and causes else None
     chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
                     found.p_value)  # fmt: skip
@@ -218,7 +221,7 @@ def attribute(
         **vars(verdict),
         effects=_effects(f, models, chance, examined),
         detection=found,
-        remainder=Remainder(explained.remainder, p_rest, rest),
+        remainder=Remainder(remains, p_rest, rest),
         where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
         how_far=far,
         small_gap=small,
@@ -335,6 +338,8 @@ def _examined(
     factors = [i.log_bayes_factor for i in shifting]
     far = others.how_far(causes) if others is not None and causes else None
     share = 1 - explained.remainder if far is None else far.fraction
+    if far is None and others is not None and shifting:
+        share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
     sure = known(left, share, factors) if causes else 0.0
     return _Examined(effects, model, explained, same, causes, sure)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from planted_gaps import gap_of, linear, rows_of
 
-from simgap.attribution.attribute import _predicting, _there, attribute, noise_of
+from simgap.attribution.attribute import _examined, _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import Heldout
 from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import Candidate, Gap, cosines
@@ -330,6 +330,17 @@ def test_causes_of_less_than_the_wanted_share_of_held_out_gap_are_unknown():
     found = attribute(replace(gap, residual=gap.residual + rest))
     assert found.verdict == "unknown" and found.probabilities["unknown"] > 0.5
     assert attribute(gap).causes == ("a",)
+
+
+def test_a_cause_is_not_known_where_other_trials_show_no_gap_that_it_could_shrink():
+    """Noise of nine times the squares that there are: nothing to be gone, so no share of it is."""
+    gap = gap_of({0: 3.0}, seed=6)
+    f, rng = forms(gap), np.random.default_rng(0)
+    for variance, likely in ((1.0, True), (9.0, False)):
+        others = Heldout.of(gap, np.full(3, variance), (0,))
+        found = _examined(f, (0,), np.full(f.count.size, variance), rng, others)
+        assert found.causes == (0,)
+        assert (found.known > 0.5) == likely
 
 
 def test_the_level_of_the_noise_is_that_of_its_mean_square_in_small_groups_too():
