@@ -107,8 +107,9 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     )
     assert large.score - none.score > 1.5 * hidden > 30
     assert both.score > large.score + 20 > small.score + 40
-    assert {*large.discrepancy.scale} == {"angle_b"} and {*small.discrepancy.scale} == {"angle_a"}
-    assert both.discrepancy.scale.get("angle_a", 0.0) < 0.01 * none.discrepancy.scale["angle_a"]
+    left = [one.discrepancy.scale for one in (large, small, both)]
+    assert left[0].get("angle_a", 0.0) < 0.02 * none.discrepancy.scale["angle_a"] < left[1]["angle_a"]
+    assert "angle_b" in left[0] and "angle_b" not in left[1] and not left[2]
 
 
 def test_priors_are_cauchy_and_of_what_was_calibrated_normal():
