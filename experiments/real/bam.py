@@ -136,7 +136,7 @@ def fitted(model: str, logs: list[tuple[Recording, tuple]]) -> tuple[list[str], 
 
     found = least_squares(
         left, start / size, bounds=(low / size - 1e-12, high / size + 1e-12), loss="soft_l1", diff_step=0.003,
-        max_nfev=25,
+        max_nfev=15,
     )  # fmt: skip
     return names, found.x * size
 
@@ -191,9 +191,9 @@ def main() -> None:
         pairs = [compared(errors, group, "ours", "m6"), compared(errors, group, "ours", "m6+")]
         out[by] = {"rms": {m: float(np.sqrt(np.mean(e**2))) for m, e in errors.items()}, "compared": pairs}
         print(by, out[by], flush=True)
-    if given.output is not None:
-        save(given.output, {**out, "logs": rows})
-        pd.DataFrame(rows).to_csv(given.output.with_suffix(".csv"), index=False)
+        if given.output is not None:
+            save(given.output, {**out, "logs": rows})
+            pd.DataFrame(rows).to_csv(given.output.with_suffix(".csv"), index=False)
 
 
 if __name__ == "__main__":
