@@ -86,6 +86,11 @@ def mixed() -> str | None:
     return changed("sts3215_mixed")
 
 
+def first() -> str | None:
+    """What changed of a servo, as the first run on the judging half had it."""
+    return changed("sts3215_first")
+
+
 def bam() -> str | None:
     """Whole logs of what was left out, of three models."""
     found = load("sts3215_bam")
