@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs gap-forms
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -37,8 +37,8 @@ typecheck: $(INSTALLED)  ## static types
 tests: $(INSTALLED)  ## tests alone, without those marked slow
 	$(BIN)/pytest -n auto --dist loadfile tests
 
-slow: $(INSTALLED)  ## the tests marked slow
-	$(BIN)/pytest -n auto --dist loadfile -m slow tests
+slow: $(INSTALLED)  ## the tests marked slow, and every call's annotations checked
+	CHECK_CALLS=1 $(BIN)/pytest -n auto --dist loadfile -m slow tests
 
 golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ against those pinned in tests/data/golden
 	$(BIN)/python -m experiments.golden compare
@@ -75,6 +75,11 @@ bench: $(INSTALLED)  ## alignment beside hmmlearn and dynamax, stages of the com
 	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
 	$(BIN)/python -m experiments.write_tables
 
+bench-accelerator: $(INSTALLED)  ## the same recursions on this machine's accelerator; fills docs/benchmarks.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[accelerator]'
+	$(BIN)/python -m experiments.benchmarks.hmm --parallel
+	$(BIN)/python -m experiments.write_tables
+
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
 	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
@@ -103,6 +108,11 @@ gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn 
 
 gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in the folder LABS; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
+	$(BIN)/python -m experiments.write_tables
+
+gap-forms: $(INSTALLED)  ## how far true effects are from their own forms, and what each test of a cause buys; fills docs/gap_results.md
+	$(BIN)/python -m experiments.gap_forms $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 085 065) $(addprefix spent/case_,033 009 000 012 026 005))
+	$(BIN)/python -m experiments.gap_detectors $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 065 080 045) $(addprefix spent/case_,009 033))
 	$(BIN)/python -m experiments.write_tables
 
 gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md
@@ -152,7 +162,6 @@ results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables o
 	$(BIN)/python -m experiments.score_recordings recordings
 	$(BIN)/python -m experiments.calibration recordings
 	$(BIN)/python -m experiments.benchmarks.moves
-	$(BIN)/python -m experiments.benchmarks.identify
 	$(BIN)/python -m experiments.write_tables
 
 ROBOTS := build/robots

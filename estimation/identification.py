@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,14 @@ from estimation.checks import (
     PredictiveCheck,
     check,
     dense,
-    force_scale,
     misfits,
     soft_pads,
-    uneven,
+    unchecked,
     unnamed,
     unrepeated,
     unstated_pads,
 )
+from estimation.consistency import contradictions, force_scale
 from estimation.design import Design, Unknown
 from estimation.friction import FrictionPosterior, friction_posteriors
 from estimation.observations import Noise, WeighedTrial, aligned_weights, with_slides, without_roll
@@ -52,7 +52,8 @@ class Identification(Tabled):
     `draws` (num_draws, num_properties) of the properties named by `names` (object, property) in
     N and m, `combined` (num_draws, num_combinations) of the `combinations` that alone are determined
     of some; `sampled` is None where nothing could be determined. `notes` say what a reader should
-    know though nothing is wrong.
+    know though nothing is wrong. `centres`: posterior means of all that was worked out, what is contradicted
+    among it, from which a search for the cause starts [N, m].
     """
 
     task: BlockTask
@@ -70,6 +71,7 @@ class Identification(Tabled):
     predictive: PredictiveCheck | None
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    centres: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @property
     def segmentations(self) -> list[Segmentation]:
@@ -87,11 +89,6 @@ class Identification(Tabled):
         if (obj, prop) not in self.names:
             raise KeyError(f"{obj}.{prop} is undetermined: {self.reasons.get(f'{obj}.{prop}', '')}")
         return self.draws[:, self.names.index((obj, prop))]
-
-    @property
-    def means(self) -> dict[tuple[str, str], float]:
-        """Posterior mean of every determined property, by block and property [N, m]."""
-        return {name: float(column.mean()) for name, column in zip(self.names, self.draws.T, strict=True)}
 
     def to_json(self) -> dict:
         """The body of `identify`'s JSON document."""
@@ -188,13 +185,15 @@ def identify_aligned(
     sampled, predictive, scale = None, None, None
     reasons = _reasons(aligned, design, friction)
     kept: list[int] = []
+    contradicted: dict[str, str] = {}
     if design.unknowns:
         found, sampled = sample_either(design, other, seed, progress)
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings
-            notes += [*unrepeated(design), *unstated_pads(design)]
-            reasons |= untrusted(aligned, weighed, design, sampled)
+            notes += [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
+            contradicted = contradictions(aligned, weighed, design)
+            reasons |= contradicted | impossible(design, sampled)
             kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
             scale = None if aligned.late else force_scale(design.doubt, weighed, rig)
         if sampled.method != "emcee":
@@ -203,8 +202,11 @@ def identify_aligned(
             why = f"the sampler has not converged: {sampled.shortfall}"
             warnings.append(why)
             reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
-    unknowns = tuple(design.unknowns[i] for i in kept)
+    unknowns, centres = tuple(design.unknowns[i] for i in kept), dict[tuple[str, str], float]()
     if sampled is not None:
+        if sampled.converged:
+            centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
+                       if u.single and i not in sampled.impossible}  # fmt: skip
         sampled = replace(sampled, chain=sampled.chain[..., kept])
         if scale is not None:
             heavy = [i for i, u in enumerate(unknowns) if u.prop == "weight"]
@@ -220,25 +222,24 @@ def identify_aligned(
         f"the zero of {name} moves by {size:.2g} N between stretches of free motion; intervals allow for it"
         for name, size in zip(FORCE_CHANNELS, design.moved, strict=True) if size > 0
     ]  # fmt: skip
-    warnings += list(dict.fromkeys(reason for reason in reasons.values() if reason.startswith("fx1 and")))
+    warnings += list(dict.fromkeys(contradicted.values()))
     warnings += soft_pads(design, rig)
     warnings += unnamed(aligned.task, design)
     means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(unknowns) if u.single}
     warnings += dense(aligned.task, rig, means)
+    centres |= means
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }
     return Identification(
         aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
         draws[:, :num], unknowns[num:], draws[:, num:], sampled if kept else None, friction, reasons,
-        predictive, tuple(warnings), tuple(notes),
+        predictive, tuple(warnings), tuple(notes), centres,
     )  # fmt: skip
 
 
-def untrusted(
-    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design, sampled: Draws
-) -> dict[str, str]:
-    """Why properties that could be worked out are none: by `object.property`."""
+def impossible(design: Design, sampled: Draws) -> dict[str, str]:
+    """Why properties that could be worked out are none: by `object.property`, those that no block has."""
     out = {}
     for i in sampled.impossible:
         size = float(sampled.flat[:, i].mean())
@@ -246,13 +247,6 @@ def untrusted(
         unit = UNITS[design.unknowns[i].prop]
         text = f"{name} comes out at {size:.3g} {unit}, as no block has it: positions or rig.toml are off"
         out |= dict.fromkeys(design.unknowns[i].properties, text)
-    objects = list(aligned.task.objects)
-    unlike = uneven(weighed)
-    if unlike is not None:
-        out |= {f"{obj}.{prop}": unlike for obj in objects for prop in ("weight", "width", "friction")}
-    blamed = {fault.line for t in aligned.trials for fault in t.trial.faults if fault.blames}
-    for line in blamed:
-        out |= {f"{obj}.{prop}": line for obj in objects for prop in ("width", "height")}
     return out
 
 

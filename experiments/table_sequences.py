@@ -9,8 +9,7 @@ from experiments.table_text import load, markdown, percent
 
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "sequences.png"
 ROWS = {
-    "none": "no labels", "before_asked": "no labels, where one is asked for", "asked": "the label asked for",
-    "trial": "one labelled trial",
+    "none": "no labels", "asked": "the label asked for", "trial": "one labelled trial",
 }  # fmt: skip
 
 

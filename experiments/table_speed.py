@@ -27,6 +27,30 @@ def alignment() -> str | None:
     return f"{table}\n\nAll paths are {same}. Versions: {versions}."
 
 
+def accelerator() -> str | None:
+    """docs/benchmarks.md: the same recursions in parallel on an accelerator."""
+    found = load("benchmark_hmm_parallel")
+    if found is None:
+        return None
+    peers = ("row by row, processor", "torchaudio.forced_align", "torbi")
+    rows = []
+    for title, case in found["cases"].items():
+        times = case["seconds"]
+        own = times["associative scan"]
+        others = [f"{times[n] / own:.0f} x" if times.get(n) else "" for n in peers]
+        rows.append([title, f"{1e3 * own:.2g} ms", *others])
+    table = markdown(["", "`hmmseg.hmm`, associative scan", *peers], rows)
+    cases = found["cases"].values()
+    same = {n: min(c["same"].get(n, 1.0) for c in cases) for n in ("associative scan", *peers[1:])}
+    shares = ", ".join(f"{n} {percent(share, 2)}" for n, share in same.items())
+    far = max(max(c["largest difference"].values(), default=0.0) for c in cases)
+    return (
+        f"{table}\n\nWall time on one {found['device']}, JAX {found['jax']}. Trials with all starts as "
+        f"found row by row, least of all cases (torchaudio and torbi in single precision): {shares}. "
+        f"Posteriors differ by {far:.0e} at most."
+    )
+
+
 def samplers() -> str | None:
     """docs/benchmarks.md: effective samples a second on the same log density."""
     found = load("reference_posteriors")

@@ -86,4 +86,4 @@ def between(low: float | None, high: float | None) -> str:
     """An interval of a share, "62 to 78 %"; empty where it is unknown or no wider than is shown."""
     if low is None or high is None or round(100 * low) == round(100 * high):
         return ""
-    return f"{100 * low:.0f} to {100 * high:.0f} %"
+    return f"{fixed(100 * low, 0)} to {fixed(100 * high, 0)} %"

@@ -15,6 +15,7 @@ from simgap.gap.diagnose import Diagnosis
 from simgap.gap.frame import CHANNELS
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.generic.trials import SLOW, bin_edges
+from simgap.report.figures import draw_heat_map, draw_suspects
 from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.linear import base_at
@@ -121,9 +122,6 @@ def draw_generic(found: GenericDiagnosis, path: Path) -> None:
         above.set_title(f"Largest difference of a course: {lay.ensembles.channels[channel]} (shaded subtask)")
 
 
-BARS = 12  # look: bars
-
-
 @dataclass(frozen=True)
 class Drawn:
     """A diagnosis with its document, as the page takes it."""
@@ -135,50 +133,17 @@ class Drawn:
 
 def draw_robot(drawn: Drawn, path: Callable[[str], Path]) -> None:
     """All figures, at the paths that `path(name)` gives."""
-    draw_where(drawn, path("gap_where.png"))
-    draw_windows(drawn, path("gap_signal.png"))
-    draw_probabilities(drawn, path("gap_probabilities.png"))
-    draw_before_after(drawn, path("gap_before_after.png"))
+    phases = sorted({cell["subtask"] for cell in drawn.body["where"]})
+    if phases:
+        draw_heat_map(drawn.body, phases, path("gap_where.png"))
+    draw_suspects(drawn.body, path("gap_probabilities.png"))
+    draw_robot_page(drawn, path)
 
 
 def draw_robot_page(drawn: Drawn, path: Callable[[str], Path]) -> None:
     """Those that a page shows next to its own tables."""
     draw_windows(drawn, path("gap_signal.png"))
     draw_before_after(drawn, path("gap_before_after.png"))
-
-
-def draw_where(drawn: Drawn, path: Path) -> None:
-    """Root mean square residual of every channel in every log, in noise's standard deviations."""
-    found = drawn.found
-    rows = found.composed.rows
-    logs = [r.name for r in found.composed.recordings]
-    size = np.sqrt(rows.variance)
-    grid = np.full((len(rows.channels), len(logs)), np.nan)
-    for c in range(len(rows.channels)):
-        for k in range(len(logs)):
-            mine = (rows.channel == c) & (rows.log == k) & np.isfinite(found.plain.residual)
-            if mine.any():
-                grid[c, k] = np.sqrt(np.mean((found.plain.residual[mine] / size[mine]) ** 2))
-    with canvas(path, height=1.6 + 0.25 * len(rows.channels)) as figure:
-        axes = figure.add_subplot()
-        shown = axes.imshow(np.log10(np.maximum(grid, 1.0)), aspect="auto", cmap="Oranges")
-        axes.set_yticks(range(len(rows.channels)), rows.channels)
-        axes.set_xticks(range(len(logs)), [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
-        for (row, column), value in np.ndenumerate(grid):
-            if np.isfinite(value) and grid.size <= 160:
-                dark = np.log10(max(value, 1)) > 0.6 * np.nanmax(np.log10(np.maximum(grid, 1)))
-                axes.text(
-                    column,
-                    row,
-                    f"{value:.2g}",
-                    ha="center",
-                    va="center",
-                    fontsize=6,
-                    color="white" if dark else "black",
-                )
-        bar = figure.colorbar(shown)
-        bar.set_label("log10 of rms [sd of noise]")
-        axes.set_title("Residual of restarted windows, model as it came")
 
 
 def _short(name: str) -> str:
@@ -224,16 +189,6 @@ def _both_residuals(found: RobotDiagnosis) -> tuple[np.ndarray, np.ndarray]:
     """Residuals before and after, each log predicted from the others where that was done."""
     far = found.shrinkage
     return (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
-
-
-def draw_probabilities(drawn: Drawn, path: Path) -> None:
-    """Probabilities of the verdicts."""
-    ranked = sorted(drawn.body["probabilities"].items(), key=lambda item: item[1])[-BARS:]
-    with canvas(path, height=0.8 + 0.22 * len(ranked)) as figure:
-        axes = figure.add_subplot()
-        axes.barh([n for n, _ in ranked], [p for _, p in ranked], color=BLUE)
-        axes.set_xlim(0, 1)
-        axes.set_xlabel("probability")
 
 
 def draw_before_after(drawn: Drawn, path: Path) -> None:

@@ -156,6 +156,7 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
 
 Body = Mapping[str, Any]
 MOST = 8  # look: rows of a table
+NOTHING = 5e-3  # look: probability, or share of a gap, that is shown as none
 SHARES = (
     "gain",
     "scale",
@@ -203,6 +204,9 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         images=images | {n: None for n in ("gap_signal", "gap_before_after") if n not in images},
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
+        robot=finding.of_robot(body),
+        calibrated=_calibrated(body),
+        numerics=_numerics(body),
         properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
         measured=setting.measured is not None,
         detection=_detection(body),
@@ -269,12 +273,43 @@ def _parameters(effect: Mapping[str, Any], causes: Sequence[str]) -> list[tuple[
     return rows
 
 
+def _calibrated(body: Body) -> list[tuple[str, ...]]:
+    """What was fitted along before any cause was sought: parameter, the model's value, found, interval."""
+    rows = []
+    for name, p in ((body.get("calibrated") or {}).get("parameters") or {}).items():
+        shown = shown_as(p["unit"])
+        found, ends = "not told by these logs", ""
+        if p["mean"] is not None:
+            found = estimate(p["mean"], p["sd"] or 0.0, shown)
+            ends = interval(*p["interval_90"], shown) if p["interval_90"] else ""
+        rows.append((plain_name(name), estimate(p["nominal"], 0.0, shown), found, ends))
+    return rows
+
+
+def _numerics(body: Body) -> str:
+    """What the simulation's own step and the hold of commands are, in a line."""
+    known = {
+        "option.timestep": "the solver's step by {:+.0%}",
+        "option.late": "commands come {:.2f} of a sample late",
+        "option.hold": "commands are held {:.0%} of the way from a step to a line",
+    }
+    said = [
+        text.format(abs(v["after"]) if name == "option.hold" else v["after"])
+        for name, text in known.items()
+        if (v := (body.get("numerics") or {}).get(name)) and abs(v["after"]) > 0.05
+    ]
+    return f"Fitted along, and no cause: {'; '.join(said)}." if said else ""
+
+
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
     """Every effect that was looked at: how probably it acts, what it explains and where it would show."""
     attribution = body.get("attribution") or {}
     rows = []
     for name, chance in sorted(finding.chances(body).items(), key=lambda row: -row[1])[:MOST]:
         own, share = attribution.get(name), ""
+        idle = own and own.get("share") is not None and own["share"] < NOTHING
+        if name not in body["causes"] and (chance < NOTHING or idle):
+            continue  # what explains nothing, however well it would go with the rest
         if own and own.get("share") is not None and own["probability"] >= 0.01:
             ends = between(*(own.get("interval_90") or (None, None)))
             share = percent(own["share"]) + (f" ({ends})" if ends else "")
@@ -298,7 +333,13 @@ def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tup
 
 def _detection(body: Body) -> str:
     p, fineness = body["detection"]["p_value"], body["detection"].get("resolution")
-    text = f"A healthy recording of this rig and task differs from the model as much with {finding.p_text(p)}"
+    of = (
+        "Logs of a robot that is as its model"
+        if finding.of_robot(body)
+        else "A healthy recording of this rig and task"
+    )
+    verb = "differ" if finding.of_robot(body) else "differs"
+    text = f"{of} {verb} from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
     fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"

@@ -63,7 +63,7 @@ def diagnose(
     """
     identified = None
     if isinstance(trials, Identification):
-        aligned, identified = trials.aligned, trials.means
+        aligned, identified = trials.aligned, trials.centres
     else:
         aligned = trials if isinstance(trials, AlignedTrials) else align(trials, task, rig)
     order = aligned.task

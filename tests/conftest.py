@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import jax
 import pytest
 from jaxtyping import install_import_hook
 
-from hmmseg.jaxconfig import configure
+from hmmseg.jaxconfig import configure, keep_programs
 
 configure()
+keep_programs()  # one worker's compiled programs are the others'
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Before any of these packages is imported: annotations are then checked at every call.
-install_import_hook(["hmmseg", "estimation", "simgap"], "typechecker.typechecked")
+# Before any of these is imported: annotations are then checked at every call. That takes three times as long,
+# so only where they state shapes, and everywhere in `make slow`; the rest is for the static checker.
+SHAPED = ["simgap.attribution.problem"]
+EVERYWHERE = ["hmmseg", "estimation", "simgap"]
+install_import_hook(EVERYWHERE if "CHECK_CALLS" in os.environ else SHAPED, "typechecker.typechecked")
 
 
 @pytest.fixture(scope="session")

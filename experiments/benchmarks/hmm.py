@@ -6,8 +6,8 @@ Writes experiments/results/benchmark_hmm.json and docs/figures/benchmarks.png. E
 processor time of several repeats, one thread, libraries in turn. General libraries take a matrix of
 transitions and have no end-state constraint: the last row of what they are given forbids all states but
 the last; dynamax takes trials of one length. With --parallel (for an accelerator) the recursions run by
-associative scans, on wall time, on one stream of 1e6 and of 1e7 samples and on 4,096 trials, into
-benchmark_hmm_parallel.json; no accelerator was at hand when this was written.
+associative scans, on wall time, on one stream of 1e6 and of 1e7 samples and on 4,096 trials, beside
+torchaudio and torbi where they are installed, into benchmark_hmm_parallel.json.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ RESULTS = Path(__file__).parents[1] / "results"
 FIGURE = Path(__file__).parents[2] / "docs" / "figures" / "benchmarks.png"
 STATES = 9
 SHORT = 100  # trials of 200 samples that one program aligns in turn
+ON_HOST, BY_SCAN = "row by row, processor", "associative scan"
+TORCHAUDIO, TORBI = "torchaudio.forced_align", "torbi"
 INSIDE, CALLED, HMMLEARN, DYNAMAX = "inside jit", "as called", "hmmlearn's kernel", "dynamax"
 Functions = dict[str, Callable[[], object]]
 
@@ -143,28 +145,127 @@ def measured(functions: Functions, seconds: float) -> dict:
 
 
 def on_accelerator(scale: int) -> dict:
-    """Wall times of the parallel recursions on the default device."""
-    found: dict = {"device": str(jax.devices()[0])}
+    """Wall times [s] on the default device, log-likelihoods already there, libraries of PyTorch in turn.
+
+    The reference is the recursion row by row on the processor of the same machine.
+    """
+    host = jax.devices("cpu")[0]
+    found: dict = {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "cases": {}}
     for num_samples in (1_000_000 // scale, 10_000_000 // scale):
-        x = jnp.asarray(problem(num_samples))
         chain = hmm.left_to_right([num_samples / STATES] * STATES)
-        best = jax.jit(lambda x, chain=chain: hmm.viterbi(x, chain, parallel=True).starts)
-        found[f"one stream of {num_samples:,}"] = wall(lambda x=x, best=best: best(x).block_until_ready())
-    trials = jnp.asarray(np.stack([problem(200, seed) for seed in range(4096 // scale)]))
-    chain = hmm.left_to_right([22.0] * STATES)
-    batch = jax.jit(jax.vmap(lambda x: hmm.viterbi(x, chain, parallel=True).starts))
-    found[f"{len(trials):,} trials"] = wall(lambda: batch(trials).block_until_ready())
+        x = problem(num_samples)
+        functions = {ON_HOST: aligned(jax.device_put(x, host), chain, False)}
+        functions[BY_SCAN] = aligned(jnp.asarray(x), chain, True)
+        if num_samples <= 1_000_000:  # row by row, PyTorch's start a kernel for every sample
+            functions |= of_torch(x[None], chain)
+        title = f"one stream, {num_samples:,} x {STATES}"
+        found["cases"]["path: " + title] = compared(functions)
+        smoothers = {ON_HOST: smoothed(jax.device_put(x, host), chain, False),
+                     BY_SCAN: smoothed(jnp.asarray(x), chain, True)}  # fmt: skip
+        found["cases"]["posterior: " + title] = compared(smoothers)
+    trials = np.stack([problem(200, seed) for seed in range(4096 // scale)])
+    chain = hmm.left_to_right([200 / STATES] * STATES)
+    functions = {ON_HOST: aligned(jax.device_put(trials, host), chain, False)}
+    functions |= {BY_SCAN: aligned(jnp.asarray(trials), chain, True)}
+    title = f"{len(trials):,} trials, 200 x {STATES}"
+    found["cases"]["path: " + title] = compared(functions | of_torch(trials, chain))
+    smoothers = {ON_HOST: smoothed(jax.device_put(trials, host), chain, False)}
+    smoothers |= {BY_SCAN: smoothed(jnp.asarray(trials), chain, True)}
+    found["cases"]["posterior: " + title] = compared(smoothers)
     return found
 
 
-def wall(function: Callable[[], object], repeats: int = 5) -> float:
-    """Least wall time [s] of a call after one that warms up."""
+def aligned(x: jax.Array, chain: hmm.Chain, parallel: bool) -> Callable[[], np.ndarray]:
+    """A function that aligns one recording, or trials of one length together, where `x` lies."""
+
+    def one(x: jax.Array) -> jax.Array:
+        return hmm.viterbi(x, chain, parallel=parallel).starts
+
+    best = jax.jit(one if x.ndim == 2 else jax.vmap(one))
+    return lambda: np.asarray(best(x))
+
+
+def smoothed(x: jax.Array, chain: hmm.Chain, parallel: bool) -> Callable[[], object]:
+    """A function that smooths one recording, or trials of one length together, where `x` lies."""
+
+    def one(x: jax.Array) -> jax.Array:
+        return hmm.smooth(x, chain, parallel=parallel).smoothed
+
+    soft = jax.jit(one if x.ndim == 2 else jax.vmap(one))
+    return lambda: soft(x).block_until_ready()
+
+
+def of_torch(trials: np.ndarray, chain: hmm.Chain) -> dict[str, Callable[[], object]]:
+    """Functions of torchaudio and torbi, as far as installed, that align trials (num, num_samples, STATES).
+
+    torchaudio.functional.forced_align knows no weights of transitions (the same for every path here, as all
+    advance as often) and takes one trial a call; its blank is made impossible.
+    """
+    functions: dict[str, Callable[[], object]] = {}
+    try:
+        import torch
+        from torchaudio.functional import forced_align
+    except ImportError:
+        return functions
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    table = torch.tensor(trials, dtype=torch.float32, device=device)
+    blank = torch.full((*table.shape[:2], 1), -torch.inf, device=device)
+    emissions = torch.cat([blank, table], 2)
+    target = torch.arange(1, STATES + 1, dtype=torch.int32, device=device)[None]
+    functions[TORCHAUDIO] = lambda: np.stack(
+        [first_of(path) for path in
+         torch.cat([forced_align(each[None], target)[0] - 1 for each in emissions]).cpu().numpy()]
+    )  # fmt: skip
+    try:
+        import torbi
+    except Exception:  # it loads its own kernels, for some versions of PyTorch only
+        return functions
+    start, matrix = general(chain)
+    with np.errstate(divide="ignore"):
+        logs = [torch.tensor(np.maximum(np.log(a), -1e30), dtype=torch.float32, device=device)
+                for a in (start, matrix)]  # fmt: skip
+    forced = torch.tensor(np.maximum(np.stack([ended(x) for x in trials]), -1e30),
+                          dtype=torch.float32, device=device)  # fmt: skip
+    frames = torch.full((len(trials),), trials.shape[1], dtype=torch.int32, device=device)
+    functions[TORBI] = lambda: np.stack(
+        [
+            first_of(path)
+            for path in torbi.decode(forced, frames, logs[1].T.contiguous(), logs[0]).cpu().numpy()
+        ]
+    )
+    return functions
+
+
+def compared(functions: dict[str, Callable[[], object]]) -> dict:
+    """Wall times; in how many trials each gives the first one's starts; how far its posterior is from it."""
+    first = next(iter(functions.values()))()
+    found: dict = {"seconds": {}, "same": {}, "largest difference": {}}
+    for name, function in functions.items():
+        try:
+            found["seconds"][name] = wall(function)
+            again = np.asarray(function())
+            if isinstance(first, np.ndarray):
+                found["same"][name] = float(np.mean((np.atleast_2d(again) == first).all(-1)))
+            else:
+                found["largest difference"][name] = float(np.abs(again - np.asarray(first)).max())
+        except Exception as problem:  # a peer's, of which the rest is no less true
+            found["seconds"][name] = None
+            found["same"][name] = str(problem).splitlines()[0][:200]
+    print(json.dumps(found), flush=True)
+    return found
+
+
+def wall(function: Callable[[], object], repeats: int = 5, seconds: float = 3.0) -> float:
+    """Least wall time [s] of a call after one that warms up, of as many as about `seconds` allow."""
     function()
-    best = np.inf
+    best, spent = np.inf, 0.0
     for _ in range(repeats):
         began = time.perf_counter()
         function()
-        best = min(best, time.perf_counter() - began)
+        best = min(best, took := time.perf_counter() - began)
+        spent += took
+        if spent > seconds:
+            break
     return best
 
 

@@ -71,7 +71,7 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
     """
     start = time.process_time()
     try:
-        found = diagnose(*_read(folder), excluded=excluded(folder))
+        found = diagnose(*read_folder(folder), excluded=excluded(folder))
     except Exception as error:  # whatever it is, the user has no diagnosis
         return {"error": f"{type(error).__name__}: {error}", "seconds": time.process_time() - start}
     seconds = time.process_time() - start
@@ -109,7 +109,7 @@ def _bic(found: Diagnosis) -> str:
     return min(score, key=lambda k: score[k])
 
 
-def _read(folder: Path) -> tuple[AlignedTrials, Actual | None]:
+def read_folder(folder: Path) -> tuple[AlignedTrials, Actual | None]:
     """Aligned trials and, where measured, properties of a folder."""
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     if not isinstance(task, BlockTask):

@@ -182,7 +182,7 @@ def seen(recording: Any, place: np.ndarray, turn: np.ndarray) -> dict[str, np.nd
 
 def product(a: Any, b: Any) -> np.ndarray:
     """Of quaternions (4,) or (4, n)."""
-    from simgap.robot_effects.readout_pose import product
+    from simgap.robot_effects.readouts import product
 
     return product(np.asarray(a, float), np.asarray(b, float))
 

@@ -20,7 +20,7 @@ import pandas as pd
 from experiments.real import collins_arm as arm
 from experiments.real import collins_hand
 from experiments.real.collins_arm import HAND, POSE, product
-from simgap.robot_effects.readout_pose import rotated
+from simgap.robot_effects.readouts import rotated
 
 CUBE = {a: f"cube_{a}" for a in ("x", "y", "z", "qw", "qx", "qy", "qz")}
 SIDE, MASS, FLOOR = 0.075, 0.0884, 0.01  # m, kg, m: of the authors' model

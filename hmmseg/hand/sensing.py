@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.hand.plausibility import Finding, all_changed, check_forces, scale_to_velocity
+from hmmseg.hand.plausibility import Finding, all_changed, check_forces
 from hmmseg.hand.tool import Tool
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
@@ -118,7 +118,6 @@ STEPS = 3  # limit: of one encoder; of more it is the hand that moves so (backla
 SPARSE = 1 / 3  # limit: share of missing readings that is remarked on
 WHOLE = 0.1  # limit: share of rows that are whole, of which fewer are remarked on
 PAUSE, USUAL = 0.6, 5.0  # limit: s, in which a subtask may hide, and usual intervals: a jump of the clock
-DISAGREE = 1.5  # limit: factor by which displacements and velocities may differ in most joints
 CARTESIAN = ("x1", "y1", "x2", "y2")
 
 
@@ -126,14 +125,12 @@ CARTESIAN = ("x1", "y1", "x2", "y2")
 class Fault:
     """Something that a channel shows and no working sensor does.
 
-    `spans`: stretches [s] whose readings are left out; none where it is only remarked on. `blames`: channels
-    whose readings are no measure of anything by it.
+    `spans`: stretches [s] whose readings are left out; none where it is only remarked on.
     """
 
     channel: str
     problem: str
     spans: tuple[tuple[float, float], ...] = ()
-    blames: tuple[str, ...] = ()
 
     @property
     def line(self) -> str:
@@ -165,7 +162,6 @@ def sensed(trial: Trial, rig: Rig) -> Trial:
         channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
     found += _leaps(trial.t, channels, rates)
     trial = replace(trial, channels=channels)
-    found += _disagreeing(trial)
     lines = tuple(f"{trial.file}: {fault.line}" for fault in found)
     return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
 
@@ -336,21 +332,6 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
     inside = there[away]
     channels[name][inside[0] : inside[-1] + 1] = np.nan
     return [Fault(name, f"{problem}, and is left out", ((float(t[inside[0]]), float(t[inside[-1]])),))]
-
-
-def _disagreeing(trial: Trial) -> list[Fault]:
-    """Positions that go farther or less far than their velocities carry them, most of them alike."""
-    pairs = position_pairs(trial)
-    slopes = np.array([scale_to_velocity(trial, *pair) for pair in pairs])
-    known = slopes[np.isfinite(slopes) & (slopes > 0)]
-    if known.size <= len(pairs) / 2 or abs(np.log(np.median(known))) < np.log(DISAGREE):
-        return []
-    places = tuple(position for position, _ in pairs)
-    problem = (
-        f"and the other positions go {1 / np.median(known):.2g} times as far as their velocities carry "
-        "them: one of the two scales is wrong"
-    )
-    return [Fault(places[0], problem, blames=places)]
 
 
 def _missing(trial: Trial) -> list[Fault]:

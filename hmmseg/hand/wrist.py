@@ -656,6 +656,8 @@ def _notes(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
         return ()
     mass = "as given" if gripper.tool_mass else "from free motion"
     text = f"{trial.file}: tool of {tool.mass:.3g} kg on the sensor ({mass})"
+    if tool.mass <= 0:  # readings that go with the pose hide it
+        text = f"{trial.file}: free motion does not tell what the tool on the sensor weighs"
     if gripper.sensor_axes is None and gripper.frame == "sensor":
         up = tool.axes @ direction(gripper.up)
         names = gripper.wrench[:3]

@@ -20,7 +20,7 @@ Rabiner, Proc. IEEE 77(2), 1989; sampling: Scott, J. Am. Stat. Assoc. 97, 2002.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -32,7 +32,7 @@ from hmmseg.jaxconfig import keep_programs
 keep_programs()
 
 NEVER = -jnp.inf  # physics: the logarithm of no weight
-BLOCK = 256  # numerics: rows that are searched together for where a path entered its state
+BLOCK = 256  # numerics: rows that a processor searches together for where a path entered its state
 
 Operation = Callable[[Array, Array], Array]
 
@@ -215,13 +215,13 @@ def solve(a: Array, b: Array, times: Operation, plus: Operation, reverse: bool =
     return lax.associative_scan(join, (a, b), reverse=reverse)[1]
 
 
-def trace_back(table: Array, w: Array, k: Array, n: Array) -> Array:
+def trace_back(table: Array, w: Array, k: Array, n: Array, block: int) -> Array:
     """Starts (num_states,) of the best path that ends in state k, from its table; a tie goes to staying.
 
     Looks for the last entry into each state in blocks of rows, so that the path is no walk from row to row.
     """
     num_timesteps, num_states = table.shape
-    states, size = numbers(num_states), min(BLOCK, num_timesteps - 1)
+    states, size = numbers(num_states), min(block, num_timesteps - 1)
     starts = jnp.where(states > k, n, 0)
     if size == 0:
         return starts
@@ -278,7 +278,8 @@ def best_path(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
         table, _ = forward(x, w, initial, n, jnp.maximum, parallel)
         last = row(table, n - 1) + final
         k = argmax(last)
-        return trace_back(table, w, k, n), last[k]
+        in_blocks, at_once = (partial(trace_back, block=size) for size in (BLOCK, len(x)))
+        return by_device(parallel, in_blocks, at_once, table, w, k, n), last[k]
 
     return one_by_one(core, parallel)(x, w, initial, final, n)
 

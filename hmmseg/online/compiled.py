@@ -6,58 +6,72 @@ each reading, and an empty call with the table of hypotheses takes about as long
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import inspect
+import json
 import os
 import shutil
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hmmseg import densities, levels
-from hmmseg.cache import cache_folder
+from hmmseg.cache import CacheWarning, cache_folder, keep, kept
 from hmmseg.contact import equations
 
-FOLDER, SHARED = cache_folder(), (densities, levels, equations)
-if FOLDER is not None and "numba" not in sys.modules and "NUMBA_CACHE_DIR" not in os.environ:
+HOME, SHARED = cache_folder(), (densities, levels, equations)
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Digests of the programs in a folder, by their paths in it."""
+    paths = [path for path in folder.glob("*/*.nb?") if path.is_file()]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
+def _examine(folder: Path) -> None:
+    """Empty the folder unless the programs that a run left there are as it left them.
+
+    Numba runs what it finds, and what is cut short or garbled ends in errors of its own. What was added
+    since, by a process that runs still, is whole: numba writes a file elsewhere and then moves it.
+    """
+    found, left = _digests(folder), json.loads(kept(folder / "digests.json") or b"{}")
+    if found and (not left or any(found.get(name, digest) != digest for name, digest in left.items())):
+        shutil.rmtree(folder, ignore_errors=True)
+        if left:
+            warnings.warn(f"{folder}: not as it was written; made anew", CacheWarning, stacklevel=2)
+
+
+def _leave(folder: Path) -> None:
+    found = _digests(folder)
+    if found:
+        keep(folder / "digests.json", json.dumps(found).encode())
+
+
+if HOME is not None and "numba" not in sys.modules and "NUMBA_CACHE_DIR" not in os.environ:
     # Numba notices a change of a function's own file alone: a folder for each state of these files.
     sources = [*Path(__file__).parent.glob("*.py"), *(Path(str(m.__file__)) for m in SHARED)]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources)))
-    os.environ["NUMBA_CACHE_DIR"] = str(FOLDER / "numba" / digest.hexdigest()[:16])
+    state = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources))).hexdigest()[:16]
+    folder = HOME / "numba" / state
+    keep(folder / "writable", b"")
+    if kept(folder / "writable") is not None:
+        _examine(folder)
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)
+        atexit.register(_leave, folder)
 
 import numba  # noqa: E402
 from numba.extending import overload  # noqa: E402
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+CACHED = bool(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
 
 
 def compiled(function: Callable) -> Any:
     """`function` compiled at its first call, without the interpreter's lock."""
     function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
-    try:
-        made = numba.njit(function, cache=bool(numba.config.CACHE_DIR), **OPTIONS)  # type: ignore[attr-defined]
-    except (RuntimeError, OSError):  # no folder that could be written to
-        return numba.njit(function, **OPTIONS)
-    cache = getattr(made, "_cache", None)
-    for name in ("load_overload", "save_overload"):
-        if hasattr(cache, name):
-            setattr(cache, name, _or_nothing(getattr(cache, name)))
-    return made
-
-
-def _or_nothing(of_cache: Callable) -> Callable:
-    """What a cache does, or nothing where its files are not as they were written or cannot be."""
-
-    def tried(*args: Any) -> Any:
-        try:
-            return of_cache(*args)
-        except Exception:
-            if FOLDER is not None:  # numba would find them again at every start
-                shutil.rmtree(FOLDER / "numba", ignore_errors=True)
-            return None
-
-    return tried
+    return numba.njit(function, cache=CACHED, **OPTIONS)
 
 
 def _for_numbers(function: Callable) -> None:

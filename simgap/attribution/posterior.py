@@ -7,6 +7,7 @@ that of their Cauchy prior. `search` finds the sets.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -330,10 +331,8 @@ def mode(
     loose = ~held
     covariance = np.zeros_like(matrix)
     covariance[np.ix_(loose, loose)] = np.linalg.inv(matrix[np.ix_(loose, loose)])
-    volume = 0.5 * (loose.sum() - z) * np.log(2 * np.pi)
-    volume -= 0.5 * float(np.linalg.slogdet(matrix[np.ix_(loose, loose)])[1])
-    known = sum(f.gap.candidates[j].evidence for j in taken.effects) + len(taken.effects) * f.log_odds
-    return Model(taken.effects, value + volume + known, x, covariance, energy, precision, held)
+    score = value + _volume(matrix, loose, z) + _known(f, taken.effects)
+    return Model(taken.effects, score, x, covariance, energy, precision, held)
 
 
 def coordinates(f: Forms, effects: tuple[int, ...]) -> dict[int, np.ndarray]:
@@ -344,6 +343,50 @@ def coordinates(f: Forms, effects: tuple[int, ...]) -> dict[int, np.ndarray]:
         out[j] = np.arange(at, at + k)
         at += k
     return out
+
+
+def screened(f: Forms, model: Model, sets: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Scores of sets after one step from where a set counts its groups, all sums over groups shared.
+
+    They rank neighbours of the set; the leading ones are then `fitted`.
+    """
+    z, (groups, size) = f.spectrum.num_nuisances, f.product.shape[:2]
+    summed = (model.precision @ f.product.reshape(groups, -1)).reshape(size, size)
+    base = np.concatenate([np.arange(1 + z), *(f.spectrum.own[j] for j in model.effects)]).astype(int)
+    rows = np.ascontiguousarray(np.moveaxis(f.product[:, base], 1, 0)).reshape(base.size, -1)
+    out = np.zeros(len(sets))
+    for k, effects in enumerate(sets):
+        own = [f.spectrum.own[j] for j in effects]
+        free = np.concatenate([np.arange(1, 1 + z), *(mine[1:] for mine in own)]).astype(int)
+        combined = np.zeros(size)
+        combined[[0, *(mine[0] for mine in own)]] = 1.0, *(-1.0 for _ in own)
+        blocks, (low, high) = coordinates(f, effects), _limits(f, effects, z)
+        prior = np.ones(free.size)
+        for mine in blocks.values():
+            prior[mine] = 1 + mine.size
+        matrix = summed[np.ix_(free, free)] + np.diag(prior)
+        x, held = least(matrix, summed[free] @ combined, low, high)
+        combined[free] = -x
+        new = np.setdiff1d(np.flatnonzero(combined), base)
+        with_base = (combined[base] @ rows).reshape(groups, size)
+        energy = with_base[:, base] @ combined[base] + 2 * with_base[:, new] @ combined[new]
+        energy += f.product[:, new[:, None], new] @ combined[new] @ combined[new]
+        density = f.marginal(effects, np.maximum(energy, 0.0))[0].sum()
+        for mine in blocks.values():
+            matrix[mine, mine] += (1 + mine.size) / (1 + x[mine] @ x[mine]) - prior[mine]
+        out[k] = density + _log_prior(x, z, blocks) + _volume(matrix, ~held, z) + _known(f, effects)
+    return out
+
+
+def _volume(matrix: np.ndarray, loose: np.ndarray, z: int) -> float:
+    """Log volume of a mode with this curvature, but for the nuisances' (2 pi)^(z/2)."""
+    volume = 0.5 * (loose.sum() - z) * np.log(2 * np.pi)
+    return volume - 0.5 * float(np.linalg.slogdet(matrix[np.ix_(loose, loose)])[1])
+
+
+def _known(f: Forms, effects: tuple[int, ...]) -> float:
+    """What speaks for a set beforehand, and in other ways than by its rows [nats]."""
+    return sum(f.gap.candidates[j].evidence for j in effects) + len(effects) * f.log_odds
 
 
 def _limits(f: Forms, effects: tuple[int, ...], z: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,10 +10,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simgap.attribution.posterior import Background, Forms, Model, fitted, mode, quadratic_forms
+from simgap.attribution.posterior import (
+    Background,
+    Forms,
+    Model,
+    fitted,
+    mode,
+    quadratic_forms,
+    screened,
+)
 
-# numerics: steps by which neighbours of a set are screened, how many of them are fitted
-SCREEN, REFINED = 3, 5
+# numerics: how many of a set's neighbours lead after one step, steps that these take, how many are fitted
+SHORT, SCREEN, REFINED = 16, 3, 5
 WINDOW = 12.0  # numerics: nats behind the best set within which a set is kept
 BEAM = 5  # numerics: sets of each size that are extended
 MOST = 6  # numerics: effects of a set at most
@@ -24,7 +32,8 @@ def sought(
 ) -> list[Model]:
     """All sets found within the window of the best, best first; the empty set is always one.
 
-    Neighbours of a set are screened from its mode in a few steps; those that lead are fitted to the end.
+    Neighbours of a set are screened from its mode in one step, leading ones in a few; what leads then is
+    fitted to the end.
     `beam`: how many sets of the window are extended. `named`: of candidates that have a name alone.
     `among`: of these candidates alone.
     """
@@ -44,11 +53,11 @@ def sought(
         for m in todo:
             opened.add(m.effects)
             new = [e for e in _neighbours(f, m.effects, among) if e not in seen and e not in rough]
-            first = sorted(
-                new, key=lambda e: -mode(f, quadratic_forms(f, e), m.precision, steps=SCREEN).score
-            )
-            seen |= {e: fitted(f, e) for e in first[:REFINED]}
-            rough |= set(first[REFINED:])
+            likely = [new[k] for k in np.argsort(-screened(f, m, new), kind="stable")[:SHORT]]
+            found = [mode(f, quadratic_forms(f, e), m.precision, steps=SCREEN) for e in likely]
+            first = sorted(found, key=lambda m: -m.score)[:REFINED]
+            seen |= {m.effects: fitted(f, m.effects) for m in first}
+            rough |= {*new} - {*seen}
     best = max(m.score for m in seen.values())
     kept = [m for m in seen.values() if m.score > best - WINDOW or not m.effects]
     return sorted(kept, key=lambda m: -m.score)
@@ -82,7 +91,7 @@ def weights(models: list[Model]) -> np.ndarray:
 # prior: shares of groups off, besides the usual one: a gap may be in one place alone
 RARE = (0.002, 0.01, 0.03)
 ENOUGH = 4  # cited: twins as extreme after which a p-value is clear (Besag & Clifford's h)
-FEW, SURE = 4, 1e-6  # chosen: twins after which so small a chance is clear, if none is as extreme
+SURE = 1e-6  # chosen: so small a chance is clear, were the next twin twice as far as those before
 
 
 @dataclass(frozen=True)
@@ -128,7 +137,7 @@ def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
     By Markov's inequality healthy recordings exceed s with a probability of exp(-s) at most, times the
     expectation of their Bayes factor: one by theory, estimated on twins. What twins exceed is as likely as
     their ranks say; the larger of both counts. Twins are taken one by one until the answer is clear:
-    ENOUGH exceed the recording's, or FEW leave no doubt.
+    ENOUGH exceed the recording's, or another one twice as far as they are would leave no doubt.
     """
     p = float(np.exp(min(0.0, -value)))
     if twins is None:
@@ -140,7 +149,7 @@ def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
         exceed += twin >= value
         expected = float(np.logaddexp.reduce([*taken, 0.0])) - np.log(len(taken) + 1)
         p = float(np.exp(min(0.0, max(expected, 0.0) - value)))
-        if exceed >= ENOUGH or (len(taken) >= FEW and not exceed and p < SURE):
+        if exceed >= ENOUGH or value - 2 * max(0.0, *taken) > -np.log(SURE):
             break
     if not taken:
         return Detection(value, p, 0.0)

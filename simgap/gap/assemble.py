@@ -223,9 +223,10 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
     return np.stack(out)
 
 
-def on_other(other: Problem, f: Fitted) -> Fitted:
-    """A fit's residual and derivatives at the same coordinates on another recording."""
-    now = evaluated(other, f.effects, f.u, f.columns, [])
+def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:
+    """A fit's residual and derivatives at the same coordinates on another recording; `usual`: those by the
+    properties, where they are known."""
+    now = evaluated(other, f.effects, f.u, f.columns, [], usual)
     return replace(f, residual=now.residual, push=now.push)
 
 
@@ -281,12 +282,12 @@ def gap_of(
     gap = at(given, healthy, fits)
     if not redrawn:
         return gap
-    noise = carried(
-        gap.raw_columns,
-        redrawn,
-        lambda other: at(other, on_other(other, healthy), [on_other(other, f) for f in fits]).raw_columns,
-    )
-    return replace(gap, carried=noise)
+
+    def on(other: Problem) -> np.ndarray:
+        plain = on_other(other, healthy)
+        return at(other, plain, [on_other(other, f, plain.push) for f in fits]).raw_columns
+
+    return replace(gap, carried=carried(gap.raw_columns, redrawn, on))
 
 
 def _measured(given: Problem, healthy: Fitted) -> list[Candidate]:

@@ -12,15 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from simgap.effects.base import gradient, tips
+from simgap.effects.base import gradient, tips, with_load
 from simgap.gap.frame import CHANNELS
-from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, slots
+from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, residual_of, slots
 from simgap.phases import Phase
 
 PAD = 5e-3  # prior: m; half a pad's length: how hard it turns follows from that and its stiffness
 STANCES = (0.6, 1.0)  # prior: shares of a block's width between its feet; what lies between is a mixture
 SWING = 2e-3  # prior: rad; sd of the angle at which a lifted block hangs against how it stood
 LANDING = 4e-5  # prior: m; sd of how far a pad slides in the shock of landing
+BEYOND = 5e-3  # prior: kg; sd of a pad's mass in front of its sensor, whose weight was tared away
 
 
 def with_nuisances(given: Problem) -> Problem:
@@ -29,7 +30,9 @@ def with_nuisances(given: Problem) -> Problem:
     How many there are depends on trials, grips and rig alone: a column of zeros stays, for with a little more
     noise on the recordings it is none (`simgap.gap.assemble`).
     """
-    columns = [*_admitted(given), *_late_rates(given), *_turning(given), *_settling(given)]
+    columns = [
+        *_admitted(given), *_inertial(given), *_late_rates(given), *_turning(given), *_settling(given)
+    ]  # fmt: skip
     return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
 
 
@@ -46,6 +49,20 @@ def _admitted(given: Problem) -> list[np.ndarray]:
                 if sds.get(p.name, 0.0) > 0:
                     out.append(-push[:, [j]] * sds[p.name] / p.sd)
     return out
+
+
+def _inertial(given: Problem) -> list[np.ndarray]:
+    """The column (n, 1) of pads' inertia: a sensor that was tared with its pad on does not show the pad's
+    weight, but what it takes to accelerate it. No effect of the catalogue is that, and no fault."""
+    world = given.constants[0]
+    force = BEYOND * gradient(world.t, tips(world)[1])
+    change = residual_of(given, with_load(world, force)) - residual_of(given, world)
+    return [-change[:, None]]
+
+
+def inertia_column(given: Problem) -> int:
+    """Where the pads' inertia stands among a gap's nuisances, properties first."""
+    return given.num_properties + len(_admitted(given))
 
 
 def _late_rates(given: Problem) -> list[np.ndarray]:

@@ -292,6 +292,13 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
     return np.asarray(_whitened(world, arrays, w, jnp.asarray(given.properties(u)))[0])
 
 
+def residual_of(given: Problem, world: World) -> np.ndarray:
+    """Whitened residuals (n,) of a world that effects were taken out of, properties as expected."""
+    _, arrays, w = given.constants
+    usual = jnp.asarray(given.properties(neutral(given)))
+    return np.asarray(_whitened(world, arrays, w, usual)[0]).ravel()[given.existing]
+
+
 @jax.jit
 def _in_contact(world):
     return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
@@ -334,12 +341,18 @@ class Evaluated(NamedTuple):
 
 
 def evaluated(
-    given: Problem, effects: tuple[str, ...], u: np.ndarray, mine: np.ndarray, blocks: list[np.ndarray]
+    given: Problem,
+    effects: tuple[str, ...],
+    u: np.ndarray,
+    mine: np.ndarray,
+    blocks: list[np.ndarray],
+    usual: np.ndarray | None = None,
 ) -> Evaluated:
     """What a candidate leaves at coordinates u, and its derivatives by the columns `mine`.
 
     They are differences over a small step: in double precision good to STEP of a usual deviation, and cheaper
-    to compile than derivatives.
+    to compile than derivatives. `usual` (n, P): those by the properties, which an effect hardly changes,
+    where they are known already.
     """
     k, on = given.num_properties, jnp.asarray(_on(given, effects))
     recorded, arrays, w = given.constants
@@ -347,20 +360,25 @@ def evaluated(
     def without(u: np.ndarray) -> World:
         return _corrected(recorded, jnp.asarray(u), on, k)
 
-    steps = given.properties(u + STEP * np.eye(k + 1, u.size, -1))
-    found, cost = _whitened_at_each(without(u), arrays, w, jnp.asarray(steps))
-    z, doubts = [np.asarray(found)], [np.asarray(cost)]
-    usual, step = jnp.asarray(steps[0]), u.copy()
+    properties = jnp.asarray(given.properties(u))
+    if usual is None:
+        steps = given.properties(u + STEP * np.eye(k + 1, u.size, -1))
+        every = _whitened_at_each(without(u), arrays, w, jnp.asarray(steps))
+    else:
+        every = [z[None] for z in _whitened(without(u), arrays, w, properties)]
+    found, doubt = (np.asarray(each) for each in every)
+    z, doubts, step = [found.reshape(len(found), -1)], [doubt], u.copy()
     for column in mine[k:]:
         step[column] += STEP
-        residual, doubt = _whitened(without(step), arrays, w, usual)
+        residual, doubt = _whitened(without(step), arrays, w, properties)
         step[column] = u[column]
-        z.append(np.asarray(residual)[None])
+        z.append(np.asarray(residual).reshape(1, -1))
         doubts.append(np.asarray(doubt)[None])
-    z = np.concatenate([each.reshape(len(each), -1)[:, given.existing] for each in z])
-    doubts = np.concatenate(doubts)
+    z, doubts = np.concatenate(z)[:, given.existing], np.concatenate(doubts)
     push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
-    own = u[mine[: given.num_properties]]
+    if usual is not None:
+        push, lift = np.concatenate([usual, push], 1), np.concatenate([np.zeros(k), lift])
+    own = u[mine[:k]]
     cost = 0.5 * float(given.product(z[0], z[0])) + float(doubts[0]) + 0.5 * float(own @ own)
     for block in blocks:
         x = u[mine[block]]
@@ -408,10 +426,11 @@ class Fitted:
     cost: float
 
 
-def fit(given: Problem, start: Start, steps: int = STEPS) -> Fitted:
+def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | None = None) -> Fitted:
     """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
 
-    Properties have normal priors, an effect's parameters together a Cauchy distribution.
+    Properties have normal priors, an effect's parameters together a Cauchy distribution. `usual`: derivatives
+    by the properties, if `evaluated` need not take them anew.
     """
     mine, z = columns_of(given, start.effects), given.num_properties
     low, high = (edge[mine] for edge in limits(given))
@@ -421,7 +440,7 @@ def fit(given: Problem, start: Start, steps: int = STEPS) -> Fitted:
     for key in start.effects:
         blocks.append(np.arange(at, at + len(free_parameters(key))))
         at += blocks[-1].size
-    now, damping = evaluated(given, start.effects, u, mine, blocks), 1e-3
+    now, damping = evaluated(given, start.effects, u, mine, blocks, usual), 1e-3
     for _ in range(steps):
         prior = np.ones(mine.size)
         for block in blocks:
@@ -432,7 +451,7 @@ def fit(given: Problem, start: Start, steps: int = STEPS) -> Fitted:
         step, _ = least(bend + damping * np.diag(np.diag(bend)), -slope, low - u[mine], high - u[mine])
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
-        new = evaluated(given, start.effects, trial, mine, blocks)
+        new = evaluated(given, start.effects, trial, mine, blocks, usual)
         if np.isfinite(new.cost) and new.cost < now.cost:
             gained, u, now, damping = now.cost - new.cost, trial, new, damping / 5
             if gained < CLOSE:

@@ -79,18 +79,18 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
     what swings with it has no size.
     """
-    every = starts(given, key, healthy.u)
-    ranked = sorted(((*_ranked(given, start), start) for start in every), key=lambda r: r[0])
+    every, usual = starts(given, key, healthy.u), healthy.push
+    ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < PROMISING:
-        return fit(given, ranked[0][2], 0)
+        return fit(given, ranked[0][2], 0, usual)
     leading = [start for _, start, _ in ranked[:LEADERS]]
     if len(leading) > 1:
-        screened = sorted((fit(given, s, SCREEN) for s in leading), key=lambda f: f.cost)
+        screened = sorted((fit(given, s, SCREEN, usual) for s in leading), key=lambda f: f.cost)
         leading = [Start((key,), screened[0].u)]
-    return fit(given, leading[0])
+    return fit(given, leading[0], usual=usual)
 
 
-def _ranked(given: Problem, start: Start) -> tuple[float, Start]:
+def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Start]:
     """A start's cost after a linear step of all but its gridded parameters, and the start there."""
     (key,) = start.effects
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
@@ -103,7 +103,7 @@ def _ranked(given: Problem, start: Start) -> tuple[float, Start]:
     columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
     u = start.u.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    now = evaluated(given, start.effects, u, columns, [])
+    now = evaluated(given, start.effects, u, columns, [], usual)
     bend = given.product(now.push, now.push) + np.eye(columns.size)
     pull = -given.product(now.push, now.residual) - u[columns]
     step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
@@ -223,7 +223,7 @@ def search(
     aligned, warnings = _complete(aligned)
     if identified is None:
         tell("identifying properties")
-        identified = identify_aligned(aligned).means
+        identified = identify_aligned(aligned).centres
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, Start((), neutral(given)))
@@ -266,7 +266,7 @@ def _anew(
     if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
         return None
     plain = fit(other, Start((), healthy.u))
-    return again, other, plain, [fit(other, Start(f.effects, f.u)) for f in fits]
+    return again, other, plain, [fit(other, Start(f.effects, f.u), usual=plain.push) for f in fits]
 
 
 def _known(fits: Sequence[Fitted]) -> list[Fitted]:

@@ -106,6 +106,8 @@ WHEN = {
     "slide": "while you push {0}",
     "place": "while you press {0} down",
     "release": "after you let go of {0}",
+    "moving": "while it moves",
+    "still": "while it stands still",
 }
 SAID = 3  # look: places of a gap that a sentence has
 SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
@@ -142,8 +144,9 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
         own = [p for k, p in found.items() if len(body["causes"]) == 1 or k.startswith(f"{cause}.")]
         text = plain_name(cause)
         if len(own) == 1 and _part(cause) is not None and own[0]["unit"] not in ("", "1"):
-            value = estimate(own[0]["mean"], 0.0, (1.0, own[0]["unit"]))
-            text += f" {value} (model: {plain(own[0]['nominal']) if own[0]['nominal'] else 0})"
+            shown, nominal = shown_as(own[0]["unit"]), own[0]["nominal"]
+            value = estimate(own[0]["mean"], 0.0, shown)
+            text += f" {value} (model: {plain(shown[0] * nominal) if nominal else 0})"
         texts.append(text)
     return " and ".join(texts)
 
@@ -176,14 +179,35 @@ def sentences(body: Body) -> list[str]:
         text = (
             f"Recording and model differ beyond noise ({p}); no known cause explains the larger part of it."
         )
-        return [text, *moving(body)]
+        return [text, *doubted(body), *moving(body)]
     chance = probability(body)
     out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
     if verdict == "set":
         others = ", or ".join(plain_name(n) for n in body["indistinguishable"])
         out.append(f"These recordings cannot tell it from {others}.")
+        instead = {c: o for c, o in (body.get("stands_in") or {}).items() if o and len(body["causes"]) > 1}
+        out += [
+            f"In place of {plain_name(cause)} it may be {' or '.join(map(plain_name, others))}."
+            for cause, others in instead.items()
+        ]
     out += [t for t in (explained(body), shrunk(body)) if t]
     return out
+
+
+def doubted(body: Body) -> list[str]:
+    """The best set of causes of an unknown gap, and why it is none, where the body has them."""
+    best = body.get("explanation") or {}
+    doubts = "; ".join(best.get("doubts", ()))
+    if not doubts:
+        return []
+    if not best.get("effects"):
+        return [f"With the model calibrated {doubts}."]
+    return [f"The best that is known, {plain_name('+'.join(best['effects']))}, is doubted: {doubts}."]
+
+
+def of_robot(body: Body) -> bool:
+    """Whether it is a diagnosis of a robot's logs by a model of it."""
+    return "numerics" in body
 
 
 def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
@@ -216,7 +240,8 @@ def shrunk(body: Body) -> str:
         return ""
     ends = between(*(s.get("interval_90") or (None, None)))
     far = percent(s["fraction"]) + (f" ({ends})" if ends else "")
-    return f"With it in the model the gap shrinks by {far} on {s['evaluated_on']}."
+    it = "them" if len(body["causes"]) > 1 else "it"
+    return f"With {it} in the model the gap shrinks by {far} on {s['evaluated_on']}."
 
 
 def remains(body: Body) -> list[str]:
@@ -224,14 +249,22 @@ def remains(body: Body) -> list[str]:
     rest = body.get("remainder")
     if not rest or rest.get("share") is None or body["verdict"] == "none":
         return []
+    noise = rest.get("rms_over_noise")
+    size = f" All that is left is {plain(noise)} times the noise." if noise else ""
     if body["verdict"] == "unknown":
-        return [f"{percent(rest['share'])} of the gap is left when every likely cause has had its part."]
+        return [
+            f"{percent(rest['share'])} of the gap is left when every likely cause has had its part.{size}"
+        ]
     p = rest.get("p_value")
     sure = "" if p is None else f" ({p_text(p)})"
-    if rest["share"] < 0.01 or _noise(rest):
-        return [f"What remains, {percent(rest['share'])} of the gap, does not stand out of the noise{sure}."]
+    if rest["share"] < 0.01 and not _noise(rest):
+        return [f"Under 1 % of the gap remains{sure}, which is more than noise.{size}"]
+    if _noise(rest):
+        return [
+            f"What remains, {percent(rest['share'])} of the gap, does not stand out of the noise{sure}.{size}"
+        ]
     return [
-        f"{percent(rest['share'])} of the gap remains{sure}.",
+        f"{percent(rest['share'])} of the gap remains{sure}.{size}",
         *moving({"where": rest.get("where") or []}, of="what remains"),
     ]
 
@@ -262,7 +295,9 @@ def chances(body: Body) -> dict[str, float]:
     known = {n: a["probability"] for n, a in (body.get("attribution") or {}).items()}
     known |= {n: body["probabilities"].get(n, 0.0) for n in body["effects"] if n not in known}
     whole = probability(body)
-    return known | {n: whole for n in (*body["causes"], "+".join(body["causes"])) if n in known}
+    known |= {n: whole for n in (*body["causes"], "+".join(body["causes"])) if n in known}
+    alone = {n for n in known if "+" not in n}
+    return {n: p for n, p in known.items() if n in alone or not set(n.split("+")) <= alone}
 
 
 def moving(body: Body, of: str = "the gap") -> list[str]:

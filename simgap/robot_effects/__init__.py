@@ -1,41 +1,59 @@
-"""Candidate effects on robots: every module of this package with a function `candidates` adds its own."""
+"""Candidate effects on robots: of their commands, of their read-outs, and parameters of the simulator."""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from functools import cache
-from types import ModuleType
 
 from hmmseg.errors import InputError, nearest
+from simgap.robot_effects import commands, readouts
 from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.simulators.protocol import Parameter, Simulator
 from simgap.simulators.recording import Recording
 
-
-@cache
-def families() -> dict[str, ModuleType]:
-    """Modules that make candidates, by name."""
-    found = {}
-    for info in pkgutil.iter_modules(__path__):
-        module = importlib.import_module(f"{__name__}.{info.name}")
-        if hasattr(module, "candidates"):
-            found[info.name] = module
-    return dict(sorted(found.items()))
+FAMILIES = (commands, readouts)
 
 
 def candidates(setting: Setting) -> dict[str, RobotEffect]:
-    """Every candidate for this simulator and these recordings, by name."""
-    made = [effect for module in families().values() for effect in module.candidates(setting)]
+    """Every candidate for this simulator and these recordings, by name: what commands, the simulator's own
+    parameters and read-outs may have wrong."""
+    made = [*commands.candidates(setting), *of_the_model(setting), *readouts.candidates(setting)]
     return {effect.name: effect for effect in made}
+
+
+def of_the_model(setting: Setting) -> list[RobotEffect]:
+    """One for each effect that the simulator's parameters name; a parameter without one is its own. The
+    solver's own numbers are fitted along: no robot has a step."""
+    groups: dict[str, dict[str, str]] = {}
+    known, numerics = setting.simulator.parameters, getattr(setting.simulator, "numerics", ())
+    for name, parameter in known.items():
+        effect = parameter.effect or name
+        if any(known[n].fitted != parameter.fitted for n in groups.get(effect, {}).values()):
+            raise InputError(
+                f"simulator: effect {effect}", "has parameters fitted and not", "all or none fitted"
+            )
+        short = name.rpartition(".")[2]
+        short = short if short not in groups.get(effect, {}) else name
+        groups.setdefault(effect, {})[short] = name
+    says = getattr(setting.simulator, "says", {})
+    return [
+        RobotEffect(
+            effect,
+            says.get(effect, "the simulator's own parameter"),
+            {short: known[name] for short, name in names.items()},
+            model=names,
+            fitted=all(known[n].fitted or n in numerics for n in names.values()),
+        )
+        for effect, names in groups.items()
+    ]
 
 
 # prior: what a model states and nobody measured may be off by so many usual sizes of what it has wrong
 WIDE = 30.0
+# prior: by unit, factors on what a model states that no robot is off by: beyond is no value at all
+MOST = {"kg": 3.0, "kg m^2": 10.0}
 UNMEASURED = (  # of a model, whatever it states of them
     "joint:*.damping", "joint:*.frictionloss", "joint:*.armature", "actuator:*.gain", "actuator:*.damping",
     "geom:*.stiffness", "command.delay",
@@ -61,7 +79,17 @@ def effects_of(
             if not any(fnmatchcase(n, name) for n in known):
                 where = f"{getattr(getattr(simulator, 'map', None), 'file', 'simulator')}: {what}"
                 raise InputError(where, f"nothing is called {name}", nearest(name, list(known)))
-    return doubted(known, (*named, *uncertain), sds)
+    return doubted({n: _plausible(e) for n, e in known.items()}, (*named, *uncertain), sds)
+
+
+def _plausible(effect: RobotEffect) -> RobotEffect:
+    """The effect with masses and inertias that are stated kept within what a robot can have."""
+    bounded = {}
+    for name, p in effect.parameters.items():
+        if p.nominal > 0 and p.unit in MOST:
+            low, high = p.nominal / MOST[p.unit], p.nominal * MOST[p.unit]
+            bounded[name] = replace(p, low=max(p.low, low), high=min(p.high, high))
+    return replace(effect, parameters={**effect.parameters, **bounded}) if bounded else effect
 
 
 def doubted(
@@ -88,8 +116,8 @@ def words(name: str) -> tuple[str, str] | None:
     """A candidate in plain words, of a channel or a body by its name, and what to check on the robot; None of
     a model's own parameter."""
     kind, where = re.sub(r":.*\.", ".", name), re.search(r":(.*)\.", name)
-    for module in families().values():
-        if kind in (known := getattr(module, "WORDS", {})):
-            called, check = known[kind]
+    for module in FAMILIES:
+        if kind in module.WORDS:
+            called, check = module.WORDS[kind]
             return called + (f" ({where[1]})" if where else ""), check
     return None

@@ -167,6 +167,7 @@ def calibrate(
     *,
     length: float | None = None,
     tell: Progress = silent,
+    judged: bool = True,
 ) -> Calibration:
     """Fit all effects that are `fitted` to logs of a robot.
 
@@ -176,6 +177,7 @@ def calibrate(
         effects: by name; those that are not fitted along are left out.
         length: s of windows that lead near.
         tell: hears what is being done.
+        judged: whether it is fitted anew without each log in turn, to say how far that is from it.
 
     Raises:
         InputError: nothing is uncertain, or the simulator diverges.
@@ -198,7 +200,7 @@ def calibrate(
     tell("what the logs tell")
     names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten)
     tell("held-out logs")
-    before, after = _held_out(whole.moved(found), point, found)
+    before, after = _held_out(whole.moved(found), point, found) if judged else ({}, {})
     return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
 
 

@@ -97,7 +97,7 @@ def _posterior(
     effects, names = found.composed.effects, one.names
     keys = [(n, short) for n in names for short in effects[n].parameters]
     fit = one.sets.fit(names, 0)
-    own = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))[-len(keys) :] if keys else np.zeros(0)
+    own = np.sqrt(np.diag(fit.spread))[-len(keys) :] if keys else np.zeros(0)
     left_out = one.sets.jackknife(names, 0)[:, -len(keys) :] if keys else np.zeros((0, 0))
     if len(left_out) > 2:
         own = np.maximum(own, np.sqrt((len(left_out) - 1) * left_out.var(0)))

@@ -126,7 +126,7 @@ def _calibrated(
     numerics = getattr(simulator, "numerics", ())
     if not any(e.fitted and not any(p in numerics for p in e.model.values()) for e in wide.values()):
         return None
-    return calibrate(simulator, recordings, wide, length=length)
+    return calibrate(simulator, recordings, wide, length=length, judged=False)
 
 
 def _diagnosed(

@@ -64,9 +64,9 @@ def shrinkage(best: Settled, nothing: Settled, composed: Composed, fold: np.ndar
     for number in np.unique(fold):
         inside = fold == number
         windows = [np.unique(rows.window[m]).tolist() for m in (~inside, inside)]
-        test = composed.among(windows[1])
         for one, left in ((nothing, before), (best, after)):
-            point = _fitted(composed.among(windows[0]), one, one.point)
+            train, test = (one.composed.among(w) for w in windows)
+            point = _fitted(train, one, one.point)
             own = [n for n in point if composed.effects[n].by_log]
             point = _fitted(test, one, point, own) if own else point
             left[inside] = rows.observed[inside] - base_at(test, point).rows

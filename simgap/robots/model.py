@@ -26,8 +26,9 @@ class Composed:
 
     `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
     move in contact; None where there is none. `motion`: a number for every log's motion, the same in repeats
-    (see `repeats`); none where no logs are. What the simulator's own numbers do (its step, how it holds
-    commands) is small: it is taken in proportion to them, as it is at the point `about`.
+    (see `repeats`); none where no logs are. How rows move with the simulator's own numbers (its step, how it
+    holds commands) hardly depends on where: that is taken as it is at the point `about`, and what would
+    cost another run (a finer step) is in proportion to it.
     """
 
     simulator: Simulator
@@ -125,15 +126,21 @@ class Composed:
 
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """True channels of every window from these starts; None where a rollout diverged."""
-        there = {n: v for n, v in self.about.items() if self.numeric(n)}
-        plain = {n: v for n, v in point.items() if not self.numeric(n)}
-        out = self._rolled({**plain, **there}, self.windows, starts)
+        out = self._rolled(self._without_dear(point), self.windows, starts)
         for name, theta in point.items():
-            if self.numeric(name):
-                from_there = {**self.effects[name].neutral(), **there.get(name, {})}
+            if self._dear(name):
+                neutral = self.effects[name].neutral()
                 for short, value in theta.items():
-                    out = self.stepped(out, name, short, value - from_there[short])
+                    out = self.stepped(out, name, short, value - neutral[short])
         return out
+
+    def _dear(self, effect: str) -> bool:
+        """Whether an effect of the simulator's own numerics costs another run of every window."""
+        dear = getattr(self.simulator, "dear", getattr(self.simulator, "numerics", ()))
+        return any(p in dear for p in self.effects[effect].model.values())
+
+    def _without_dear(self, point: Point) -> Point:
+        return {n: v for n, v in point.items() if not self._dear(n)}
 
     def stepped(
         self, true: Sequence[Channels | None], name: str, short: str, by: float
@@ -149,10 +156,11 @@ class Composed:
         new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
         if new:
             known = self.effects[name].parameters[short]
-            now = {**self.effects[name].neutral(), **self.about.get(name, {})}
+            about = self._without_dear(self.about)
+            now = {**self.effects[name].neutral(), **about.get(name, {})}
             step = known.sd if now[short] + known.sd <= known.high else -known.sd
-            there = {**self.about, name: {**now, short: now[short] + step}}
-            both = [self._rolled(p, new, [w.start for w in new]) for p in (self.about, there)]
+            there = {**about, name: {**now, short: now[short] + step}}
+            both = [self._rolled(p, new, [w.start for w in new]) for p in (about, there)]
             for w, here, moved in zip(new, *both, strict=True):
                 change = {} if here is None or moved is None else _sum(moved, here, -1.0)
                 found = {n: v / step for n, v in (change or {}).items()}

@@ -32,7 +32,6 @@ from simgap.simulators.protocol import Parameter
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
-RESETS = 3  # numerics: fits of the simulator's own numbers, each about where the last one ended
 USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
 CANCEL = 64  # numerics: pairs that nearly cancel, rolled out along their difference
 LEAVES = (
@@ -51,8 +50,10 @@ MANY = 80  # numerics: candidates of which all pairs are tried
 @dataclass(frozen=True)
 class Settled:
     """A set where it fits best: its point, the gap linear about it in its own effects, the discrepancy that
-    it leaves, its log evidence, and the log density (folds,) of each fold given the others."""
+    it leaves, its log evidence, and the log density (folds,) of each fold given the others; `composed`: with
+    what the simulator's own numbers do as it is there."""
 
+    composed: Composed
     names: Names
     point: Point
     linear: Linear
@@ -86,6 +87,7 @@ class Search:
     known: dict[frozenset[str], Settled] = field(default_factory=dict)
     starts: dict = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
+    columns: dict[str, Moved | None] = field(default_factory=dict)  # of candidates where a search began
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
 
@@ -106,6 +108,7 @@ class Search:
         if best.squares.sum() < LEAVES * best.covariances.floor():
             return best
         tell("from the calibration")
+        self.columns.clear()
         other = self._calibrated()
         if other is not None and other.squares.sum() < best.squares.sum():
             other = self._from(other, tell)
@@ -166,37 +169,36 @@ class Search:
         if any(w.regime == STRIKES for w in self.composed.windows):
             every = linearise(self.composed, point, [*self.along, *self.wanted])
             self.composed = wobbling(self.composed, every)
-        last = -np.inf
-        for _ in range(RESETS if any(map(self.composed.numeric, self.along)) else 1):
-            self.composed, self.known = self.composed.moved(point), {}
-            linear = linearise(self.composed, point, self.along)
-            self.starts = dict(linear.starts)
-            found = self.settled((), point, [covariances(self.composed, linear).whitener()])
-            if found.score < last + BETTER:
-                break
-            point, last = found.point, found.score
-        return found
+        linear = linearise(self.composed.moved(point), point, self.along)
+        self.starts = dict(linear.starts)
+        return self.settled((), point, [covariances(self.composed, linear).whitener()])
 
-    def settled(self, names: Names, begin: Point, scales: Sequence[Whitener]) -> Settled:
-        """A set at its best, from a start: by each of these scales, and once more by what that leaves."""
+    def settled(
+        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
+    ) -> Settled:
+        """A set at its best, from a start: by each of these scales, and once more by what that leaves. What
+        stays further behind a `rival`'s score than that can mend is not gone on with."""
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        found = [self._judged(names, begin)] if frozenset(names) not in self.known else []
+        here, best, key = self.composed.moved(begin), None, frozenset(names)
         for whiten in scales:
-            found.append(self._judged(names, self._moved(begin, whiten)))
-        best = max(found, key=lambda one: one.score)
-        again = self._judged(names, self._moved(best.point, best.whiten))
-        best = max((best, again), key=lambda one: one.score)
-        key = frozenset(names)
+            one = self._judged(here, names, self._moved(here, begin, whiten))
+            best = one if best is None or one.score > best.score else best
+            if best.score < rival - NEAR:
+                break
+        assert best is not None
+        if best.score >= rival - NEAR:
+            there = self.composed.moved(best.point)
+            again = self._judged(there, names, self._moved(there, best.point, best.whiten))
+            best = max((best, again), key=lambda one: one.score)
         if key not in self.known or self.known[key].score < best.score:
             self.known[key] = best
         return self.known[key]
 
-    def _moved(self, begin: Point, whiten: Whitener) -> Point:
-        linear = linearise(self.composed, begin, [], self.starts)
-        return moved_to(self.composed, linear, whiten, begin).point
+    def _moved(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
+        linear = linearise(composed, begin, [], self.starts)
+        return moved_to(composed, linear, whiten, begin).point
 
-    def _judged(self, names: Names, point: Point) -> Settled:
-        composed = self.composed
+    def _judged(self, composed: Composed, names: Names, point: Point) -> Settled:
         linear = linearise(composed, point, [*self.along, *names], self.starts)
         cov = covariances(composed, linear)
         left = np.nan_to_num(linear.residual)
@@ -224,22 +226,24 @@ class Search:
             score += 0.5 * float(np.linalg.slogdet(fit.covariance[np.ix_(inside, inside)])[1])
             score += _prior_constants(sets.size)
             score += len(wide) * ALONE - 1e3 * linear.dropped
-        return Settled(names, point, linear, cov, off, wide, whiten, sets, score)
+        return Settled(composed, names, point, linear, cov, off, wide, whiten, sets, score)
 
     def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener], dict[str, RobotEffect]]:
         """All candidates about a point, by the discrepancy there and less of it.
 
         Those that do not act yet are secants of their usual size: a joint that sticks follows no small
-        change.
+        change. They stay as they were where the search began; those that lead are rolled out anew.
         """
-        composed, point, held = self.composed, at.point, at.names
+        composed, point, held = at.composed, at.point, at.names
         linear = linearise(composed, point, [*self.along, *held], self.starts)
         base, more = base_at(composed, point), {}
         for name in names:
             if name not in held:
-                say(f"what {name} would do")
-                size = np.full(len(composed.effects[name].parameters), USUAL)
-                one = vary(composed, base, linear.starts, name, step=size)
+                if name not in self.columns:
+                    say(f"what {name} would do")
+                    size = np.full(len(composed.effects[name].parameters), USUAL)
+                    self.columns[name] = vary(composed, base, linear.starts, name, step=size)
+                one = self.columns[name]
                 more |= {} if one is None else {name: one}
         linear = linear.with_moved(more)
         cov = covariances(composed, linear)
@@ -251,40 +255,52 @@ class Search:
         if not held:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
-        linear = self._where_they_act(base, linear, sets, held)
-        linear, both = self._together(base, linear, sets, held)
+        linear = self._where_they_act(composed, base, linear, sets, held)
+        linear, both = self._together(composed, base, linear, sets, held)
         effects, every = {**composed.effects, **both}, [*usable, *both]
         return Sets.of(effects, linear, levels, every, self.fold, self.log_odds), levels, effects
 
     def _together(
-        self, base: Base, linear: Linear, sets: Sets, held: Names
+        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
     ) -> tuple[Linear, dict[str, RobotEffect]]:
         """Pairs of candidates that nearly cancel, as one each: in their difference what counts is how each
         bends, which no straight line has. They are rolled out along it."""
         more, both = {}, {}
         for one, other, against in cancelling(sets)[:CANCEL]:
+            name = f"{one}{JOINED}{other}"
             if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
                 continue
-            for sign in (1.0, -1.0):
-                point = dict(base.point)
-                for name, size in ((one, sign), (other, sign * against)):
-                    ((short, p),) = self.composed.effects[name].parameters.items()
-                    point[name] = {short: p.nominal + size * p.sd}
-                    if not p.low <= point[name][short] <= p.high:
-                        break
-                else:
-                    break
-            else:
-                continue
-            rows = base_at(self.composed, point).rows
-            if np.isfinite(rows[np.isfinite(base.rows)]).all():
-                name = f"{one}{JOINED}{other}"
-                more[name] = Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
-                both[name] = RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
+            if name not in self.columns:
                 self.against[name] = against
+                self.columns[name] = self._difference(composed, base, one, other, against)
+            moved = self.columns[name]
+            if moved is not None:
+                more[name] = moved
+                both[name] = RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
         return linear.with_moved(more), both
 
-    def _where_they_act(self, base: Base, linear: Linear, sets: Sets, held: Names) -> Linear:
+    def _difference(
+        self, composed: Composed, base: Base, one: str, other: str, against: float
+    ) -> Moved | None:
+        """How the rows move by a usual size of one and so much `against` it of the other; None where that is
+        not to be had."""
+        for sign in (1.0, -1.0):
+            point = dict(base.point)
+            for name, size in ((one, sign), (other, sign * against)):
+                ((short, p),) = self.composed.effects[name].parameters.items()
+                point[name] = {short: p.nominal + size * p.sd}
+                if not p.low <= point[name][short] <= p.high:
+                    break
+            else:
+                rows = base_at(composed, point).rows
+                if not np.isfinite(rows[np.isfinite(base.rows)]).all():
+                    return None
+                return Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
+        return None
+
+    def _where_they_act(
+        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
+    ) -> Linear:
         """The candidates that come near, rolled out where they fit best: what kinks or saturates is a
         straight line from there only."""
         first: dict[str, dict[str, float]] = {}
@@ -307,7 +323,7 @@ class Search:
                 near = {
                     n: p.nominal + (p.sd if p.nominal + p.sd <= p.high else -p.sd) for n, p in known.items()
                 }
-            one = vary(self.composed, base, linear.starts, name, near)
+            one = vary(composed, base, linear.starts, name, near)
             if one is not None:
                 more[name] = one
         return linear.with_moved(more)
@@ -331,7 +347,8 @@ class Search:
             one = self._apart(near[k], begin)
             if frozenset(one) in self.known or (at is not best and {*best.names} < {*one}):
                 continue
-            found.append(self.settled(one, begin, [levels[i] for i in {level[k], len(levels) - 1}]))
+            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
+            found.append(self.settled(one, begin, scales, best.score))
         good = [s for s in found if self._is_better(s, best)]
         return max(good, key=lambda s: s.score, default=None)
 

@@ -37,11 +37,13 @@ Names = tuple[str, ...]
 @dataclass(frozen=True)
 class Evidence:
     """Of a set by one level: its log evidence, the mode x (m,) of what is fitted along and of its effects'
-    parameters, and the covariance (m, m) there."""
+    parameters, the covariance (m, m) there, 0 of what is at a bound, and the `spread` (m, m): that of as
+    much without bounds, for what lies at one is not certain, nor is what it is traded against."""
 
     score: float
     x: np.ndarray
     covariance: np.ndarray
+    spread: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ class Sets:
 
     def fit(self, names: Names, level: int) -> Evidence:
         """One set's evidence by a level; parameters in the order of `names`."""
-        score, x, covariance = self._evidence([names], level, None, kept=True)
-        return Evidence(float(score[0]), x[0], covariance[0])
+        score, x, covariance, spread = self._evidence([names], level, None, kept=True)
+        return Evidence(float(score[0]), x[0], covariance[0], spread[0])
 
     def held_out(self, names: Names, level: int) -> np.ndarray:
         """Log density (folds,) of each fold given the others."""
@@ -141,8 +143,8 @@ class Sets:
 
     def _evidence(
         self, sets: Sequence[Names], level: int, without: int | None, kept: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Scores (B,), modes (B, m) and covariances (B, m, m) of sets whose effects have as many
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Scores (B,), modes (B, m), covariances and spreads (B, m, m) of sets whose effects have as many
         parameters."""
         used = np.arange(self.gram.shape[1]) != without
         gram, half = self.gram[level][used].sum(0), float(self.half_log_det[level][used].sum())
@@ -188,8 +190,10 @@ class Sets:
             )  # fmt: skip
         score += 0.5 * ((~held[:, a:]).sum(1)) * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(matrix)[1]
         score += len(ordered[0]) * self.log_odds
-        covariance = np.linalg.inv(matrix) * loose if kept else np.zeros((0, 0, 0))
-        return score, x, covariance
+        if not kept:
+            return score, x, np.zeros((0, 0, 0)), np.zeros((0, 0, 0))
+        spread = np.linalg.inv(bend + prior[:, :, None] * eye)
+        return score, x, np.linalg.inv(matrix) * loose, spread
 
 
 def _columns(effect: RobotEffect, moved: Moved) -> tuple[list[np.ndarray], tuple[list[float], list[float]]]:

@@ -49,12 +49,14 @@ class Recording:
 
 
 def read_recording(
-    path: Path, wanted: Iterable[str], times: str = "t", unit: float = 1.0, commands: Collection[str] = ()
-) -> Recording:
+    path: Path, wanted: Iterable[str], times: str = "t", unit: float = 1.0, commands: Collection[str] = (),
+    acts: str | None = None,
+) -> Recording:  # fmt: skip
     """Recording from a file of any kind with the columns that a simulator needs.
 
     `times` is the name of the time column, `unit` its size [s]; `commands` are held from sample to sample.
-    Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept.
+    Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept; a column
+    `acts`, where it is asked for, says when each row's commands were given.
     InputError names the file and the row or column at fault: a column that is missing, a cell that is no
     number, a clock that goes back or cannot be in this unit.
     """
@@ -68,12 +70,13 @@ def read_recording(
             remedy = f'{{column = "{times}", unit = {json.dumps(finding.changes["t"]["unit"])}}}'
             raise InputError(f"{path}: column {times}", finding.problem, f"time = {remedy} in map.toml")
     found = Recording(path.name, trial.t, trial.channels, warnings=trial.warnings)
-    return _on_one_clock(found, commands)
+    return _on_one_clock(found, commands, acts)
 
 
-def _on_one_clock(log: Recording, commands: Collection[str]) -> Recording:
+def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -> Recording:
     """The rows of the column that is read most often; slower ones are interpolated there as topics of a log
-    are, and commands count as they are held on average until the next row."""
+    are, and commands count as they are held on average until the next row; or, where all are given together
+    and once a row at most, as they are, from when they were given."""
     rows = {name: np.flatnonzero(np.isfinite(values)) for name, values in log.columns.items()}
     if all(np.median(np.diff(each)) <= 1 for each in rows.values() if each.size > 1):
         return log
@@ -82,10 +85,18 @@ def _on_one_clock(log: Recording, commands: Collection[str]) -> Recording:
         return log
     t = log.t[kept]
     columns = {}
+    given = [rows[name] for name in log.columns if name in commands]
+    if acts is not None and given and all(np.array_equal(each, given[0]) for each in given):
+        latest = np.searchsorted(given[0], kept, side="right") - 1
+        if np.diff(latest).max(initial=0) <= 1:
+            columns[acts] = np.where(latest >= 0, log.t[given[0][np.maximum(latest, 0)]], t)
     for name, values in log.columns.items():
         seen = rows[name]
         if name not in commands:
             columns[name] = interpolated(t, log.t[seen], values[seen])[0]
+            continue
+        if acts in columns:
+            columns[name] = values[seen[np.maximum(latest, 0)]]
             continue
         until = np.append(t, 2 * t[-1] - t[-2])
         steady = held(values)

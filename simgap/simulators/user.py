@@ -28,7 +28,7 @@ from simgap.simulators.recording import Recording
 
 PATIENCE = 300.0  # limit: s that one call may take, unless the simulator states a `timeout` of its own
 LONGEST = 1e6  # limit: s; more is a slip of the pen
-BY_LOG = ("shift", "offset")  # what each log may have of its own (`simgap.robot_effects.by_log`)
+BY_LOG = ("shift", "offset")  # what each log may have of its own (`simgap.robot_effects.readouts`)
 
 
 @dataclass(frozen=True)

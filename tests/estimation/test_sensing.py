@@ -11,8 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from fault_scene import FOLDER
+from scipy.stats import norm
 
 from estimation import identify
+from estimation.consistency import SIZE, WELL_MADE, WRONG, Tie
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.sensing import sensed
 from hmmseg.io.formats import read_table
@@ -101,6 +103,8 @@ ALTERED = {
     "ten times": (scaled(10.0, *FORCES), "forces are read 8.* times too large"),
     "half": (scaled(0.5, *FORCES), "forces are read 2 times too small"),
     "one finger": (scaled(2.0, "fx2", "fy2"), "fx1 and -fx2 press what is carried"),
+    "one vertical": (scaled(2.0, "fy1"), "what fy1 takes of a carried weight fy2 gives up 0.5.*-fold"),
+    "angles": (scaled(1.1, "q11", "q12", "q21", "q22"), "distance changes by 2. cm a metre .* vertically"),
     "velocities": (scaled(2.0, *RATES), "0.5 times as far as their velocities"),
     "every other row": (emptied, "every channel lacks 50% of its readings"),
     "holes": (holed, "every row without some reading"),
@@ -116,6 +120,7 @@ QUICK = (
     "saturated",
     "twice",
     "one finger",
+    "one vertical",
     "clock",
 )
 
@@ -127,7 +132,10 @@ def test_what_a_sensor_cannot_have_read_is_named_and_no_number_hangs_on_it(name)
     alter, named = ALTERED[name]
     columns = {key: values.copy() for key, values in TABLE.items()}
     alter(columns)
-    found = identify(columns, FOLDER / "task.toml", FOLDER / "rig.toml")
+    assert_no_number_misleads(identify(columns, FOLDER / "task.toml", FOLDER / "rig.toml"), named)
+
+
+def assert_no_number_misleads(found, named):
     said = [*found.aligned.trials[0].trial.warnings, *found.warnings]
     assert any(re.search(named, line) for line in said), said
     for obj, props in TRUTH.items():
@@ -137,6 +145,48 @@ def test_what_a_sensor_cannot_have_read_is_named_and_no_number_hangs_on_it(name)
                 assert low <= props[prop] <= high, (obj, prop, low, high)
             else:
                 assert found.reasons[f"{obj}.{prop}"]
+
+
+def hand(wider=0.0, higher=0.0, **links):
+    def alter(rig):
+        for name, finger in rig["fingers"].items():
+            finger["links"] = [links.get(f"links{name}", 1.0) * length for length in finger["links"]]
+            finger["base"][1] += higher
+        rig["fingers"]["2"]["base"][0] += wider
+
+    return alter
+
+
+RIGS = {
+    "wider by 5 cm": (hand(wider=0.05), "comes 3. mm within a block that stands"),
+    "links too long": (hand(links1=1.1, links2=1.1), "is held .* mm beneath its bottom"),
+    "links too short": (hand(links1=0.9, links2=0.9), "is held .* mm above its top"),
+    "one finger's links": (hand(links1=1.1), "distance changes by 9.5 cm a metre"),
+}
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_that_is_no_such_hand_is_named_and_no_number_hangs_on_it(name):
+    rig, (alter, named) = tomllib.loads((FOLDER / "rig.toml").read_text()), RIGS[name]
+    alter(rig)
+    assert_no_number_misleads(identify(TABLE, FOLDER / "task.toml", rig), named)
+
+
+@pytest.mark.parametrize("kind", ("balance", "room"))
+def test_a_tie_is_as_sure_as_bayes_rule_over_its_two_hypotheses_makes_it(kind):
+    value, error = 3.0 * WELL_MADE[kind], 0.5 * WELL_MADE[kind]
+    sds = np.hypot(error, WELL_MADE[kind]), np.hypot(np.hypot(error, WELL_MADE[kind]), SIZE[kind])
+    healthy, wrong = (norm(0, sd).pdf(value) for sd in sds)
+    expected = WRONG * wrong / (WRONG * wrong + (1 - WRONG) * healthy)
+    assert Tie(kind, value, error, (), "").probability == pytest.approx(expected)
+
+
+def test_what_nothing_contradicts_is_said():
+    rig = tomllib.loads((FOLDER / "rig.toml").read_text())
+    hand(wider=-0.01)(rig)
+    found = identify(TABLE, FOLDER / "task.toml", rig)
+    assert found.of("block1", "width").mean() == pytest.approx(TRUTH["block1"]["width"] - 0.01, abs=1e-4)
+    assert any("bases that stand closer than it says would not show" in note for note in found.notes)
 
 
 def test_a_width_below_nothing_is_none_and_the_weights_stay():

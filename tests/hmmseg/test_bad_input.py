@@ -141,9 +141,9 @@ def read_task_of(sequence):
 
 def test_damaged_files_give_a_result_or_a_line():
     """A subset of `make fuzz`."""
-    found = run(cases=1200, seed=int.from_bytes(b"ci", "big"))
+    found = run(cases=600, seed=int.from_bytes(b"ci", "big"))
     assert not found["failures"], found["failures"][0]["trace"]
-    assert found["outcomes"]["refused"] > 100
+    assert found["outcomes"]["refused"] > 50
 
 
 def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):

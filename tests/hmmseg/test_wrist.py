@@ -181,6 +181,7 @@ def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):
     trials = [read_trial(columns, wrist_rig(setup, **said)) for said in ({}, {"reaction": False})]
     for trial in trials:
         assert any("go against the hand's own acceleration" in each for each in trial.warnings)
+        assert not any("tool of -" in note for note in trial.notes)
     np.testing.assert_allclose(trials[0].channels["fy1"], trials[1].channels["fy1"])
     with pytest.raises(InputError, match=r"pulls up .*expected reaction = false under"):
         read_trial(columns, wrist_rig(setup, reaction=True))

@@ -18,7 +18,7 @@ from simgap.report.finding import (
     settles,
     to_do,
 )
-from simgap.robot_effects import families
+from simgap.robot_effects import FAMILIES
 from simgap.simulators.mjcf.settable import KNOWN
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
@@ -65,8 +65,8 @@ def test_numbers_have_one_unit_and_no_exponent():
 def test_every_effect_has_a_plain_name_and_a_check():
     for name, effect in catalogue().items():
         assert effect.called and checks([name]) == [effect.check] and effect.check.endswith(".")
-    for family in families().values():
-        for kind, (called, check) in getattr(family, "WORDS", {}).items():
+    for family in FAMILIES:
+        for kind, (called, check) in family.WORDS.items():
             whole = kind.replace(".", ":arm x.") if kind.split(".")[0] in ("readout", "pose") else kind
             assert plain_name(whole) == called + (" (arm x)" if whole != kind else "")
             assert checks([whole]) == [check] and check.endswith(".")
@@ -174,3 +174,49 @@ def test_every_verdict_has_a_page(verdict):
         assert text.count(">61 %<") == 1 and ">61<" in text  # heat map and table, the same number
     if causes:
         assert "3985 ± 180 N/m" in text and "1.6200 cm" in text
+
+
+ROBOT = {
+    "verdict": "unknown", "causes": [], "indistinguishable": [], "effects": {}, "numerics": {},
+    "detection": {"p_value": 0.0, "resolution": 0.0}, "next_experiment": None, "shrinkage": None,
+    "probabilities": {"none": 0.0, "unknown": 1.0}, "remainder": {"share": 1.0, "rms_over_noise": 11.5},
+    "explanation": {"effects": ["joint:slew.armature"], "doubts": ["11.5 times the noise is left"]},
+    "attribution": {"joint:slew.armature": {"probability": 0.68, "share": 0.0, "interval_90": [0.0, 0.0]}},
+    "where": [{"trial": "a.csv", "channel": "q1", "subtask": "moving", "band": [0.0, 50.0], "share": 1.0,
+               "z": 9.0}],
+}  # fmt: skip
+
+
+def test_an_unknown_gap_of_a_robot_names_the_best_and_why_it_is_none():
+    said = " ".join([*sentences(ROBOT), *remains(ROBOT)])
+    assert "slew: rotor inertia, is doubted: 11.5 times the noise is left" in said
+    assert "while it moves: 100 % of the gap" in said
+    shown = page(ROBOT, Setting(["a.csv"], ["moving"]), lambda path: None)
+    assert "None explains a hundredth of the gap" in shown and "68 %" not in shown
+    assert "Logs of a robot that is as its model differ" in shown
+
+
+def test_causes_that_act_together_are_listed_once_in_units_that_read_well():
+    found = {"body:arm.payload": (0.0894, 0.0, "kg"), "joint:slew.frictionloss": (0.451, 0.05, "N m")}
+    parameters = {
+        f"{n}.{n.rpartition('.')[2]}": {
+            "mean": m, "sd": 0.001, "interval_90": [m, m], "unit": unit, "nominal": nominal
+        }
+        for n, (m, nominal, unit) in found.items()
+    }  # fmt: skip
+    pair, act = "+".join(found), {"probability": 0.5, "share": 0.5, "interval_90": None}
+    body = ROBOT | {
+        "verdict": "named", "causes": list(found), "effects": {pair: {"parameters": parameters}},
+        "probabilities": {pair: 0.99}, "attribution": dict.fromkeys(found, act), "explanation": None,
+    }  # fmt: skip
+    assert headline(body) == "Arm: a load 89.4 g (model: 0) and slew: dry friction 0.451 N m (model: 0.0500)"
+    assert chances(body) == dict.fromkeys(found, 0.99)
+
+
+def test_what_remains_is_called_noise_by_its_p_value_alone():
+    left = {"remainder": {"share": 0.003, "p_value": 1e-15, "where": []}}
+    assert remains(body("named", ["table_compliance"], **left)) == [
+        "Under 1 % of the gap remains (p = 1e-15), which is more than noise."
+    ]
+    left["remainder"]["p_value"] = 0.6
+    assert "does not stand out of the noise (p = 0.60)" in remains(body("named", ["cable_force"], **left))[0]

@@ -135,6 +135,7 @@ def test_the_papers_method_has_no_evidence_and_its_own_formulas(tmp_path):
     assert found["properties"]["block1"]["width"]["mean"] < 0.0185  # short by what the pads give
 
 
+@pytest.mark.slow  # `make wheel` runs it as well
 def test_demo_runs_on_the_packages_own_recordings(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = document("demo", out=tmp_path / "out.json")

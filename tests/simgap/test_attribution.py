@@ -11,7 +11,7 @@ from planted_gaps import gap_of, linear, rows_of
 
 from simgap.attribution.attribute import _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import Heldout
-from simgap.attribution.posterior import Background, fitted, forms
+from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import Candidate, Gap, cosines
 from simgap.attribution.search import detected, leniently, sought, statistic, weights
 from simgap.attribution.verdict import known, significant
@@ -95,6 +95,15 @@ def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
     assert detected(1e3).p_value == 0.0 and detected(-2.0).p_value == 1.0
 
 
+def test_neighbours_are_screened_by_what_one_step_of_each_gives():
+    f = forms(gap_of({0: 3.0, 2: -2.0}))
+    m = fitted(f, (0,))
+    sets = [(), (0, 2), (1,), (1, 3), (0, 1, 2)]
+    each = [mode(f, quadratic_forms(f, e), m.precision, steps=1).score for e in sets]
+    # but for the volume of the mode, by how groups count before the step
+    np.testing.assert_allclose(screened(f, m, sets), each, atol=0.2)
+
+
 def test_twins_are_taken_until_the_answer_is_clear():
     taken = []
 
@@ -107,7 +116,8 @@ def test_twins_are_taken_until_the_answer_is_clear():
     assert len(taken) == 8 and found.p_value >= 0.5
     rare = detected(5.0, [0.0] * 19)
     assert rare.resolution == pytest.approx(1 / 20) and rare.p_value == pytest.approx(np.exp(-5))
-    assert detected(50.0, twins()).resolution == pytest.approx(1 / 5)  # a few leave no doubt
+    assert detected(50.0, twins()).resolution == pytest.approx(1 / 2)  # the first leaves no doubt
+    assert detected(50.0, [20.0] * 6).resolution == pytest.approx(1 / 7)  # as large ones do
 
 
 def test_twins_tell_by_how_much_the_bayes_factor_is_off():

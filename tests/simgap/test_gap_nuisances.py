@@ -16,13 +16,14 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
-from simgap.effects.base import tips
+from simgap.effects.base import gradient, tips
 from simgap.gap.assemble import _density, _likeliest, with_noise
 from simgap.gap.assemble import _turning as turned_variance
 from simgap.gap.frame import CHANNELS, build
-from simgap.gap.nuisances import _late_rates, _settling, _turning
+from simgap.gap.nuisances import BEYOND, _inertial, _late_rates, _settling, _turning
 from simgap.gap.problem import Nuisances, problem
 from simgap.gap.residuals import residuals
+from simgap.phases import Phase
 
 
 def test_products_are_those_of_the_marginal_density():
@@ -136,3 +137,20 @@ def test_angles_in_doubt_widen_positions_by_what_they_move(given):
     share = (more[firm] / expected[firm])[:, [0, 1, 2, 3]]
     assert np.median(share, axis=0) == pytest.approx(np.ones(4), rel=0.05)
     assert (share < 1.01).all() and (wide >= sure - 1e-12).all()
+
+
+@double_precision
+def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_no_weight(given):
+    a, (column,) = given.frame.arrays, _inertial(given)
+    there, free = given.whitening.weight > 0, a.phase[..., Phase.FREE] > 0
+    world = jax.tree.map(jnp.asarray, given.frame.world)
+    acceleration = np.asarray(gradient(world.t, tips(world)[1]))
+    net = BEYOND * (acceleration[..., :2] + acceleration[..., 2:])
+    out = np.zeros(there.shape)
+    out[there] = column[:, 0]
+    for k, name in enumerate(("fx", "fy")):
+        c = CHANNELS.index(name)
+        mine = there[..., c] & free
+        assert mine.sum() > 100
+        expected = (net[..., k] * given.whitening.weight[..., c])[mine]
+        np.testing.assert_allclose(out[..., c][mine], expected, atol=0.02 * np.abs(expected).max())

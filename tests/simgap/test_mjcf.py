@@ -131,6 +131,62 @@ def test_degrees_where_radians_are_declared_are_named(files, tmp_path):
         found.read(path)
 
 
+def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, tmp_path):
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    servo = '<position name="m" joint="pivot" kp="9" ctrlrange="-0.5 0.5" ctrllimited="true"/>'
+    goals = MAP.replace('unit = "Nm"', 'unit = "rad"')
+    found = load_mjcf(*files(XML.replace('<motor name="m" joint="pivot"/>', servo), goals))
+    t, path = np.arange(0, 2, 0.01), tmp_path / "log.csv"
+
+    def read(angle, goal):
+        rows = zip(t, angle, goal, strict=True)
+        path.write_text("t,q,u\n" + "".join(f"{a:.3f},{b:.6f},{c:.6f}\n" for a, b, c in rows))
+        return found.read(path)
+
+    with pytest.raises(InputError, match=r"column u: .* of column q; expected unit = .deg. of u"):
+        read(np.sin(t), np.degrees(np.sin(t - 0.02)))
+    (clipped,) = read(np.sin(t), np.sin(t)).warnings
+    share = f"({100 * np.mean(np.sin(t) > 0.5):.2g} %"
+    assert "beyond its actuator's ctrlrange -0.5 to 0.5" in clipped and share in clipped
+    log = read((2.0 * t + np.pi) % (2 * np.pi) - np.pi, 0.0 * t)
+    assert "jumps by whole turns" in log.warnings[0]
+    np.testing.assert_allclose(log["q"], 2.0 * t, atol=1e-5)
+
+
+def test_delayed_commands_step_when_they_are_carried_out(files):
+    """The mean over each solver's step of what was commanded 12.3 ms before, by brute force."""
+    from simgap.robot_effects import effects_of
+    from simgap.simulators.mjcf.runs import _carried_out, _commanded
+    from simgap.simulators.mjcf.signals import Held
+
+    found, log, effects = loaded(files)
+    rng = np.random.default_rng(3)
+    t = log.t + 1e-3 * rng.uniform(-1, 1, log.t.size)
+    log = Recording("a.csv", t, {"q": log["q"], "u": rng.normal(size=t.size)})
+    late = effects_of(found.simulator, [log], effects)["command.delay"].command
+    assert late is not None
+    window = late(log, {"delay": 0.0123}).window(40, 80)
+    times = np.arange(0, float(window.t[-1] - window.t[0]), 1e-3)
+    since = np.array([window.t - window.t[0]])
+    held = _carried_out([window], Held(since, times), 0.0)
+    acted = held(np.array([_commanded(window, "u")]))[0]
+    fine = window.t[0] + times[:, None] + 1e-3 * (np.arange(200) + 0.5) / 200
+    asked = log["u"][np.searchsorted(log.t, fine - 0.0123, side="right") - 1].mean(1)
+    np.testing.assert_allclose(acted, asked, atol=0.02)
+    line = held(np.array([_commanded(window, "u")]), 1.0)[0]
+    asked = np.interp(fine - 0.0123, log.t, log["u"]).mean(1)
+    np.testing.assert_allclose(line, asked, atol=0.02)
+
+
+def test_a_mass_stays_within_what_a_robot_can_have(files):
+    found, log, effects = loaded(files)
+    from simgap.robot_effects import effects_of
+
+    mass = effects_of(found.simulator, [log], effects)["body:bob.mass"].parameters["mass"]
+    assert (mass.low, mass.high) == pytest.approx((0.5 / 3, 1.5))
+
+
 def test_a_patch_touches_only_what_changes(files):
     from simgap.simulators.mjcf.patch import attribute_set, option_set
 

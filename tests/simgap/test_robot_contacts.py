@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simgap.robot_effects import by_log, readout_pose
+from simgap.robot_effects import readouts
 from simgap.robot_effects.base import Setting
 from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import Channel, Parameter
@@ -45,7 +45,7 @@ def tumbling(name: str = "log.csv") -> Recording:
 )
 def test_what_a_pose_is_read_through_is_undone(name, theta):
     log = tumbling()
-    effects = {e.name: e for e in readout_pose.candidates(Setting(Posed(), [log]))}
+    effects = {e.name: e for e in readouts.candidates(Setting(Posed(), [log]))}
     read = log.with_columns(effects[name].alter(log, log.columns, theta))
     assert max(np.abs(read[a] - log[a]).max() for a in POSE) > 1e-3
     back = effects[name].restore(read, theta)
@@ -58,13 +58,13 @@ def test_what_a_pose_is_read_through_is_undone(name, theta):
 def test_an_offset_turns_with_the_body():
     """About the vertical by half a turn, an arm along x points back."""
     turn = np.array([[np.cos(np.pi / 2)], [0.0], [0.0], [np.sin(np.pi / 2)]])
-    assert np.allclose(readout_pose.rotated(turn, np.array([0.1, 0.0, 0.2]))[:, 0], [-0.1, 0.0, 0.2])
+    assert np.allclose(readouts.rotated(turn, np.array([0.1, 0.0, 0.2]))[:, 0], [-0.1, 0.0, 0.2])
 
 
 def test_each_log_has_its_own_shift_and_no_component_of_a_turn_a_gain():
     logs = [tumbling("a.csv"), tumbling("b.csv")]
     setting = Setting(Posed(), logs)
-    shift, offset = by_log.candidates(setting)
+    shift, offset = readouts.by_log(setting)
     assert list(shift.parameters) == ["a.csv", "b.csv"] and shift.fitted and shift.by_log
     assert list(offset.parameters)[:3] == ["a.csv.x", "a.csv.y", "a.csv.z"]
     late = shift.alter(logs[1], logs[1].columns, {"a.csv": 0.3, "b.csv": 0.1})
@@ -136,7 +136,7 @@ def test_flight_and_contact_are_told_apart(dropped):
 
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     """Windows that admit that each impact differs by a usual size: their weight on the scale is small."""
-    from simgap.robot_effects.readout_scale import candidates
+    from simgap.robot_effects.readouts import scale as candidates
     from simgap.robots.linear import linearise, wobbling
     from simgap.robots.model import Composed
     from simgap.robots.whiten import CONTACTS, Discrepancy, covariances

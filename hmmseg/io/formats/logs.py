@@ -124,7 +124,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
             raise InputError(f"{path}: topic {stream.topic}", f"cannot be decoded ({stream.reason})",
                              "messages of ROS with a known type, or JSON")  # fmt: skip
         which = f"{stream.failed} messages of topic" if stream.values else "topic"
-        notes.append(f"{path}: {which} {stream.topic} cannot be decoded ({stream.reason}) and left out")
+        notes.append(f"{path}: {which} {stream.topic} cannot be decoded ({stream.reason}) and is left out")
     return joined(str(path), list(streams.values()), wanted, notes)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,19 +35,24 @@ class Loaded:
         columns = self.map.columns
         raw = read_recording(
             path, columns, self.map.time, self.map.time_factor,
-            [name for name, mapped in columns.items() if mapped.kind == "command"],
+            [name for name, mapped in columns.items() if mapped.kind == "command"], self.simulator.acts,
         )  # fmt: skip
         values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
+        told = list(raw.warnings)
         for name, mapped in columns.items():
             if mapped.kind == "command":  # a drive holds it until the next
                 values[name] = held(values[name])
             elif mapped.thing == "joint" and mapped.kind == "position" and self.turns(mapped.name):
-                values[name] = unwrapped(values[name])
+                wrapped, values[name] = values[name], unwrapped(values[name])
+                if not np.array_equal(wrapped, values[name], equal_nan=True):
+                    told.append(f"{path}: column {name} jumps by whole turns, which were taken out")
         log = raw.with_columns(values)
         for pose in self.simulator.free.values():
             log = continuous(log, [pose[a] for a in ("qw", "qx", "qy", "qz")])
         _check_ranges(self.simulator.model, columns, log, str(path))
-        return log
+        _check_goals(self.simulator, log, str(path))
+        told += _clipped(self.simulator, log, str(path))
+        return replace(log, warnings=tuple(told))
 
     def turns(self, joint: str) -> bool:
         """Whether a joint is a hinge, whose angle may be recorded with jumps by whole turns."""
@@ -293,6 +298,50 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
             f"{low:.4g} to {high:.4g} {unit}, beyond joint {column.name}'s {reach[0]:.4g} to {reach[1]:.4g}",
             guess,
         )
+
+
+def _check_goals(simulator: Any, log: Recording, file: str) -> None:
+    """InputError where a servo's goals are its joint's angles in other units, never guessed."""
+    from simgap.simulators.mjcf.engine import mujoco
+
+    model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
+    for column, a in simulator.driven.items():
+        joint = int(model.actuator_trnid[a, 0])
+        servo = model.actuator_biasprm[a, 1] < 0 and joint in seen
+        if not servo or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_HINGE):
+            continue
+        goal, angle = log[column], log[seen[joint]]
+        both = np.isfinite(goal) & np.isfinite(angle)
+        if not both.any() or not np.any(angle[both]):
+            continue
+        times = float(goal[both] @ angle[both] / (angle[both] @ angle[both]))
+        for factor, unit in ((math.degrees(1), "deg"), (math.radians(1), "rad")):
+            if abs(math.log(max(times, 1e-9) / factor)) < SAME:
+                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad"
+                there = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad"
+                found = f"{ends}, and its joint is at {there} of column {seen[joint]}"
+                raise InputError(
+                    f"{file}: column {column}", found, f'unit = "{unit}" of {column} in the map?'
+                )
+
+
+SAME = math.log(2.0)  # limit: a servo that follows its goals at less or more than this factor follows none
+
+
+def _clipped(simulator: Any, log: Recording, file: str) -> list[str]:
+    """What to tell of commands that the model clips."""
+    model, out = simulator.model, []
+    for column, a in simulator.driven.items():
+        if model.actuator_ctrllimited[a]:
+            low, high = (float(v) for v in model.actuator_ctrlrange[a])
+            share = float(np.mean((log[column] < low) | (log[column] > high)))
+            if share > 0:
+                ends = f"{np.nanmin(log[column]):.4g} to {np.nanmax(log[column]):.4g}"
+                out.append(
+                    f"{file}: column {column} goes from {ends}, beyond its actuator's ctrlrange {low:.4g} to "
+                    f"{high:.4g}, where the model clips it ({100 * share:.2g} % of samples)"
+                )
+    return out
 
 
 def continuous(log: Recording, turn: Sequence[str]) -> Recording:

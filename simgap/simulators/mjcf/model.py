@@ -16,7 +16,7 @@ from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
 from simgap.simulators.mjcf.play import Played
-from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
+from simgap.simulators.mjcf.runs import ACTS, HOLD, LATE, Runs
 from simgap.simulators.mjcf.setting import Setting
 from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
@@ -50,6 +50,7 @@ class MjcfSimulator:
     played: Mapping[str, Played] = field(default_factory=dict)  # by setting
     spec: Any = None  # what the model was compiled from
     restarts: bool = True
+    acts: str = ACTS
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
     _runs: dict[str, np.ndarray] = field(default_factory=dict)
     _touched: dict = field(default_factory=dict, repr=False)
@@ -150,6 +151,11 @@ class MjcfSimulator:
     def numerics(self) -> frozenset[str]:
         """Parameters of the simulation, not of the robot."""
         return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n in (HOLD, LATE))
+
+    @property
+    def dear(self) -> frozenset[str]:
+        """Those of them that cost a second run, of steps as fine as they are to be had."""
+        return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
 
     @property
     def uncertain(self) -> tuple[str, ...]:

@@ -19,6 +19,9 @@ from simgap.simulators.recording import Recording
 APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
 HOLD = "option.hold"  # the setting of how commands are held between samples
 LATE = "option.late"  # the setting of how late within a step they come
+# A column of the times [s] from which on each row's commands are carried out; with "next" behind it when
+# those that follow are, and with a command's name what these are.
+ACTS = "acts:"
 BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
 KEPT = 1e8  # limit: bytes of the latest runs that are kept
 FAR = 1e9  # numerics: what reads beyond it has diverged
@@ -67,9 +70,11 @@ class Runs:
         control = np.zeros((len(logs), times.size, width))
         line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
         for (mine, own, applied), side in zip(parts, sides, strict=True):
-            for column, place in {**self.driven, **{n: self._pushed(n) for n in applied}}.items():
-                held = Held(side.held.since + late * h, times) if late else side.held
-                control[mine, :, place] = held(np.array([log[column] for log in own]), line)
+            held = _carried_out(own, side.held, late * h)
+            for column, place in self.driven.items():
+                control[mine, :, place] = held(np.array([_commanded(log, column) for log in own]), line)
+            for column in applied:
+                control[mine, :, self._pushed(column)] = side.held(np.array([log[column] for log in own]))
         sensed = self._sensed(first, control, changed)
         out: list[Channels | None] = [None] * len(logs)
         for (mine, own, _), side in zip(parts, sides, strict=True):
@@ -122,3 +127,21 @@ class Runs:
                 aligned(log, out, columns)
             whole.append(out if all(np.abs(v).max() < FAR for v in out.values()) else None)
         return whole
+
+
+def _carried_out(logs: Sequence[Recording], held: Held, late: float) -> Held:
+    """How commands are held that come `late` [s], and at times of their own where logs have such."""
+    since = held.since
+    if ACTS in logs[0].columns:
+        own = np.array([log[ACTS] - log.t[0] for log in logs])
+        since = np.minimum.accumulate(np.minimum(own, since)[:, ::-1], 1)[:, ::-1]
+        if f"{ACTS}next" in logs[0].columns:
+            after = np.array([log[f"{ACTS}next"][-1] - log.t[0] for log in logs])
+            since = np.column_stack([since, np.maximum(after, since[:, -1])])
+    return held if since is held.since and not late else Held(since + late, held.times)
+
+
+def _commanded(log: Recording, column: str) -> np.ndarray:
+    """A command's values, and where a log has it the one that follows the last."""
+    following = log.columns.get(f"{ACTS}{column}")
+    return log[column] if following is None else np.append(log[column], following[-1])

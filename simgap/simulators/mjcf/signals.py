@@ -35,7 +35,8 @@ class Held:
         rise, wide = np.diff(u), np.diff(t)
         done = np.cumsum((u[..., :-1] + 0.5 * line * rise) * wide, -1)
         area = np.concatenate([np.zeros((*done.shape[:-1], 1)), done], -1)
-        slope = np.concatenate([line * rise / wide, np.zeros((*done.shape[:-1], 1))], -1)
+        steep = line * rise / np.where(wide > 0, wide, np.inf)
+        slope = np.concatenate([steep, np.zeros((*done.shape[:-1], 1))], -1)
         here, held, begun, steep = (np.take_along_axis(v, k, -1) for v in (area, u, t, slope))
         late = self.edges - begun
         return np.diff(here + (held + 0.5 * steep * late) * late) / self.width

@@ -1,0 +1,474 @@
+"""Whether the scales of a recording agree: forces with pads, the two fingers and positions with each other.
+
+Mechanics ties channels to each other whatever the blocks are. Each tie estimates how far a scale of the hand
+is off (0 where rig.toml is right), with the error of that estimate:
+
+- *squeeze*: two fingers press what they carry alike: where finger 1 is read g times too large, fx1 = -g fx2.
+- *balance*: what they carry weighs W (1 + a / g) however they share it: where finger 1 is read g times too
+  large, their sum follows their difference, d(fy1 + fy2) / d(fy1 - fy2) = (g - 1) / (g + 1).
+- *rigidity*: a held block keeps its width on its way, so that the fingers' distance, the pads' squeeze taken
+  out, has no slope over the hand's place. Angles, links or bases that are off give it one.
+- *motion*: positions go as far as their velocities carry them.
+- *room*: no fingertip is where a block stands.
+- *level*: a fingertip that holds a block is neither beneath what that stands on nor above its top.
+
+Of each, two hypotheses are compared: the hand is as well made as its rig says, or something is misstated, by
+a size of which little is known. Normal densities about 0 of sd (error, WELL_MADE) and (error, WELL_MADE,
+SIZE) give the odds; a scale is contradicted, and what hangs on it is no number, where it is misstated with a
+probability of CERTAIN. With the prior odds of WRONG that takes some 4.5 sds of a healthy hand.
+
+Forces on another scale alike are a matter of pads and noise. A force that is read g times too large squeezes
+pads that seem 1 / g times as soft, and its noise is g times the stated one; pads that truly differ leave the
+noise alone. Where [fingertip] states the pads, four explanations of what grips show are weighed against each
+other: the rig is right, its pads are wrong, both axes of force are scaled by g, or the vertical alone. A
+weight is then drawn from all of them, so that its interval holds the truth whichever it is.
+
+Nothing checks what all of these leave alone: the distance of the fingers' bases as long as there is room,
+and the length of all links together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from estimation.design import RISE, Design, PadDoubt
+from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
+from estimation.pads import MISSTATED, SLOPE_SD
+from estimation.sampler import CERTAIN
+from hmmseg.contact.decompose import ON_GROUND, stack
+from hmmseg.hand.plausibility import scale_to_velocity
+from hmmseg.hand.sensing import WHITE
+from hmmseg.io.rig import Rig
+from hmmseg.io.task import GROUND
+from hmmseg.io.trial import position_pairs
+from hmmseg.robust import robust_sd
+from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
+
+WRONG = 0.01  # prior: share of recordings in which one such scale is misstated
+# learned: sds of healthy hands by experiments/consistency.py: of logarithms of gains and rates, of slopes
+# [m/m], of places [m]; what rig.toml states in [systematic] comes on top
+WELL_MADE = {
+    "squeeze": 0.015, "balance": 0.03, "rigidity": 4e-3, "motion": 0.04, "room": 5e-4, "level": 1.5e-3,
+}  # fmt: skip
+# prior: sds of what is misstated, in the same units
+SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
+BRIEF = 5  # numerics: samples that are no glitch
+FEWEST = 8  # numerics: samples of a carry that tell a slope
+BESIDE = 3e-3  # chosen: m below a grip in which a block that stands on another surely is itself
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Where the fingertips hold a block that stands [m], before (`pickup`) or after (`place`) a move."""
+
+    move: int
+    key: str
+    object: str
+    subtask: int
+    x1: float
+    x2: float
+    y: float
+
+
+@dataclass(frozen=True)
+class Tie:
+    """One tie: by how much it does not hold, and what is worth nothing if it does not.
+
+    `value` +- `error`: how far the scale is off; `made`: sd of healthy hands that the rig itself admits, on
+    top of WELL_MADE; `properties` hang on it; `text` says what is seen.
+    """
+
+    kind: str
+    value: float
+    error: float
+    properties: tuple[str, ...]
+    text: str
+    made: float = 0.0
+
+    @property
+    def probability(self) -> float:
+        """That something is misstated."""
+        healthy = float(np.hypot(self.error, np.hypot(WELL_MADE[self.kind], self.made)))
+        wrong = float(np.hypot(healthy, SIZE[self.kind]))
+        gain = np.log(healthy / wrong) + 0.5 * self.value**2 * (1 / healthy**2 - 1 / wrong**2)
+        return float(1 / (1 + (1 / WRONG - 1) * np.exp(-min(gain, 500.0))))
+
+
+def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> dict[str, str]:
+    """Why properties are worth nothing, by `object.property`: scales that contradict each other."""
+    out: dict[str, str] = {}
+    for tie in ties(aligned, weighed, design):
+        if tie.probability > CERTAIN:
+            for prop in tie.properties:
+                for obj in aligned.task.objects:
+                    out.setdefault(f"{obj}.{prop}", tie.text)
+    return out
+
+
+def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
+    """All ties that a recording tells anything of."""
+    if not any(one.trial.inertia is not None for one in aligned.trials):  # a wrist's fingers are made up
+        yield from _sideways(aligned.rig, weighed)
+        if not aligned.late:
+            yield from _carried(aligned, weighed)
+        yield from _rigid(aligned, weighed)
+        yield from _moving(aligned)
+        yield from _room(aligned, weighed)
+        yield from _levels(aligned, weighed, design)
+
+
+def _carries(
+    weighed: Sequence[WeighedTrial], name: str, *needed: str
+) -> Iterator[tuple[WeighedTrial, int, np.ndarray]]:
+    """Trial, move and weights (num_timesteps,) of each grip's mean `name` where all `needed` are there."""
+    for a in weighed:
+        known = np.all([np.isfinite(getattr(a.signals, each)) for each in needed], axis=0)
+        for move, grip in a.weights.grips.items():
+            weight = grip[name].mean(axis=0) * known
+            if (weight > 0).sum() >= FEWEST:
+                yield a, move, weight / weight.sum()
+
+
+def _sideways(rig: Rig, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """Two fingers press what they carry alike, but for its inertia."""
+    pressed = []
+    for a, _, weight in _carries(weighed, "force", "fx1", "fx2"):
+        free = free_forces(a.signals, a) if a.weights.free.any() else np.zeros(4)
+        left, right = (
+            weight @ np.nan_to_num(a.signals.fx1) - free[0],
+            free[2] - weight @ np.nan_to_num(a.signals.fx2),
+        )
+        if left > 0 and right > 0:
+            pressed.append((left, right))
+    if pressed:
+        left, right = np.median(pressed, axis=0)
+        ratios = np.log([a / b for a, b in pressed])
+        text = (
+            f"fx1 and -fx2 press what is carried with {left:.3g} and {right:.3g} N, which should be alike: "
+            "one of the fingers is read on another scale"
+        )
+        made = float(np.hypot(rig.systematic.force_gain[0], rig.systematic.force_gain[2]))
+        yield Tie("squeeze", float(np.median(ratios)), float(np.std(ratios) / np.sqrt(ratios.size)),
+                  ("weight", "width", "friction"), text, made)  # fmt: skip
+
+
+def _carried(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """Two fingers carry the same weight however they share it."""
+    rig, performed = aligned.rig, aligned.task.performed
+    of, sums, apart, factors, weights, noises = [], [], [], [], [], []
+    for a, move, weight in _carries(weighed, "force", "fy1", "fy2"):
+        s, inside = a.signals, weight > 0
+        factor = gravity_factor(s, rig)
+        free = a.weights.free > 0
+        if free.sum() < MIN_FREE:
+            continue
+        noises.append([np.nanmean(np.diff(np.where(free, f, np.nan), 2) ** 2) / 6 for f in (s.fy1, s.fy2)])
+        of += [performed[move].object] * int(inside.sum())
+        sums.append((s.fy1 + s.fy2)[inside])
+        apart.append((s.fy1 - s.fy2)[inside])
+        factors.append(factor[inside])
+        weights.append(weight[inside] / weight[inside].max())
+    if not sums:
+        return
+    y, x, root = (np.concatenate(each) for each in (sums, apart, weights))
+    root = np.sqrt(root)
+    columns = np.stack(
+        [np.where(np.array(of) == obj, np.concatenate(factors), 0.0) * root for obj in dict.fromkeys(of)], 1
+    )
+    first, second = np.nanmean(noises, axis=0)
+    left = [v - columns @ np.linalg.lstsq(columns, v, rcond=None)[0] for v in (y * root, x * root)]
+    total = float(root @ root)
+    syy, sxx, sxy = (float(a @ b) / total for a, b in (left[:1] * 2, left[1:] * 2, left))
+    moved = sxx - first - second
+    if moved <= 3 * (first + second) * np.sqrt(2 / total):
+        return
+    slope = (sxy - (first - second)) / moved
+    rest = max(syy - slope**2 * moved, first + second)
+    error = float(np.sqrt(rest * sxx / total) / moved)
+    if abs(slope) < 1:
+        ratio = 2 * float(np.arctanh(slope))
+        text = (
+            f"what fy1 takes of a carried weight fy2 gives up {np.exp(-ratio):.2g}-fold: one of the fingers "
+            "is read on another scale"
+        )
+        made = float(np.hypot(rig.systematic.force_gain[1], rig.systematic.force_gain[3]))
+        yield Tie("balance", ratio, 2 * error / (1 - slope**2), ("weight", "height", "friction"), text, made)
+
+
+def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """A held block keeps its width wherever the hand takes it."""
+    rig, found = aligned.rig, []
+    for a, _, weight in _carries(weighed, "distance", "x", "y", "distance", "fx1", "fx2"):
+        s, root = a.signals, np.sqrt(weight)
+        width = np.nan_to_num(channel_values(s, rig)["distance"])
+        place = [np.nan_to_num(v - weight @ np.nan_to_num(v)) for v in (s.x, s.y)]
+        rows = np.stack([np.ones(width.size), *place], axis=1) * root[:, None]
+        slope = np.linalg.lstsq(rows, width * root, rcond=None)[0]
+        rest = width * root - rows @ slope
+        covariance = np.linalg.pinv(rows.T @ rows) * (rest @ rest) / max((weight > 0).sum() - 3, 1)
+        found.append(np.stack([slope[1:], np.diag(covariance)[1:]]))
+    if not found or aligned.late:
+        return
+    slopes, variances = np.moveaxis(np.array(found), 1, 0)
+    for k, axis in enumerate(("horizontally", "vertically")):
+        steep = float(np.median(slopes[:, k]))
+        spread = float(np.median(np.abs(slopes[:, k] - steep))) * 1.4826
+        error = max(spread, float(np.sqrt(np.median(variances[:, k])))) / np.sqrt(len(slopes))
+        text = (
+            f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
+            f"block {axis}, which no block does: joint angles, links or bases are not as rig.toml has them"
+        )
+        yield Tie("rigidity", steep, error, ("width", "height"), text, _made(rig))
+
+
+def _made(rig: Rig) -> float:
+    """Sd of the slope of a width over the hand's place that the rig's own [systematic] makes."""
+    if not rig.jointed:
+        return 0.0
+    return float(
+        np.hypot(np.linalg.norm(rig.systematic.joint_offset), np.linalg.norm(rig.systematic.link_length))
+    )
+
+
+def _moving(aligned: AlignedTrials) -> Iterator[Tie]:
+    """Positions go as far as their velocities carry them."""
+    slopes = [
+        [scale_to_velocity(one.trial, *pair) for pair in position_pairs(one.trial)] for one in aligned.trials
+    ]
+    known = np.array(slopes).ravel()
+    known = known[np.isfinite(known) & (known > 0)]
+    if known.size < 2 or known.size <= len(slopes) * len(slopes[0]) / 2:
+        return
+    logs = np.log(known)
+    text = (
+        f"positions go {1 / np.exp(np.median(logs)):.3g} times as far as their velocities carry them: one of "
+        "the two scales is wrong"
+    )
+    error = float(robust_sd(logs - np.median(logs)) / np.sqrt(known.size))
+    yield Tie("motion", float(np.median(logs)), error,
+              ("width", "height"), text)  # fmt: skip
+
+
+def _spans(one: TrialAlignment, aligned: AlignedTrials) -> list[tuple[float, float]]:
+    """Start and end [s] of every subtask of a trial."""
+    edges = [float(one.signals.t[0]), *(b.quantile(0.5) for b in one.boundaries), float(one.signals.t[-1])]
+    return list(pairwise(np.maximum.accumulate(edges)))
+
+
+def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iterator[Grip]:
+    """Where the fingertips hold each block that stands, and what it stands on."""
+    for move, grip in a.weights.grips.items():
+        ground = [s for s in aligned.subtasks if s.move == move and s.state == ON_GROUND and present[s.index]]
+        for key, of in (("pickup", ground[:1]), ("place", ground[1:])):
+            weight = grip[key].mean(axis=0)
+            if of and weight.any():
+                s = a.signals
+                x1, x2, y = (float(weight @ np.nan_to_num(v) / weight.sum()) for v in (s.x1, s.x2, s.y))
+                yield Grip(move, key, of[0].object or "", of[0].index, x1, x2, y)
+
+
+def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """No fingertip is where a block stands: by how far one is in the median trial."""
+    task, every = aligned.task, []
+    for a, one in zip(weighed, aligned.trials, strict=True):
+        s, deepest, spans = a.signals, 0.0, _spans(one, aligned)
+        support = dict(task.initial)
+        grips = list(_grips(a, aligned, one.present))
+        for grip in grips:
+            start, end = spans[grip.subtask]
+            if grip.key == "pickup":  # it has stood there since it was put down, or from the beginning
+                before = [g.subtask for g in grips if g.object == grip.object and g.subtask < grip.subtask]
+                since, until = spans[max(before)][1] if before else s.t[0], start
+                under = support[grip.object]
+            else:
+                after = [g.subtask for g in grips if g.object == grip.object and g.subtask > grip.subtask]
+                since, until = end, spans[min(after)][0] if after else s.t[-1] + 1
+                under = support[grip.object] = task.performed[grip.move].to
+            at = (s.t > since + APART) & (s.t < until - APART)
+            floor = -np.inf if under == GROUND else grip.y - BESIDE
+            for x, y in ((s.x1, s.y1), (s.x2, s.y2)):
+                within = at & (y < grip.y) & (y > floor)
+                depth = np.minimum(x - grip.x1, grip.x2 - x)[within]
+                depth = np.sort(depth[np.isfinite(depth)])
+                if depth.size >= BRIEF:
+                    deepest = max(deepest, float(depth[-BRIEF]))
+        every.append(deepest)
+    depth = float(np.median(every))
+    text = (
+        f"a fingertip comes {1e3 * depth:.2g} mm within a block that stands: the fingers' bases, links or "
+        "positions are not as rig.toml has them"
+    )
+    yield Tie("room", depth, 0.0, ("width",), text)
+
+
+def _levels(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
+    """Blocks are held between bottom and top; of a hand with joints, whose heights hang on its links."""
+    if not aligned.rig.jointed:
+        return  # whose y = 0 need not be the ground
+    heights = _heights(design)
+    off: dict[tuple[int, str], list[float]] = {}
+    for a, one in zip(weighed, aligned.trials, strict=True):
+        support = dict(aligned.task.initial)
+        for grip in _grips(a, aligned, one.present):
+            if grip.key == "place":
+                support[grip.object] = aligned.task.performed[grip.move].to
+            beneath = stack(support, grip.object)
+            if all(name in heights for name in beneath):
+                bottom = sum(heights[name] for name in beneath)
+                above = grip.y - bottom - heights.get(grip.object, np.inf)
+                below = bottom - grip.y
+                off.setdefault((grip.move, grip.key), []).append(
+                    max(above, 0.0) if above > below else min(-below, 0.0)
+                )
+    if off:
+        move, far = max(
+            ((m, float(np.median(v))) for (m, _), v in off.items()), key=lambda each: abs(each[1])
+        )
+        where = "above its top" if far > 0 else "beneath its bottom"
+        text = (
+            f"{aligned.task.performed[move].object} is held {1e3 * abs(far):.2g} mm {where}: the fingers' "
+            "bases or links are not as rig.toml has them, or y = 0 is not the ground"
+        )
+        yield Tie("level", abs(far), 0.0, ("width", "height"), text)
+
+
+def _heights(design: Design) -> dict[str, float]:
+    """Heights [m] of the objects whose height alone is determined, by least squares."""
+    rows = (design.channel == RISE) & ~design.slope
+    mine = [i for i, u in enumerate(design.unknowns) if u.prop == "height"]
+    if not rows.any() or not mine:
+        return {}
+    found = np.linalg.lstsq(design.coefficients[rows][:, mine], design.mean[rows], rcond=None)[0]
+    return {
+        design.unknowns[i].name[0]: float(v)
+        for i, v in zip(mine, found, strict=True)
+        if design.unknowns[i].single
+    }
+
+
+MISREAD = 0.5  # prior: share of forces among what is to blame where pads and forces contradict each other
+GAIN_LOG_SD = 1.0  # prior: of log g: another range or unit of the amplifier
+PADS_LOG_SD = 0.8  # prior: of a wrong stiffness: foams of another kind are a third or three times as stiff
+NOISE_LOG_SD, AXIS_LOG_SD = 0.35, 0.3  # prior: noise is off its statement by a factor of two once in twenty
+GRID = np.linspace(np.log(1e-3), np.log(1e3), 2001)  # numerics: log g; twice a third of a percent a step
+RAISED = 2.0  # chosen: times its prior that the probability of a wrong scale must be, to be taken up
+TELLING = 1.0  # limit: sd of the pads' share along the grip, from which grips show nothing of it
+
+
+@dataclass(frozen=True)
+class ForceScale:
+    """The posterior of g (GRID,), by which vertical forces are read too large, and that of any g but 1.
+
+    `probability` that forces are misread; `density` (len(GRID),) of log g if they are.
+    """
+
+    probability: float
+    density: np.ndarray
+
+    def corrected(self, chain: np.ndarray, weights: list[int], rng: np.random.Generator) -> np.ndarray:
+        """Draws (walkers, steps, Q), those of `weights` [N] with g drawn from its posterior."""
+        out, size = chain.copy(), chain.shape[:2]
+        log_g = np.where(
+            rng.uniform(size=size) < self.probability, rng.choice(GRID, size, p=self.density), 0.0
+        )
+        out[..., weights] *= np.exp(-log_g)[..., None]
+        return out
+
+    def remark(self) -> str:
+        """What contradicts what, for people."""
+        g = float(np.exp(self.density @ GRID))
+        size = f"{g:.2g} times too large" if g > 1 else f"{1 / g:.2g} times too small"
+        return (
+            f"forces and [fingertip] contradict each other: forces are read {size} with a probability of "
+            f"{self.probability:.0%}, or the pads are not as stated; weights allow for both, and a weighed "
+            "block would tell"
+        )
+
+
+def force_scale(doubt: PadDoubt, weighed: Sequence[WeighedTrial], rig: Rig) -> ForceScale | None:
+    """The scale of forces where pads and noise say anything against 1; None where nothing does.
+
+    Not to be used where forces come late, which makes slopes of readings over them flat.
+    """
+    tip = rig.fingertip
+    if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
+        return None
+    (normal, normal_sd), (shear, shear_sd) = doubt.seen
+    if normal_sd > TELLING:
+        return None
+    share = np.expm1(-GRID)  # of compliance beyond the stated one, where forces are g times too large
+
+    def pads(of_normal: np.ndarray | float, of_shear: np.ndarray | float) -> np.ndarray:
+        """Log likelihood (len(GRID),) of both shares where truly these."""
+        out = np.zeros(GRID.size)
+        for seen, sd, true in ((normal, normal_sd, of_normal), (shear, shear_sd, of_shear)):
+            if np.isfinite(sd):
+                error = np.hypot(sd, SLOPE_SD * (1 + np.asarray(true)))
+                out = out - 0.5 * ((seen - true) / error) ** 2 - np.log(error)
+        return out
+
+    def noise(of_x: np.ndarray | float, of_y: np.ndarray | float) -> np.ndarray:
+        """Log likelihood of the noise of both axes, read `of` (logarithms) times too large."""
+        excess = _noise_excess(weighed, rig)
+        if excess is None:
+            return np.zeros(GRID.size)
+        covariance = np.full((2, 2), NOISE_LOG_SD**2) + AXIS_LOG_SD**2 * np.eye(2)
+        off = np.stack(np.broadcast_arrays(excess[0] - of_x, excess[1] - of_y, GRID)[:2])
+        return -0.5 * (off * np.linalg.solve(covariance, off)).sum(axis=0)
+
+    def normal_prior(sd: float) -> np.ndarray:
+        density = np.exp(-0.5 * (GRID / sd) ** 2)
+        return np.log(density / density.sum())
+
+    def evidence(log_likelihood: np.ndarray, sd: float) -> float:
+        return float(np.logaddexp.reduce(normal_prior(sd) + log_likelihood))
+
+    foam = max(evidence(pads(share, share), PADS_LOG_SD), evidence(pads(share, 0.0), PADS_LOG_SD),
+               evidence(pads(0.0, share), PADS_LOG_SD))  # fmt: skip
+    both, vertical = pads(share, share) + noise(GRID, GRID), pads(0.0, share) + noise(0.0, GRID)
+    right = float((pads(0.0, 0.0) + noise(0.0, 0.0))[0])
+    log_odds = np.array([
+        np.log(1 - MISSTATED) + right,
+        np.log(MISSTATED * (1 - MISREAD)) + foam + float(noise(0.0, 0.0)[0]),
+        np.log(MISSTATED * MISREAD / 2) + evidence(both, GAIN_LOG_SD),
+        np.log(MISSTATED * MISREAD / 2) + evidence(vertical, GAIN_LOG_SD),
+    ])  # fmt: skip
+    odds = np.exp(log_odds - np.logaddexp.reduce(log_odds))
+    wrong = float(odds[2] + odds[3])
+    if wrong < RAISED * MISSTATED * MISREAD:
+        return None
+    prior = normal_prior(GAIN_LOG_SD)
+    of_g = [np.exp(prior + each - np.logaddexp.reduce(prior + each)) for each in (both, vertical)]
+    density = (odds[2] * of_g[0] + odds[3] * of_g[1]) / wrong
+    return ForceScale(wrong, density / density.sum())
+
+
+def _noise_excess(weighed: Sequence[WeighedTrial], rig: Rig) -> tuple[float, float] | None:
+    """Logarithm of the noise of fx and of fy over the stated one; None where it is filtered or unstated."""
+    if rig.noise.force is None:
+        return None
+    out = []
+    for axis in "xy":
+        bends, followed = [], []
+        for a in weighed:
+            free = a.weights.free > 0
+            for finger in (1, 2):
+                force = getattr(a.signals, f"f{axis}{finger}")
+                bend = np.diff(np.where(free, force, np.nan), 2)
+                bends.append(bend[np.isfinite(bend)] / a.signals.sd_force)
+                both = bend[1:] * bend[:-1]
+                followed.append(both[np.isfinite(both)] / a.signals.sd_force**2)
+        every, neighbours = np.concatenate(bends), np.concatenate(followed)
+        if neighbours.size < MIN_FREE or not every.any():
+            return None
+        if float(neighbours.mean() / np.mean(every**2)) > WHITE:
+            return None
+        shown = robust_sd(every) / np.sqrt(6)
+        if shown == 0:  # coarser than its noise
+            return None
+        out.append(float(np.log(shown)))
+    return out[0], out[1]
