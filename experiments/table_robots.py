@@ -62,9 +62,9 @@ def check() -> str | None:
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
 
 
-def changed() -> str | None:
+def changed(name: str = "sts3215") -> str | None:
     """What changed of a servo."""
-    found = load("sts3215")
+    found = load(name)
     if found is None:
         return None
     rows = []
@@ -79,6 +79,34 @@ def changed() -> str | None:
         f"{seconds[len(seconds) // 2]:.0f} s. Code of {found['made_by']}."
     )
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+
+
+def mixed() -> str | None:
+    """What changed of a servo, from one half of the configurations to the other."""
+    return changed("sts3215_mixed")
+
+
+def first() -> str | None:
+    """What changed of a servo, as the first run on the judging half had it."""
+    return changed("sts3215_first")
+
+
+def bam() -> str | None:
+    """Whole logs of what was left out, of three models."""
+    found = load("sts3215_bam")
+    if found is None:
+        return None
+    rows = []
+    for by, words in (("kp", "one gain of three"), ("mass", "one mass of two")):
+        one = found.get(by, {"compared": []})
+        for pair in one["compared"]:
+            low, high = (1e3 * v for v in pair["interval_95"])
+            ours, other = (1e3 * one["rms"][pair[n]] for n in ("one", "other"))
+            less = f"{1e3 * pair['less']:.1f} ({low:.1f} to {high:.1f})"
+            rows.append([words, pair["other"], f"{ours:.1f}", f"{other:.1f}", less])
+    head = ["left out in turn", "beside", "ours [mrad]", "it [mrad]", "difference"]
+    note = f"In brackets 95 % intervals by a paired bootstrap. Code of {found['made_by']}."
+    return f"{markdown(head, rows)}\n\n{note}"
 
 
 def given() -> str | None:

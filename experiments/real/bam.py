@@ -136,7 +136,7 @@ def fitted(model: str, logs: list[tuple[Recording, tuple]]) -> tuple[list[str], 
 
     found = least_squares(
         left, start / size, bounds=(low / size - 1e-12, high / size + 1e-12), loss="soft_l1", diff_step=0.003,
-        max_nfev=25,
+        max_nfev=40,
     )  # fmt: skip
     return names, found.x * size
 
@@ -176,7 +176,7 @@ def main() -> None:
                     off = angles(model, names, x, log, s) - log["position"]
                     rms = float(np.sqrt(np.nanmean(off**2)))
                     group = f"{row['mass']}/{row['length']}/{row['kp']}/{row['trajectory']}"
-                    rows.append({"left_out": by, "value": value, "model": model, "file": row["file"],
+                    rows.append({"left_out": by, "value": float(value), "model": model, "file": row["file"],
                                  "group": group, "rms": rms})  # fmt: skip
                 mine = [
                     r["rms"] for r in rows if (r["left_out"], r["value"], r["model"]) == (by, value, model)
@@ -191,9 +191,9 @@ def main() -> None:
         pairs = [compared(errors, group, "ours", "m6"), compared(errors, group, "ours", "m6+")]
         out[by] = {"rms": {m: float(np.sqrt(np.mean(e**2))) for m, e in errors.items()}, "compared": pairs}
         print(by, out[by], flush=True)
-    if given.output is not None:
-        save(given.output, {**out, "logs": rows})
-        pd.DataFrame(rows).to_csv(given.output.with_suffix(".csv"), index=False)
+        if given.output is not None:
+            save(given.output, {**out, "logs": rows})
+            pd.DataFrame(rows).to_csv(given.output.with_suffix(".csv"), index=False)
 
 
 if __name__ == "__main__":

@@ -141,7 +141,6 @@ class Comparison:
         bend = np.zeros((p + k, p + k))
         bend[:p, :p] = self.old.information.sum(0) + self.old.prior
         bend[range(p, p + k), range(p, p + k)] = 1e-6
-
         begun = [np.concatenate([np.zeros(p), x]) for x in starts]
         for wider in (WIDER[0], 1.0):
             self.runs.scaled(wider * self.old.scale)
@@ -162,7 +161,6 @@ class Comparison:
         tug = np.zeros((len(self.old.units), p + k))
         tug[:, :p] = self.old.pull - self.old.information @ z[:p]
         total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
-
         left, moved = np.zeros(len(self.runs.units)), [np.zeros((n, k)) for n in map(len, (pull, tug))]
         none = np.zeros(len(self.old.units), bool)
         for number in range(len(self.runs.units)):
@@ -177,34 +175,23 @@ class Comparison:
         sd, freedom = jackknife(moved)
         x = z[p:]
         p_value = 1.0
-        if k:
+        if k:  # of an effect with several parameters the surest, of two effects the less sure
             each = 2 * student.sf(np.abs(x) / np.maximum(sd, 1e-12), freedom)
-            by_effect = [
-                each[[of.names[m][0] == e for m in mine]].min() * sum(of.names[m][0] == e for m in mine)
-                for e in effects
-            ]
-            p_value = min(1.0, len(self.candidates) * float(max(by_effect)))
+            own = [[of.names[m][0] == e for m in mine] for e in effects]
+            p_value = min(1.0, len(self.candidates) * float(max(each[m].min() * sum(m) for m in own)))
         return Change(effects, x, sd, freedom, p_value, left, z[:p])
 
     def scanned(self, about: Change | None = None) -> dict[str, tuple[float, np.ndarray]]:
         """By candidate the least cost over a ladder of changes of it, theta held, and where that is."""
-        out = {}
-        known = () if about is None else about.effects
-        first = np.zeros(self.p) if about is None else about.theta
-        held = np.zeros(0) if about is None else about.x
-        for name in self.candidates:
-            if name in known:
-                continue
+        out, known, first = {}, () if about is None else about.effects, np.zeros(self.p)
+        if about is not None:
+            first = np.concatenate([about.theta, about.x])
+        for name in (n for n in self.candidates if n not in known):
             of, mine = self._coordinates((*known, name))
-            k = mine.size - held.size
-            steps = [np.zeros(k)]
-            for j in range(k):
-                for s in LADDER:
-                    steps.append(s * np.eye(k)[j])
-            tried = [np.concatenate([first, held, x]) for x in steps]
-            costs = [self.cost(z, of, mine) for z in tried]
-            best = int(np.argmin(costs))
-            out[name] = (costs[best], steps[best])
+            k = self.p + mine.size - first.size
+            steps = [np.zeros(k), *(s * one for one in np.eye(k) for s in LADDER)]
+            costs = [self.cost(np.concatenate([first, x]), of, mine) for x in steps]
+            out[name] = (min(costs), steps[int(np.argmin(costs))])
         return out
 
     @staticmethod
@@ -266,6 +253,12 @@ def by_chance(gains: np.ndarray) -> float:
     return float(student.sf(gains.mean() / sd * np.sqrt(gains.size), gains.size - 1))
 
 
+def beaten(one: Change, by: Change) -> float:
+    """How often another predicts motions by as large a share of a change's loss better where it is no better:
+    shares, as some motions are missed by far more than others."""
+    return by_chance(1 - by.left / np.maximum(one.left, 1e-12))
+
+
 @dataclass(frozen=True)
 class Changes:
     """What was found: `verdict` none, named, set or unknown; the `best` explanation and `others` that NEW's
@@ -280,7 +273,6 @@ class Changes:
     probabilities: Mapping[str, float]
     worse: float
     old: Old
-    units: np.ndarray
     runs: Runs
     composed: Composed
     broken: tuple[Broken, ...]
@@ -291,9 +283,8 @@ class Changes:
         best, nothing, names = self.best, self.nothing, sorted(self.best.effects)
         others = sorted({n for c in self.others for n in c.effects} - {*names})
         before, after, floor = (float(v.mean()) for v in (nothing.left, best.left, self.old.missed))
-        fraction = (
-            None if not names else float(np.clip(1 - (after - floor) / max(before - floor, 1e-9), 0, 1))
-        )
+        gone = float(np.clip((before - after) / max(before - floor, 1e-9), 0, 1))
+        fraction = gone if names else None
         explanations = {"+".join(sorted(c.effects)): c for c in (best, *self.others) if c.effects}
         chances = self.probabilities
         effects = {
@@ -329,7 +320,7 @@ class Changes:
 
     @property
     def over(self) -> float:
-        """How far NEW's logs are met worse than OLD's, as a factor on root mean squares of medium rows."""
+        """How far NEW's motions are missed worse than OLD's, about as a factor on root mean squares."""
         return float(np.exp((self.best.left.mean() - self.old.missed.mean()) / 2))
 
     def where(self) -> list[dict[str, Any]]:
@@ -380,7 +371,7 @@ class Changes:
             ratio = at.log[k]
             out[name] = {
                 "old": float(at.at[k]), "mean": float(now[k]),
-                "sd": float(change.sd[k] * at.slopes(change.x)[k]),
+                "sd": float(min(change.sd[k], 1e6) * at.slopes(change.x)[k]),
                 "interval_90": [float(low[k]), float(high[k])], "unit": known.parameters[short].unit,
                 "ratio": float(now[k] / at.at[k]) if ratio else None,
                 "ratio_90": [float(low[k] / at.at[k]), float(high[k] / at.at[k])] if ratio else None,
@@ -452,15 +443,15 @@ def _concluded(
     every = sorted(tried[1:], key=lambda c: c.left.mean())
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
     changed = min((c.p_value for c in singles), default=1.0) < CHANGED
-    changed = changed and by_chance(nothing.left - singles[0].left) < CHANGED
+    changed = changed and beaten(nothing, singles[0]) < CHANGED
     best = singles[0] if changed else nothing
     both = min((c.p_value for c in pairs), default=1.0) < CHANGED
-    if changed and both and by_chance(best.left - pairs[0].left) * len(pairs) < RIVAL:
+    if changed and both and beaten(best, pairs[0]) * len(pairs) < RIVAL:
         best = pairs[0]
     others = [
         c
         for c in (singles if len(best.effects) == 1 else pairs)
-        if c is not best and best.effects and by_chance(c.left - best.left) > RIVAL
+        if c is not best and best.effects and beaten(c, best) > RIVAL
     ]
     excess = found.excess(best)
     paired = np.isin(found.runs.units, old.units).all()
@@ -470,7 +461,7 @@ def _concluded(
         verdict = "unknown"
     return Changes(
         verdict, best, tuple(others), nothing, tuple(tried), _chances(tried, best, worse), worse, old,
-        found.runs.units, found.runs, found.composed, tuple(broken), calibration,
+        found.runs, found.composed, tuple(broken), calibration,
     )  # fmt: skip
 
 
@@ -493,7 +484,7 @@ def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, f
 
     changed = [c for c in tried if c.effects]
     none, unknown = odds(best.p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
-    weight = {"+".join(sorted(c.effects)): by_chance(c.left - best.left) for c in changed if c is not best}
+    weight = {"+".join(sorted(c.effects)): beaten(c, best) for c in changed if c is not best}
     weight |= {"+".join(sorted(best.effects)): 1.0} if best.effects else {}
     total = max(sum(weight.values()), 1e-300)
     seen = 1 - none / (1 + none) if best.effects else min(0.5, total)

@@ -70,9 +70,7 @@ def without_broken(
             out_of = (np.sign(v - before) == np.sign(v - after)) & (v != before) & (v != after)
             size = np.abs(off)
             usual = max(float(robust_sd(off)), float(np.quantile(size, 0.95)), resolution(values), 1e-300)
-            beside = np.maximum(
-                np.append(size[1:], 0.0), np.append(0.0, size[:-1])
-            )  # a wild one has half of it
+            beside = np.maximum(np.append(size[1:], 0.0), np.append(0.0, size[:-1]))  # of a wild one: half
             wrong = seen[out_of & (size > BROKEN * usual) & (size > 1.5 * beside)]
             if wrong.size:
                 columns[name] = np.where(np.isin(np.arange(values.size), wrong), np.nan, values)
@@ -166,16 +164,11 @@ class Runs:
         """Use these scales by channel (C,); starts are taken out in their units."""
         rows, starts = self.composed.rows, self.linear.starts
         self.scale, self.parts = scale, []
-        for i in np.unique(self.log):
-            mine = np.flatnonzero(self.log == i)
-            doubt = []
-            for number in np.unique(rows.window[mine]):
-                for state, sd in self.composed.windows[number].doubt.items():
-                    doubt.append(np.where(rows.window[mine] == number, starts[state][mine] * sd, 0.0))
+        for window, mine in zip(self.composed.windows, rows.of, strict=True):
+            doubt = [starts[state][mine] * sd for state, sd in window.doubt.items()]
             if doubt:
-                left, value, _ = np.linalg.svd(
-                    np.array(doubt).T / scale[rows.channel[mine], None], full_matrices=False
-                )
+                away = np.array(doubt).T / scale[rows.channel[mine], None]
+                left, value, _ = np.linalg.svd(away, full_matrices=False)
                 self.parts.append((mine, left, value**2 / (1 + value**2)))
 
     def _scales(self, values: np.ndarray | None = None) -> np.ndarray:
@@ -318,23 +311,21 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
         theta = Coordinates.of(composed, point, fitted)
 
         def cost(z: np.ndarray, theta=theta, point=point, dependence=dependence) -> float:
-            rows = runs.rows(theta.point(point, z))
-            prior = 0.5 * dependence * np.sum(((theta.values(z) - nominal) / sd) ** 2)
-            return float(loss(rows).sum() + prior) if np.isfinite(rows).all() else np.inf
+            off, rows = (theta.values(z) - nominal) / sd, runs.rows(theta.point(point, z))
+            whole = float(loss(rows).sum() + 0.5 * dependence * off @ off)
+            return whole if np.isfinite(rows).all() else np.inf
 
         def local(z: np.ndarray, theta=theta, point=point, dependence=dependence) -> Local:
             there, slope = theta.point(point, z), theta.slopes(z) / sd
             bend, pull = runs.told(runs.rows(there), runs.slopes(there, theta, z))
-            push = slope * (theta.values(z) - nominal) / sd
-            return bend.sum(0) + dependence * np.diag(slope**2), pull.sum(0) - dependence * push
+            push = dependence * slope * (theta.values(z) - nominal) / sd
+            return bend.sum(0) + dependence * np.diag(slope**2), pull.sum(0) - push
 
-        z = descended(cost, local, np.zeros(p))
-        point = theta.point(point, z) if p else point
+        point = theta.point(point, descended(cost, local, np.zeros(p)))
         runs.rescaled(point)
-        theta = Coordinates.of(composed, point, fitted)
-        rows, columns = runs.rows(point), runs.slopes(point, theta, np.zeros(p))
-        information, pull = runs.told(rows, columns)
-        slope = theta.slopes(np.zeros(p)) / sd
+        theta, z = Coordinates.of(composed, point, fitted), np.zeros(p)
+        information, pull = runs.told(runs.rows(point), runs.slopes(point, theta, z))
+        slope = theta.slopes(z) / sd
         if p and m > 1:  # as if every row were so many
             spread = np.linalg.solve(information.sum(0) + dependence * np.diag(slope**2), pull.T @ pull)
             dependence = max(1.0, float(np.trace(spread)) * m / (m - 1) / p)
@@ -342,12 +333,12 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
     total, missed = information.sum(0) + prior, np.zeros(m)
     rest = pull.sum(0) - dependence * slope * (theta.values(np.zeros(p)) - nominal) / sd
     for u in range(m):
-        step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
 
         def without(z: np.ndarray, u=u) -> tuple[float, float]:
             kept, out = runs.losses(theta.point(point, z), u)
             return kept + 0.5 * dependence * float(np.sum(((theta.values(z) - nominal) / sd) ** 2)), out
 
+        step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
         missed[u] = without(halved(lambda z, f=without: f(z)[0], np.zeros(p), step))[1]
     return Old(
         point,

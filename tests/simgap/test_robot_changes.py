@@ -12,6 +12,7 @@ from scipy.stats import ttest_1samp, ttest_ind
 from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
+from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.changes import Changes, by_chance, changes, jackknife
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
@@ -51,12 +52,20 @@ def logs(
 
 
 @cache
-def compared(**changed: float) -> Changes:
-    """What is found of planted changes."""
-    old, new = logs(0), logs(100, **changed)
+def healthy() -> tuple[dict, list[Recording], Calibration]:
+    """What may have changed, old logs, and what is calibrated on them."""
+    old = logs(0)
     every = effects_of(SIMULATOR, old)
     effects = {n: replace(e, fitted=n in ("gain", "coulomb")) for n, e in every.items() if n in KNOWN}
-    return changes(SIMULATOR, old, new, effects)
+    return effects, old, calibrate(SIMULATOR, old, effects)
+
+
+@cache
+def compared(**changed: float) -> Changes:
+    """What is found of planted changes."""
+    effects, old, calibration = healthy()
+    before = compared().old if changed else None
+    return changes(SIMULATOR, old, logs(100, **changed), effects, calibration=calibration, known=before)
 
 
 def test_nothing_changed_is_none():
