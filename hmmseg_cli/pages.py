@@ -281,7 +281,9 @@ def _calibrated(body: Body) -> list[tuple[str, ...]]:
         found, ends = "not told by these logs", ""
         if p["mean"] is not None:
             found = estimate(p["mean"], p["sd"] or 0.0, shown)
-            ends = interval(*p["interval_90"], shown) if p["interval_90"] else ""
+            if p["interval_90"]:
+                low, high = p["interval_90"]
+                ends = interval(low, high, shown)
         rows.append((plain_name(name), estimate(p["nominal"], 0.0, shown), found, ends))
     return rows
 

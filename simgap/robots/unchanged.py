@@ -298,6 +298,26 @@ class Old:
     motions: list[Motion]
 
 
+def _objective(
+    runs: Runs, theta: Coordinates, point: Point, nominal: np.ndarray, sd: np.ndarray, dependence: float
+) -> tuple[Callable[[np.ndarray], float], Callable[[np.ndarray], Local]]:
+    """What OLD's fit makes least, of coordinates z (p,), and its curvature and pull there; the prior counts
+    `dependence` times, as rows do not count singly."""
+
+    def cost(z: np.ndarray) -> float:
+        off, rows = (theta.values(z) - nominal) / sd, runs.rows(theta.point(point, z))
+        whole = float(loss(rows).sum() + 0.5 * dependence * off @ off)
+        return whole if np.isfinite(rows).all() else np.inf
+
+    def local(z: np.ndarray) -> Local:
+        there, slope = theta.point(point, z), theta.slopes(z) / sd
+        bend, pull = runs.told(runs.rows(there), runs.slopes(there, theta, z))
+        push = dependence * slope * (theta.values(z) - nominal) / sd
+        return bend.sum(0) + dependence * np.diag(slope**2), pull.sum(0) - push
+
+    return cost, local
+
+
 def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
     """What OLD logs tell of a robot that does not change, from the point of its calibration."""
     point: Point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
@@ -310,18 +330,8 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
         runs.rescaled(point, wider)
         theta = Coordinates.of(composed, point, fitted)
 
-        def cost(z: np.ndarray, theta=theta, point=point, dependence=dependence) -> float:
-            off, rows = (theta.values(z) - nominal) / sd, runs.rows(theta.point(point, z))
-            whole = float(loss(rows).sum() + 0.5 * dependence * off @ off)
-            return whole if np.isfinite(rows).all() else np.inf
-
-        def local(z: np.ndarray, theta=theta, point=point, dependence=dependence) -> Local:
-            there, slope = theta.point(point, z), theta.slopes(z) / sd
-            bend, pull = runs.told(runs.rows(there), runs.slopes(there, theta, z))
-            push = dependence * slope * (theta.values(z) - nominal) / sd
-            return bend.sum(0) + dependence * np.diag(slope**2), pull.sum(0) - push
-
-        point = theta.point(point, descended(cost, local, np.zeros(p)))
+        found = descended(*_objective(runs, theta, point, nominal, sd, dependence), np.zeros(p))
+        point = theta.point(point, found)
         runs.rescaled(point)
         theta, z = Coordinates.of(composed, point, fitted), np.zeros(p)
         information, pull = runs.told(runs.rows(point), runs.slopes(point, theta, z))

@@ -9,8 +9,8 @@ import simgap
 from simgap.effects import fitted
 
 ROOT = Path(simgap.__file__).parent
-# The comparison with given trials has effects of its own, some of the same names, in a catalogue of its own.
-CATALOGUES = {ROOT / "generic/effects.py"}
+# The comparison with given trials and robots have effects of their own, some of the same names.
+CATALOGUES = {ROOT / "generic/effects.py", ROOT / "robot_effects/commands.py"}
 
 
 def named_in(path: Path, names: set[str]) -> set[str]:
