@@ -15,7 +15,7 @@ from hmmseg.errors import InputError
 from simgap.progress import say
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Rows
-from simgap.robots.windows import REGIMES, STRIKES
+from simgap.robots.windows import JUMPS, REGIMES, STRIKES, earlier
 from simgap.simulators.protocol import Channels
 
 STEP = 0.05  # numerics: of a parameter's standard deviation: the finite difference
@@ -246,7 +246,11 @@ def _by_start(composed: Composed, base: Base) -> dict[str, np.ndarray]:
             s if s is None or state not in s else {**s, state: s[state] + h}
             for s, h in zip(base.begun, steps, strict=True)
         ]
-        run = composed.rolled(base.point, begun)
+        moved = composed
+        if state == JUMPS:
+            logs = tuple(earlier(composed.simulator, r, max(steps)) for r in composed.recordings)
+            moved = replace(composed, recordings=logs)
+        run = moved.rolled(base.point, begun)
         there = composed.rows.averaged(composed.read(run, base.point))
         by_row = np.array(steps)[composed.rows.window]
         change = np.where(by_row > 0, (there - base.rows) / np.where(by_row > 0, by_row, 1.0), 0.0)

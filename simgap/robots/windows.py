@@ -28,6 +28,8 @@ DOUBT = 3.0
 FREE = "free"  # what a simulator's `contact_states` call the state in which nothing touches
 STILL = 0.01  # chosen: share of a channel's range; a stretch in which none goes further is still
 AT_REST, CALM = 0.002, 0.05  # chosen: likewise, and s: what touches and goes no further in this time rests
+JUMPS = "command jumps"  # beside the states of a start: when in its interval a command jumped
+ABRUPT = 4.0  # chosen: times a command's changes before and after, from which it jumps and does not pass
 # A model may lack one thing in flight, another at rest, and a third where bodies strike, slide or roll.
 FLIES, RESTS, STRIKES = REGIMES = ("nothing touches", "bodies rest on each other", "bodies move in contact")
 
@@ -89,7 +91,34 @@ def alike(
 def _begun(simulator: Simulator, log: Recording, window: Window, noise: Mapping[str, float]) -> Window:
     state = start_of(simulator, log, window.begin, noise, window.forward)
     values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
+    if jumps(simulator, log)[window.begin : window.end].any():
+        doubt[JUMPS] = DOUBT * 12**-0.5  # uniform over the interval
     return replace(window, start=values, doubt=doubt)
+
+
+def jumps(simulator: Simulator, log: Recording) -> np.ndarray:
+    """The interval [s] (num_timesteps,) in which the commands of each row jumped, 0 where none did.
+
+    A log has commands at samples; a jump between two of them came at some time since the one before.
+    """
+    acts = getattr(simulator, "acts", None)
+    if acts is None:
+        return np.zeros(len(log))
+    given = log.columns.get(acts, log.t)
+    first = np.flatnonzero(np.diff(given, prepend=-np.inf) > 0)
+    wide = np.zeros(first.size)
+    for name, channel in simulator.channels.items():
+        if channel.kind == "command":
+            change = np.abs(np.diff(log[name][first]))
+            beside = np.maximum(np.append(change[1:], 0.0), np.append(0.0, change[:-1]))
+            wide[1:] = np.where(change > ABRUPT * beside, np.diff(given[first]), wide[1:])
+    return wide[np.searchsorted(first, np.arange(len(log)), side="right") - 1]
+
+
+def earlier(simulator: Simulator, log: Recording, share: float) -> Recording:
+    """A log whose commands jumped this share of an interval earlier."""
+    acts = simulator.acts  # type: ignore[attr-defined]
+    return log.with_columns({acts: log.columns.get(acts, log.t) - share * jumps(simulator, log)})
 
 
 def reaches(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:

@@ -114,3 +114,45 @@ def test_the_command_patches_the_model_and_tells_how_commands_were_held(tmp_path
     assert ranges["fitted"]["actuator:servo.gain"]["nominal"] == 0.0 and "command.delay" in str(
         ranges["not_in_xml"]
     )
+
+
+def test_a_command_that_jumps_between_two_samples_is_no_gap(tmp_path):
+    """A drive that took its commands at 500 Hz, logged at 50 Hz: when a jump came is not in the log."""
+    mujoco = pytest.importorskip("mujoco")
+    from simgap.robots.linear import linearise
+    from simgap.robots.model import Composed
+    from simgap.robots.noise import noises
+    from simgap.robots.whiten import covariances
+    from simgap.robots.windows import JUMPS
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    (tmp_path / "robot.xml").write_text(ROBOT)
+    (tmp_path / "map.toml").write_text(MAP)
+    jumps = (0.513, 1.262, 2.447)
+    robot = mujoco.MjModel.from_xml_string(ROBOT)
+    data, rows = mujoco.MjData(robot), []
+    for step in range(1500):
+        t = 0.002 * step
+        u = 0.3 * np.sin(2 * t) + 0.5 * (sum(t >= at for at in jumps) % 2)
+        if step % 10 == 0:
+            rows.append([t, data.qpos[0], u])
+        data.ctrl[0] = u
+        mujoco.mj_step(robot, data)
+    noise = 4e-4 * np.random.default_rng(0).standard_normal(len(rows))
+    np.savetxt(tmp_path / "log.csv", np.array(rows) + np.outer(noise, [0, 1, 0]), delimiter=",",
+               header="t,q,u", comments="")  # fmt: skip
+    loaded = load_mjcf(tmp_path / "robot.xml", tmp_path / "map.toml")
+    log = loaded.read(tmp_path / "log.csv")
+    effects = effects_of(loaded.simulator, [log], loaded.effects([log]))
+    model = Composed.of(loaded.simulator, [log], effects, noises(loaded.simulator, [log]))
+    held = {"option.hold": {"hold": 1.0}}
+    linear = linearise(model, held, [])
+    mean = np.mean(covariances(model, linear).whitener()(linear.residual) ** 2)
+    doubted = [w for w in model.windows if JUMPS in w.doubt]
+    assert len(doubted) <= len(jumps)
+    assert all(any(log.t[w.begin] - 0.02 < at < log.t[w.end - 1] for at in jumps) for w in doubted)
+    for window in model.windows:
+        window.doubt.pop(JUMPS, None)
+    without = linearise(model, held, [])
+    plain = np.mean(covariances(model, without).whitener()(without.residual) ** 2)
+    assert mean < 0.1 * plain
