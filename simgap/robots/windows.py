@@ -62,6 +62,7 @@ def cut(
         if not restarts(simulator):
             out.append(Window(number, 0, len(log), True, None, {}))
             continue
+        jumped = jumps(simulator, log)
         touching = _touching(simulator, log)
         rests = touching & resting(log, reach)
         turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
@@ -74,7 +75,7 @@ def cut(
             if touching[begin:end].any():
                 regime = RESTS if rests[begin:end].all() else STRIKES
             window = Window(number, begin, end, near, None, {}, regime)
-            out.append(_begun(simulator, log, window, noise))
+            out.append(_begun(simulator, log, window, noise, jumped))
     return out
 
 
@@ -85,13 +86,19 @@ def alike(
     noise: Mapping[str, float],
 ) -> list[Window]:
     """The same windows of other recordings of the same times, begun as those have it."""
-    return [w if w.start is None else _begun(simulator, recordings[w.log], w, noise) for w in windows]
+    jumped = [jumps(simulator, log) for log in recordings]
+    return [
+        w if w.start is None else _begun(simulator, recordings[w.log], w, noise, jumped[w.log])
+        for w in windows
+    ]
 
 
-def _begun(simulator: Simulator, log: Recording, window: Window, noise: Mapping[str, float]) -> Window:
+def _begun(
+    simulator: Simulator, log: Recording, window: Window, noise: Mapping[str, float], jumped: np.ndarray
+) -> Window:
     state = start_of(simulator, log, window.begin, noise, window.forward)
     values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
-    if jumps(simulator, log)[window.begin : window.end].any():
+    if jumped[window.begin : window.end].any():
         doubt[JUMPS] = DOUBT * 12**-0.5  # uniform over the interval
     return replace(window, start=values, doubt=doubt)
 
