@@ -268,6 +268,8 @@ def _digest(path: Path) -> str:
 
 
 TASK_KEYS = {"objects", "moves", "sequence"}  # without any of which there is no task
+MAPS, NO_HAND = {"columns", "topics"}, {"columns", "topics", "rate", "gravity"}  # keys of a rig that tells
+# how files are read, as `inspect --write` makes it, and those beside which it describes no hand
 
 
 def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
@@ -281,8 +283,8 @@ def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tu
     if found[0] is None:
         raise InputError("--task", "missing", f"the task's description, or a task.toml in {folder}")
     as_task, as_rig = (_keys(path) for path in found)
-    if "sequence" in as_task:  # needs no hand, and another task's may lie in its folder
-        found[1] = rig
+    if "sequence" in as_task and not (as_rig & MAPS and as_rig <= NO_HAND):
+        found[1] = rig  # needs no hand, and another task's may lie in its folder
     if as_task and not as_task & TASK_KEYS and (task is not None or as_rig & TASK_KEYS):
         swapped = f"; are --task and --rig {found[1]} swapped?" if as_rig & TASK_KEYS else ""
         raise InputError(

@@ -95,6 +95,10 @@ def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
     other = tmp_path / "other.toml"
     other.write_text('sequence = ["approach", "press"]\n')
     assert described([trial], other, None) == (other, None)  # a plain task needs no hand
+    hand = rig.read_text()
+    rig.write_text('[columns]\nt = {from = "time"}\n')  # but how its files are read, as inspect writes it
+    assert described([trial], other, None) == (other, rig)
+    rig.write_text(hand)
     with pytest.raises(InputError, match=r"--task .*rig.toml: describes no task; .*swapped\?"):
         described([trial], rig, task)
     with pytest.raises(InputError, match=r"--rig .*other.toml: describes a task"):
