@@ -62,6 +62,7 @@ def results() -> str | None:
     if speed is not None:
         seconds = speed["commands"]["identify"]["warm"]
         note += f" `hmmseg identify` of one trial takes {seconds:.1f} s of processor."
+    note += f" Code of {found['made_by']}."
     head = ["", "stand-in recordings", "virtual model, fresh seeds"]
     return f"{markdown(head, rows)}\n\n{note}"
 
