@@ -10,7 +10,7 @@ from rich.table import Table
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
 
 if TYPE_CHECKING:
-    from simgap.effects.base import Effect
+    from simgap.effects.base import HandEffect
 
 
 def plain_name(
@@ -71,7 +71,7 @@ def _part(name: str) -> tuple[str, str] | None:
     return f"{where}: {called}", check.format(where)
 
 
-def _words(name: str) -> tuple[str, str, Effect | None]:
+def _words(name: str) -> tuple[str, str, HandEffect | None]:
     """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
     from simgap.robot_effects import words
 

@@ -14,25 +14,16 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from simgap.channels import ChannelEffect, channel_effects
+from simgap.channels.sensors import LAG
+from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect, Setting
-from simgap.simulators.protocol import Channels, Parameter
+from simgap.simulators.protocol import Channels
 from simgap.simulators.recording import Recording
 
-SHORTEST = 1e-9  # numerics: s: below this nothing is smoothed
 PLACE, TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
 WORDS = {
-    "readout.bias": (
-        "a zero error of a reading",
-        "Record two seconds at rest and compare with the model's value.",
-    ),
-    "readout.drift": ("a reading whose zero drifts", "Record a minute at rest after switching on."),
-    "readout.gain": (
-        "a reading that is off by a factor",
-        "Compare the sensor with a known load or distance; check its unit and scale.",
-    ),
-    "readout.lag": ("a reading that comes late", "Compare time stamps of two channels at a sharp event."),
-    "readout.lowpass": ("a slow filter in a reading", "Look up the filter setting of this channel."),
     "readout.scale": (
         "lengths that are all read too long or too short",
         "Measure a known distance with the tracking system.",
@@ -49,94 +40,27 @@ WORDS = {
         "a tracked point beside the body's origin",
         "Measure from the tracked point to the body's origin.",
     ),
-}
+} | {f"readout.{n}": (e.called, e.check) for n, e in channel_effects().items()}
 
 
 def candidates(setting: Setting) -> Iterator[RobotEffect]:
     """What logs have of their own; one of each kind for every channel that is read by itself; a scale where
     several lengths are read; and of each body's pose."""
     yield from by_log(setting)
-    alone, late_alone = setting.alone(), setting.late_alone()
-    for name in alone:
-        yield RobotEffect(
-            f"readout:{name}.bias", "recorded = true + bias", {"bias": setting.usual(name, 0.03)}, name,
-            read=lambda since, values, theta: values + theta["bias"],
-            undo=lambda since, values, theta: values - theta["bias"],
-        )  # fmt: skip
-    longest = max(float(r.t[-1] - r.t[0]) for r in setting.recordings)
-    for name in alone:
-        unit = setting.simulator.channels[name].unit
-        rate = Parameter(0.0, 0.03 * setting.sd(name) / longest, f"{unit}/s")
-        yield RobotEffect(
-            f"readout:{name}.drift", "recorded = true + rate (t - t0)", {"rate": rate}, name,
-            read=lambda since, values, theta: values + theta["rate"] * since,
-            undo=lambda since, values, theta: values - theta["rate"] * since,
-        )  # fmt: skip
-    for name in alone:
-        yield RobotEffect(
-            f"readout:{name}.gain", "recorded = (1 + gain) true",
-            {"gain": Parameter(0.0, 0.03, "1", low=-0.9)}, name,
-            read=lambda since, values, theta: (1 + theta["gain"]) * values,
-            undo=lambda since, values, theta: values / (1 + theta["gain"]),
-        )  # fmt: skip
-    for name in late_alone:  # a stamp that is late makes the delay negative
-        yield RobotEffect(
-            f"readout:{name}.lag", "recorded(t) = true(t - delay)",
-            {"delay": Parameter(0.0, 0.01, "s", low=-0.2, high=0.5)}, name,
-            read=lambda since, values, theta: delayed(since, values, theta["delay"]),
-            undo=lambda since, values, theta: np.interp(since + theta["delay"], since, values),
-        )  # fmt: skip
-    for name in late_alone:
-        yield RobotEffect(
-            f"readout:{name}.lowpass", "time_constant recorded' + recorded = true",
-            {"time_constant": Parameter(0.0, 0.01, "s", low=0.0, high=0.5)}, name,
-            read=lambda since, values, theta: lowpass(since, values, theta["time_constant"]),
-            undo=lambda since, values, theta: values + theta["time_constant"] * np.gradient(values, since),
-        )  # fmt: skip
+    for effect in channel_effects().values():
+        for name in setting.late_alone() if effect.remembers else setting.alone():
+            yield of_channel(setting, name, effect)
     for body, columns in setting.poses().items():
         place, turn = [columns[a] for a in PLACE], [columns[a] for a in TURN]
         yield from (_lag(body, [*place, *turn]), _turned(body, turn), _offset(body, place, turn))
     yield from scale(setting)
 
 
-def delayed(since: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Values (num_timesteps,) `delay` [s] later, at these times; before their start they were a parabola."""
-    if len(values) < 3:
-        return values
-    late = since - delay
-    slope, bend = onset(since, values)
-    ahead = np.minimum(late - since[0], 0.0)
-    before = values[0] + slope * ahead + 0.5 * bend * ahead**2
-    return np.where(late < since[0], before, np.interp(late, since, values))
-
-
-def onset(since: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """First and second derivative at the start, of the parabola through three early samples."""
-    few = min(2, (len(values) - 1) // 2)
-    a, b = since[few] - since[0], since[2 * few] - since[0]
-    first, second = (values[few] - values[0]) / a, (values[2 * few] - values[0]) / b
-    bend = 2 * (second - first) / (b - a)
-    return float(first - 0.5 * bend * a), float(bend)
-
-
-def lowpass(since: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:
-    """tau y' + y = u for values u (num_timesteps,) linear between samples, exactly.
-
-    Before the start u was a parabola, which y had settled to follow: y = u - tau u' + tau^2 u''.
-    """
-    if time_constant < SHORTEST or len(values) < 3:
-        return values
-    steps = np.diff(since)
-    slopes = np.diff(values) / steps
-    kept = np.exp(-steps / time_constant)
-    out = np.empty_like(values)
-    slope, bend = onset(since, values)
-    out[0] = values[0] - time_constant * slope + time_constant**2 * bend
-    for i, (keep, slope) in enumerate(zip(kept, slopes, strict=True)):
-        # On each piece y = u - tau slope + decaying rest.
-        rest = out[i] - (values[i] - time_constant * slope)
-        out[i + 1] = values[i + 1] - time_constant * slope + keep * rest
-    return out
+def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffect:
+    """An effect on what is read of one channel."""
+    parameters = setting.sized(effect, name)
+    return RobotEffect(f"readout:{name}.{effect.name}", effect.says, parameters, effect.shows,
+                       channel=name, read=effect.read, undo=effect.undo)  # fmt: skip
 
 
 def scale(setting: Setting) -> list[RobotEffect]:
@@ -159,16 +83,13 @@ def scale(setting: Setting) -> list[RobotEffect]:
 
 def _lag(body: str, columns: list[str]) -> RobotEffect:
     def late(window: Recording, channels: Channels, theta) -> Channels:
-        since = window.t - window.t[0]
-        return {n: delayed(since, channels[n], theta["delay"]) for n in columns}
+        return {n: LAG.read(window.t, channels[n], theta) for n in columns}
 
     def in_time(log: Recording, theta) -> Recording:
-        since = log.t - log.t[0]
-        return log.with_columns({n: np.interp(since + theta["delay"], since, log[n]) for n in columns})
+        return log.with_columns({n: LAG.undo(log.t, log[n], theta) for n in columns})
 
-    delay = {"delay": Parameter(0.0, 0.01, "s", low=-0.2, high=0.5)}
-    says = "recorded(t) = true(t - delay), place and orientation alike"
-    return RobotEffect(f"pose:{body}.lag", says, delay, alter=late, restore=in_time)
+    says = f"{LAG.says}, place and orientation alike"
+    return RobotEffect(f"pose:{body}.lag", says, LAG.parameters, alter=late, restore=in_time)
 
 
 def _turned(body: str, turn: list[str]) -> RobotEffect:
