@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 
 from simgap.channels import ChannelEffect, Theta, at_rest, channel_effects
 from simgap.effect import Parameter
-from simgap.generic.trials import Layout, bin_edges, log_power, means, resampled, transformed, windowed
+from simgap.generic.trials import Cut, Layout, bin_edges, log_power, means, resampled, transformed, windowed
 
 FINE = 2048  # numerics: points of the mean course
 SMOOTH = 9  # numerics: coefficients over which a spectrum is smoothed
@@ -194,27 +194,34 @@ def _waves(given: Scene, channel: int, acting: Acting) -> list[np.ndarray]:
     if key in given.cache:
         return given.cache[key]
     lay, name = given.layout, given.layout.ensembles.channels[channel]
-    noise, rng, out = given.floor[channel], np.random.default_rng(0), list[np.ndarray]()
-    rows: list[list[tuple[np.ndarray, ...]]] = [[] for _ in lay.window]
-    for cut in lay.ensembles.sim:
-        t, values = cut.trial.t, cut.trial.channels[name]
-        there = np.isfinite(values)
-        values = np.interp(t, t[there], values[there])
-        hiss = np.sqrt(noise) * rng.standard_normal(t.size)
-        each = [values, hiss] if not key[1] else [read(t - cut.edges[0], v, acting) for v in (values, hiss)]
-        for k in range(len(lay.window)):
-            rows[k].append(tuple(windowed(lay, cut, channel, k, v) for v in (*each, hiss)))
-    for mine in rows:
-        wave, kept, hiss = (transformed(np.array(v)) for v in zip(*mine, strict=True))
-        if key[1]:
-            now, left, before = (
-                np.maximum(uniform_filter1d((v**2).mean(0), SMOOTH, mode="nearest"), 1e-300)
-                for v in (wave, kept, hiss)
-            )
-            wave = wave * np.sqrt(np.maximum(now + noise * (1 - left / before), 0.0) / now)
-        out.append(wave)
+    cuts, noise = lay.ensembles.sim, given.floor[channel]
+
+    def cut_up(cut: Cut, values: np.ndarray) -> list[np.ndarray]:
+        values = read(cut.trial.t - cut.edges[0], values, acting) if key[1] else values
+        return [transformed(windowed(lay, cut, channel, k, values)) for k in range(len(lay.window))]
+
+    each = [cut_up(cut, _bridged(cut.trial.t, cut.trial.channels[name])) for cut in cuts]
+    out = [np.array(waves) for waves in zip(*each, strict=True)]
+    hiss = np.sqrt(noise) * np.random.default_rng(0).standard_normal(cuts[0].trial.t.size)
+    alone = given.cache[(channel, "noise", key[1])] = [_smooth(w) for w in cut_up(cuts[0], hiss)]
+    if key[1]:
+        _waves(given, channel, {})
+        for k, before in enumerate(given.cache[(channel, "noise", ())]):
+            now = _smooth(out[k])
+            out[k] = out[k] * np.sqrt(np.maximum(now + noise * (1 - alone[k] / before), 0.0) / now)
     given.cache[key] = out
     return out
+
+
+def _bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    there = np.isfinite(values)
+    return values if there.all() else np.interp(t, t[there], values[there])
+
+
+def _smooth(waves: np.ndarray) -> np.ndarray:
+    """Power (window,) of coefficients (..., window), smoothed."""
+    power = np.square(np.atleast_2d(waves)).mean(0)
+    return np.maximum(uniform_filter1d(power, SMOOTH, mode="nearest"), 1e-300)
 
 
 def ring_waves(given: Scene, t: np.ndarray) -> np.ndarray:

@@ -10,14 +10,14 @@ a Parameter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from simgap.channels import ChannelEffect, channel_effects
+from simgap.channels import ChannelEffect, Theta, channel_effects
 from simgap.channels.sensors import LAG
 from simgap.effect import Parameter
-from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robot_effects.base import Alter, RobotEffect, Setting
 from simgap.simulators.protocol import Channels
 from simgap.simulators.recording import Recording
 
@@ -51,9 +51,15 @@ def candidates(setting: Setting) -> Iterator[RobotEffect]:
         for name in setting.late_alone() if effect.remembers else setting.alone():
             yield of_channel(setting, name, effect)
     for body, columns in setting.poses().items():
-        place, turn = [columns[a] for a in PLACE], [columns[a] for a in TURN]
-        yield from (_lag(body, [*place, *turn]), _turned(body, turn), _offset(body, place, turn))
-    yield from scale(setting)
+        yield from of_pose(body, columns)
+    known = setting.simulator.channels
+    lengths = [n for n in setting.compared("position") if known[n].unit == "m"]
+    if len(lengths) > 1:
+        yield _of_columns(
+            "readout.scale", "recorded positions = (1 + scale) true ones",
+            {"scale": Parameter(0.0, 0.02, "1", low=-0.9)},
+            lambda t, columns, theta, way: {n: (1 + theta["scale"]) ** way * columns[n] for n in lengths},
+        )  # fmt: skip
 
 
 def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffect:
@@ -63,66 +69,51 @@ def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffec
                        channel=name, read=effect.read, undo=effect.undo)  # fmt: skip
 
 
-def scale(setting: Setting) -> list[RobotEffect]:
-    """One for all lengths that are read, where there are several."""
-    known = setting.simulator.channels
-    names = [n for n in setting.compared("position") if known[n].unit == "m"]
-    if len(names) < 2:
-        return []
-
-    def scaled(window: Recording, channels: Channels, theta) -> Channels:
-        return {n: (1 + theta["scale"]) * channels[n] for n in names}
-
-    def unscaled(log: Recording, theta) -> Recording:
-        return log.with_columns({n: log[n] / (1 + theta["scale"]) for n in names})
-
-    size = Parameter(0.0, 0.02, "1", low=-0.9)
-    says = "recorded positions = (1 + scale) true ones"
-    return [RobotEffect("readout.scale", says, {"scale": size}, alter=scaled, restore=unscaled)]
+Turn = Callable[[np.ndarray, Channels, Theta, float], Channels]  # (times, columns, theta, 1 there or -1 back)
 
 
-def _lag(body: str, columns: list[str]) -> RobotEffect:
-    def late(window: Recording, channels: Channels, theta) -> Channels:
-        return {n: LAG.read(window.t, channels[n], theta) for n in columns}
+def _of_columns(name: str, says: str, parameters: Mapping[str, Parameter], act: Turn) -> RobotEffect:
+    """An effect on several columns at once, there and back."""
+    return RobotEffect(
+        name,
+        says,
+        parameters,
+        alter=lambda window, channels, theta: act(window.t, channels, theta, 1.0),
+        restore=lambda log, theta: log.with_columns(act(log.t, log.columns, theta, -1.0)),
+    )
 
-    def in_time(log: Recording, theta) -> Recording:
-        return log.with_columns({n: LAG.undo(log.t, log[n], theta) for n in columns})
 
-    says = f"{LAG.says}, place and orientation alike"
-    return RobotEffect(f"pose:{body}.lag", says, LAG.parameters, alter=late, restore=in_time)
+def of_pose(body: str, columns: Mapping[str, str]) -> Iterator[RobotEffect]:
+    """What may be wrong with a body's pose as a whole."""
+    place, turn = [columns[a] for a in PLACE], [columns[a] for a in TURN]
 
+    def late(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
+        read = LAG.read if way > 0 else LAG.undo
+        assert read is not None
+        return {n: read(t, known[n], theta) for n in (*place, *turn)}
 
-def _turned(body: str, turn: list[str]) -> RobotEffect:
-    def by(columns: Mapping[str, np.ndarray], theta, sign: float) -> dict[str, np.ndarray]:
-        half = 0.5 * sign * np.array([theta["about_x"], theta["about_y"], theta["about_z"]])
+    def turned(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
+        half = 0.5 * way * np.array([theta[f"about_{a}"] for a in PLACE])
         small = np.array([np.sqrt(max(1.0 - half @ half, 0.0)), *half])
-        found = product(np.array([columns[n] for n in turn]), small[:, None])
+        found = product(np.array([known[n] for n in turn]), small[:, None])
         return dict(zip(turn, found, strict=True))
 
+    def offset(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
+        return _shifted(known, place, turn, way * np.array([theta[a] for a in PLACE]))
+
+    yield _of_columns(f"pose:{body}.lag", f"{LAG.says}, place and orientation alike", LAG.parameters, late)
     angles = {f"about_{a}": Parameter(0.0, 0.01, "rad", low=-0.5, high=0.5) for a in PLACE}
-    return RobotEffect(
-        f"pose:{body}.turned",
-        "the frame that is read is turned against the body's",
-        angles,
-        alter=lambda window, channels, theta: by(channels, theta, 1.0),
-        restore=lambda log, theta: log.with_columns(by(log.columns, theta, -1.0)),
+    yield _of_columns(
+        f"pose:{body}.turned", "the frame that is read is turned against the body's", angles, turned
     )
+    says = "the point that is read lies beside the body's origin, fixed to the body"
+    yield _of_columns(f"pose:{body}.offset", says, {a: Parameter(0.0, 0.003, "m") for a in PLACE}, offset)
 
 
-def _offset(body: str, place: list[str], turn: list[str]) -> RobotEffect:
-    def by(columns: Mapping[str, np.ndarray], theta, sign: float) -> dict[str, np.ndarray]:
-        arm = sign * np.array([theta[a] for a in PLACE])
-        moved = rotated(np.array([columns[n] for n in turn]), arm)
-        return {n: columns[n] + d for n, d in zip(place, moved, strict=True)}
-
-    lengths = {a: Parameter(0.0, 0.003, "m") for a in PLACE}
-    return RobotEffect(
-        f"pose:{body}.offset",
-        "the point that is read lies beside the body's origin, fixed to the body",
-        lengths,
-        alter=lambda window, channels, theta: by(channels, theta, 1.0),
-        restore=lambda log, theta: log.with_columns(by(log.columns, theta, -1.0)),
-    )
+def _shifted(columns: Channels, place: Sequence[str], turn: Sequence[str], arm: np.ndarray) -> Channels:
+    """Places of a point that lies by an arm (3,) in the body's frame beside that of `columns`."""
+    moved = rotated(np.array([columns[n] for n in turn]), arm)
+    return {n: columns[n] + d for n, d in zip(place, moved, strict=True)}
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -146,34 +137,26 @@ def rotated(turn: np.ndarray, arm: np.ndarray) -> np.ndarray:
     return arm[:, None] + 2 * (w * once + np.cross(axis, once, axis=0))
 
 
-def by_log(setting: Setting) -> list[RobotEffect]:
+def by_log(setting: Setting) -> Iterator[RobotEffect]:
     """One for the shift, one for each pose's offset; none is a cause."""
     known: Mapping[str, Parameter] = getattr(setting.simulator, "by_log", {})
-    logs, out = [r.name for r in setting.recordings], []
-    if "shift" in known:
-        out.append(_log_shift(logs, known["shift"], setting.compared()))
-    if "offset" in known:
-        out += [_log_offset(logs, known["offset"], body, c) for body, c in setting.poses().items()]
-    return out
+    logs, every = [r.name for r in setting.recordings], setting.compared()
 
+    def of_log(name: str, says: str, each: Mapping[str, Parameter], alter: Alter) -> RobotEffect:
+        return RobotEffect(name, says, each, alter=alter, fitted=True, by_log=True)
 
-def _log_shift(logs: list[str], one: Parameter, columns: list[str]) -> RobotEffect:
-    def shifted(window: Recording, channels: Channels, theta) -> Channels:
+    def late(window: Recording, channels: Channels, theta: Theta) -> Channels:
         since = window.t - window.t[0]
-        return {n: np.interp(since - theta[window.name], since, channels[n]) for n in columns}
+        return {n: np.interp(since - theta[window.name], since, channels[n]) for n in every}
 
-    says = "the log was started by hand, so much before the simulator"
-    return RobotEffect("log.shift", says, dict.fromkeys(logs, one), alter=shifted, fitted=True, by_log=True)
+    if "shift" in known:
+        says = "the log was started by hand, so much before the simulator"
+        yield of_log("log.shift", says, dict.fromkeys(logs, known["shift"]), late)
+    for body, columns in setting.poses().items() if "offset" in known else ():
 
+        def moved(window: Recording, channels: Channels, theta: Theta, columns=columns) -> Channels:
+            arm = np.array([theta[f"{window.name}.{a}"] for a in PLACE])
+            return _shifted(channels, [columns[a] for a in PLACE], [columns[a] for a in TURN], arm)
 
-def _log_offset(logs: list[str], one: Parameter, body: str, columns: Mapping[str, str]) -> RobotEffect:
-    place, turn = [columns[a] for a in PLACE], [columns[a] for a in TURN]
-
-    def moved(window: Recording, channels: Channels, theta) -> Channels:
-        arm = np.array([theta[f"{window.name}.{a}"] for a in PLACE])
-        by = rotated(np.array([channels[n] for n in turn]), arm)
-        return {n: channels[n] + d for n, d in zip(place, by, strict=True)}
-
-    each = {f"{log}.{a}": one for log in logs for a in PLACE}
-    says = "where the marker sits on the body"
-    return RobotEffect(f"log.{body}.offset", says, each, alter=moved, fitted=True, by_log=True)
+        each = {f"{log}.{a}": known["offset"] for log in logs for a in PLACE}
+        yield of_log(f"log.{body}.offset", "where the marker sits on the body", each, moved)
