@@ -395,13 +395,13 @@ def _candidates(white: Sequence[Block], found: Sequence[Part], count: int) -> li
         return []
     gains = [float(np.square(_whitened(white, p.shift)).sum()) for p in found]
     forms = [list(found)] + [[found[int(np.argmax(gains))]]] * (len(found) > 1)
-    return [_candidate(white, parts, sum(p.shift for p in parts), count) for parts in forms]
+    return [_candidate(white, parts, np.sum([p.shift for p in parts], 0), count) for parts in forms]
 
 
 def _joint(given: Scene, white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
     """The effects of a joint fit as candidates where they are together; what they do only together is parted
     evenly."""
-    whole = sum(p.shift for p in found)
+    whole = np.sum([p.shift for p in found], 0)
     names, blocks = (
         list(dict.fromkeys(s.effect for p in found for s in p.slots)),
         {b.channel: b for b in white},
@@ -419,7 +419,7 @@ def _joint(given: Scene, white: Sequence[Block], found: Sequence[Part], count: i
             if mine.any():
                 kept = tuple(s for s in p.slots if s.effect == name)
                 own.setdefault(name, []).append(Part(kept, p.u[mine], p.shift, p.slopes[:, mine]))
-    more = (whole - sum(alone.values())) / len(names)
+    more = (whole - np.sum(list(alone.values()), 0)) / len(names)
     return [_candidate(white, own[name], alone[name] + more, count) for name in names]
 
 
