@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -174,7 +175,7 @@ def write_rerun(path: Path, found: Sequence[Course]) -> None:
         InputError: rerun-sdk is not installed.
     """
     try:
-        import rerun
+        rerun: Any = importlib.import_module("rerun")
     except ImportError:
         raise InputError("--rerun", "needs rerun-sdk", "pip install rerun-sdk") from None
     stream = rerun.RecordingStream("hmmseg")
