@@ -10,7 +10,9 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
   delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
   degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
   how little they tell of theta. Where the prior decides, motions agree and yet nothing is known: to it comes
-  what delta moves by when the prior's mean, one more observation, moves by its sd.
+  what delta moves by when the prior's mean, one more observation, moves by its sd. And what a model gets
+  wrong alike in all motions shows in what a second small change would do to the first: to it comes how far
+  such pairs scatter, as Bayesian model averaging has it.
 * *Whether*: a change is one where delta is that far from nothing and which predicts motions of NEW that took
   no part better than nothing does, by a share that matters. Where OLD made the same motions, what the model
   gets wrong in them is known, and the nats gained must outweigh the number of candidates; a row counts as
@@ -27,8 +29,8 @@ A change of what is positive is of its logarithm (a gain doubled: log 2), of all
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -241,8 +243,9 @@ class Comparison:
         scan = self.scanned()
         names = sorted(scan, key=lambda n: scan[n][0])[:TRIED]
         singles = [self.fit((n,), [scan[n][1], *self._rungs(scan[n][1])]) for n in names]
-        best = sorted(singles, key=lambda c: c.left.mean())[:PAIRED]
-        if not best or not self.excess(best[0]).mean() > 0:  # no more is left than of old logs
+        fit = sorted(singles, key=lambda c: c.left.mean())
+        best = [c for c in fit if self.needed(c, nothing)][:PAIRED]
+        if not best:
             return [nothing, *singles]
         self.runs.scaled(WIDER[0] * self.old.scale)
         scan = self.scanned(best[0])
@@ -251,11 +254,28 @@ class Comparison:
             pairs[frozenset((best[0].effects[0], name))] = (best[0], name, scan[name][1])
         for one, two in itertools.combinations(best, 2):
             pairs.setdefault(frozenset((*one.effects, *two.effects)), (one, two.effects[0], two.x))
+        more = self.excess(best[0]).mean() > 0  # else no second change is sought, only what it would do
         both = [
-            self.fit((*one.effects, name), [np.concatenate([one.x, r]) for r in (x, *self._rungs(x))])
+            self.fit(
+                (*one.effects, name),
+                [np.concatenate([one.x, r]) for r in (x, *(self._rungs(x) if more else ()))],
+            )
             for one, name, x in pairs.values()
         ]
-        return [nothing, *singles, *both]
+        rivals = {n for c in singles if beaten(c, best[0]) > RIVAL for n in c.effects}
+        return [nothing, *(widened(c, both, rivals) for c in singles), *both]
+
+
+def widened(change: Change, pairs: Sequence[Change], rivals: Collection[str]) -> Change:
+    """With the variance by what else may be a little otherwise: a second effect, no rival of the first, moves
+    it, and counts as much as it cannot be ruled out."""
+    own, k = {*change.effects}, change.x.size
+    both = [c for c in pairs if own < {*c.effects} and not ({*c.effects} - own) & {*rivals}]
+    if not both:
+        return change
+    moved = np.array([(c.x[:k] if c.effects[0] in own else c.x[-k:]) - change.x for c in both])
+    weight = np.array([beaten(c, change) for c in both])
+    return replace(change, sd=np.sqrt(change.sd**2 + weight @ moved**2 / (1 + weight.sum())))
 
 
 def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -489,7 +509,8 @@ def _concluded(
     every = sorted(tried[1:], key=lambda c: c.left.mean())
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
     best = next((c for c in singles if found.needed(c, nothing)), nothing)
-    best = next((c for c in pairs if best.effects and found.needed(c, best)), best)
+    if best.effects and found.excess(best).mean() > 0:  # more is left than of old logs
+        best = next((c for c in pairs if found.needed(c, best)), best)
     others = [
         c
         for c in (singles if len(best.effects) == 1 else pairs)

@@ -13,7 +13,7 @@ from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Changes, by_chance, changes, jackknife
+from simgap.robots.changes import Change, Changes, by_chance, changes, jackknife, widened
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -148,6 +148,21 @@ def test_what_a_prior_leaves_open_adds_to_what_motions_say():
     parts = [rng.normal(size=(5, 1)) for _ in range(2)]
     (alone, few), (more, many) = jackknife(parts), jackknife(parts, np.array([4.0]))
     assert more[0] == pytest.approx(np.hypot(alone[0], 2.0)) and many[0] > few[0]
+
+
+def test_a_size_takes_in_what_a_second_small_change_would_do_to_it():
+    left = np.array([1.0, 1.0, 1.1, 0.9])
+
+    def change(effects: tuple[str, ...], *x: float) -> Change:
+        x_ = np.array(x)
+        return Change(effects, x_, np.full(x_.size, 0.01), np.full(x_.size, 8.0), 0.0, left, np.zeros(0))
+
+    one = change(("gain",), 0.7)
+    pairs = [change(("gain", "lag"), 0.73, 1.0), change(("mass", "gain"), 0.4, 0.1)]
+    found = widened(one, pairs, {"mass"})  # what could stand in its place says nothing of its size
+    weight = 0.5  # as good from motion to motion: by chance in half of cases
+    assert found.sd[0] == pytest.approx(np.sqrt(0.01**2 + weight * 0.03**2 / (1 + weight)))
+    assert widened(one, pairs[1:], {"mass"}) is one
 
 
 def test_gains_from_motion_to_motion_are_judged_by_student():
