@@ -54,6 +54,7 @@ PARTS = {
     "actuator.gain": ("strength", "Command a known torque of {0}, or hold a known weight, and measure."),
     "actuator.damping": ("velocity gain", "Look up the velocity gain in the drive of {0}."),
     "actuator.limit": ("largest force", "Look up the current limit in the drive of {0}."),
+    "actuator.fade": ("a drive that falls behind", "Load {0} up to its most and measure its torque."),
     "gravity.direction": ("a base that is tilted", "Put a level on the robot's base."),
 }
 
