@@ -31,10 +31,12 @@ from hmmseg_cli.console import (
 )
 from hmmseg_cli.diagnose_robot import (
     CandidateOption,
+    HistoryOption,
     MapOption,
     MjcfOption,
     OwnSimulator,
     PatchOption,
+    RerunOption,
     SimulatorOption,
     compare_robot,
     diagnose_robot,
@@ -101,6 +103,8 @@ def diagnose(
     model: ModelFile = None,
     effect: EffectOption = None,
     patch: PatchOption = None,
+    history: HistoryOption = None,
+    rerun: RerunOption = None,
     json: JsonOption = None,
     figures: FiguresOption = None,
     report: ReportOption = None,
@@ -115,7 +119,7 @@ def diagnose(
         paths = distinct_trials(trials)
         if model is not None and mjcf is None and model.suffix.lower() != ".npz":
             model, mjcf = None, model  # a robot's, not the emissions of a task
-        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
+        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch, history, rerun)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
             if healthy:

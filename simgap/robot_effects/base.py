@@ -27,8 +27,9 @@ class RobotEffect(Effect):
     `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
     `alter` gives several channels or such as depend on others, `restore` undoes it on a whole log. `command`
     maps a whole recording to one whose commands are as the drives took them. `model` maps short names to the
-    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself; `by_log`:
-    each log has its own parameters, which no other log tells.
+    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself; `widened`:
+    how many usual sizes its parameters' sd are, where that is of what a model states and nobody measured;
+    `by_log`: each log has its own parameters, which no other log tells.
     """
 
     channel: str = ""
@@ -39,6 +40,7 @@ class RobotEffect(Effect):
     command: Command | None = None
     model: Mapping[str, str] = field(default_factory=dict)
     fitted: bool = False
+    widened: float = 0.0
     by_log: bool = False
 
     @property
