@@ -22,7 +22,7 @@ from simgap.generic.trials import Cut, Layout, bin_edges, log_power, means, resa
 
 FINE = 2048  # numerics: points of the mean course
 SMOOTH = 9  # numerics: coefficients over which a spectrum is smoothed
-LINE = 1e-12  # numerics: of a channel: a straight line, which is in no spectrum, bends less from step to step
+LINE = 1e-12  # numerics: of a channel: a straight line bends less from step to step
 LEAST = 4  # numerics: coefficients that a mean power is taken of
 COARSE = 10.0  # prior: what a given simulation is off by, of what a calibrated robot's sensors are
 NOISE = "noise_level"
@@ -98,7 +98,7 @@ class Scene:
     """What predictions start from: the layout, mean real boundaries and the mean simulated course on them.
 
     `t` (FINE,) [s] and `course` (C, FINE); `floor` (C,): power of the simulated noise; `ring`: the
-    oscillation looked for. `cache`: spectra computed so far.
+    oscillation looked for. `cache`: by channel, spectra as simulated, and the power of noise alone.
     """
 
     layout: Layout
@@ -107,7 +107,7 @@ class Scene:
     course: np.ndarray
     floor: np.ndarray
     ring: Ring | None = None
-    cache: dict[tuple, list[np.ndarray]] = field(default_factory=dict, repr=False)
+    cache: dict[int, tuple[list[np.ndarray], list[np.ndarray]]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def bins(self) -> np.ndarray:
@@ -190,31 +190,27 @@ def _waves(given: Scene, channel: int, acting: Acting) -> list[np.ndarray]:
     What lies at the noise floor is the sensor's own noise, which is added behind what it is read through: its
     power there is put back to what it was, by what becomes of noise alone.
     """
-    known = {f"force_{e.name}" for e in channel_effects().values()}
-    key = channel, tuple((n, *sorted(v.items())) for n, v in sorted(acting.items()) if n in known)
-    if key in given.cache:
-        return given.cache[key]
     lay, name = given.layout, given.layout.ensembles.channels[channel]
-    cuts, noise = lay.ensembles.sim, given.floor[channel]
-
-    t, x = given.t, given.course[channel]
-    if key[1] and np.ptp(np.diff(read(t, x, acting) - x)) < LINE * (1 + np.abs(x).max()):
-        return _waves(given, channel, {})
+    cuts, noise, x = lay.ensembles.sim, given.floor[channel], given.course[channel]
+    straight = np.ptp(np.diff(read(given.t, x, acting) - x)) < LINE * (1 + np.abs(x).max())  # in no spectrum
+    if straight and channel in given.cache:
+        return given.cache[channel][0]
 
     def cut_up(cut: Cut, values: np.ndarray) -> list[np.ndarray]:
-        values = read(cut.trial.t - cut.edges[0], values, acting) if key[1] else values
+        values = values if straight else read(cut.trial.t - cut.edges[0], values, acting)
         return [transformed(windowed(lay, cut, channel, k, values)) for k in range(len(lay.window))]
 
     each = [cut_up(cut, _bridged(cut.trial.t, cut.trial.channels[name])) for cut in cuts]
     out = [np.array(waves) for waves in zip(*each, strict=True)]
     hiss = np.sqrt(noise) * np.random.default_rng(0).standard_normal(cuts[0].trial.t.size)
-    alone = given.cache[(channel, "noise", key[1])] = [_smooth(w) for w in cut_up(cuts[0], hiss)]
-    if key[1]:
-        _waves(given, channel, {})
-        for k, before in enumerate(given.cache[(channel, "noise", ())]):
-            now = _smooth(out[k])
-            out[k] = out[k] * np.sqrt(np.maximum(now + noise * (1 - alone[k] / before), 0.0) / now)
-    given.cache[key] = out
+    alone = [_smooth(w) for w in cut_up(cuts[0], hiss)]
+    if straight:
+        given.cache[channel] = out, alone
+        return out
+    _waves(given, channel, {})
+    for k, before in enumerate(given.cache[channel][1]):
+        now = _smooth(out[k])
+        out[k] = out[k] * np.sqrt(np.maximum(now + noise * (1 - alone[k] / before), 0.0) / now)
     return out
 
 
@@ -244,10 +240,7 @@ def ring_waves(given: Scene, t: np.ndarray) -> np.ndarray:
 # grid and refined. Intervals from the scatter between trials (jackknife), which needs no noise model.
 
 DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
-LIGHTEST, HEAVIEST = (
-    1e-3,
-    0.25,
-)  # chosen: damping below which it is no ring, and beyond which a course is none
+LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: damping below or beyond which it is no ring
 FREQUENCIES = 80  # numerics: where searches start
 SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
 SHORTEST = 12  # numerics: samples of a window in which an oscillation is looked for
