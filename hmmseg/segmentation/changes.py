@@ -42,7 +42,6 @@ from hmmseg.segmentation.boundaries import (
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
-LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 
@@ -68,20 +67,6 @@ class Penetration:
     sd_rate: float
     form: float
     hidden: bool = False
-    ahead: np.ndarray | None = None
-
-    @property
-    def free_place(self) -> np.ndarray:
-        """Place (num_samples,) [m] of a thing that is apart."""
-        return self.place if self.ahead is None else self.place + self.ahead
-
-    def restless(self, n: int) -> float:
-        """How much the speed of what comes down wanders up to sample n: its variance a second [m^2/s^3]."""
-        last = slice(max(n - LOOKED_BACK, 0), n + 1)
-        change, step = np.diff(self.rate[0, last]), np.diff(self.t[last])
-        there = np.isfinite(change)
-        wandered = float(np.sum(change[there] ** 2)) - 2 * self.sd_rate**2 * there.sum()
-        return max(wandered, 0.0) / float(step[there].sum()) if there.any() else 0.0
 
 
 def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -102,21 +87,17 @@ def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.n
     log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
     pushes = np.where(force, log_ndtr(pressed / sd_pressed), 0.0) - log_force
     silent = np.where(force, _log_student(pressed / sd_apart) - np.log(sd_apart), 0.0)
-    # What stands on its corner comes to lie flat: its place is anywhere between.
-    ahead = np.zeros(c.t.size) if c.ahead is None else c.ahead
-    place, sd_place = place + ahead / 2, np.sqrt(c.sd_place**2 + ahead**2 / 12)
-    within = np.where(position, log_ndtr(place / sd_place), 0.0) - log_place
-    apart = np.where(position, c.free_place, 0.0)
-    beyond = np.where(position, log_ndtr(-apart / c.sd_place), 0.0) - log_place
+    within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
+    beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
     sd_force = np.hypot(sd_pressed, c.form * np.abs(pressed))
-    both = np.hypot(sd_force, sd_place)
-    depth = (sd_place**2 * pressed + sd_force**2 * place) / both**2
+    both = np.hypot(sd_force, c.sd_place)
+    depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
     # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
     # is lost in it, that would count against contact, of which force alone tells.
     deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
-    agree = agree + np.log(np.maximum(ROOT_2PI * sd_place / deep, 1.0))
-    held = agree + log_ndtr(depth * both / (sd_force * sd_place))
+    agree = agree + np.log(max(ROOT_2PI * c.sd_place / deep, 1.0))
+    held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))
     held = np.where(force & position & (not c.hidden), held, pushes + within)
     moved, rung = (STRAY, SELDOM) if making else (SELDOM, STRAY)
     neither = np.log(STRAY * SELDOM) - log_force - log_place
@@ -194,7 +175,7 @@ class Change:
     """Contacts made, or broken, at one boundary: of two, the last one made and the first one broken count.
 
     `timing` [s] is the uncertainty of the forces' own clock. `slips` [m]: at which penetration each contact
-    that is broken slides. `unmoved`: the contacts, had the block stood still where it rests later.
+    that is broken slides.
     """
 
     contacts: tuple[Penetration, ...]
@@ -203,7 +184,6 @@ class Change:
     kind: Kind
     timing: float
     slips: tuple[float, ...] = ()
-    unmoved: tuple[Penetration, ...] = ()
 
     @property
     def sort(self) -> tuple[Kind, int]:
@@ -233,15 +213,11 @@ def cut(change: Change) -> Change | None:
     if not near.size:
         return None
     index = index[near[0] : near[-1] + 2]
-
-    def near_it(contacts: Sequence[Penetration]) -> tuple[Penetration, ...]:
-        return tuple(
-            replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index],
-                    ahead=None if c.ahead is None else c.ahead[index])
-            for c in contacts
-        )  # fmt: skip
-
-    return replace(change, contacts=near_it(change.contacts), unmoved=near_it(change.unmoved))
+    contacts = tuple(
+        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
+        for c in change.contacts
+    )
+    return replace(change, contacts=contacts)
 
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
@@ -283,7 +259,7 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
     z = [np.zeros(0)]
     for change in changes:
         if not change.making and len(change.contacts) == num_contacts:
-            z += [c.pressed[c.free_place < -SURE * c.sd_place] / c.sd_apart for c in change.contacts]
+            z += [c.pressed[c.place < -SURE * c.sd_place] / c.sd_apart for c in change.contacts]
     z2 = np.concatenate(z) ** 2
     z2 = z2[np.isfinite(z2)]
     if not z2.size:
@@ -295,7 +271,6 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
 
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
 VIEWS = (0.6, 0.2, 0.2)
-STOOD = 0.5  # prior: that a block stood still until the later finger touched it
 FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 
 
@@ -306,16 +281,10 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
     silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
     meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
 
-    Of two touches the later comes when both fingers are the block's width apart, as the first pushes the
-    block; or, of a heavy block in soft pads and touches some ms apart, before it has moved (STOOD).
+    Of two touches the later comes when both fingers are the block's width apart: the first pushes the block.
     """
-    contacts, unmoved = (
-        [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in each]
-        for each in (change.contacts, change.unmoved)
-    )
+    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
     views, weight = [contacts], (1.0,)
-    if unmoved:
-        views, weight = [contacts, unmoved], (1 - STOOD, STOOD)
     if change.slips:
         sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
         opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
@@ -373,7 +342,7 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
     """The crossing of interval n: by position where apart, by force where there is contact."""
     making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
-    pressed, gap = c.pressed[touching], c.free_place[apart]
+    pressed, gap = c.pressed[touching], c.place[apart]
     noise = c.sd_pressed * (known.louder if making else 1.0)
     sd_pressed = float(np.hypot(noise, c.form * abs(pressed)))
     if c.hidden:  # a rigid pad hides its compression
@@ -382,9 +351,7 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
     before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
         found = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-        if len(change.contacts) == 1:  # a block is set down in several motions
-            return replace(found, restless=c.restless(n))
-        if n == 0:
+        if n == 0 or len(change.contacts) == 1:
             return found
         then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
         return replace(found, earlier=then) if np.isfinite(then).all() else found

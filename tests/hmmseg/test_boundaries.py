@@ -15,8 +15,6 @@ from hmmseg.segmentation.boundaries import (
     UNIFORM,
     BoundaryPosterior,
     Crossing,
-    _hermite,
-    _hermite_slopes,
     _minimum_jerk,
     _minimum_jerk_slope,
     combine,
@@ -76,18 +74,6 @@ def test_without_noise_the_root_is_found(kind, root):
     assert quantiles(density, 0.5) == pytest.approx(root, abs=0.001 + 0.5 * sd[kind])
 
 
-def test_hermite_slopes_are_the_derivatives_of_the_cubic():
-    u = np.linspace(0.1, 0.9, 7)
-    numeric = [(a - b) / 2e-6 for a, b in zip(_hermite(u + 1e-6), _hermite(u - 1e-6), strict=True)]
-    np.testing.assert_allclose(_hermite_slopes(u), numeric, atol=1e-8)
-
-
-def test_the_cubic_passes_through_values_and_velocities():
-    ends = np.array([0.0, 1.0])
-    np.testing.assert_allclose(_hermite(ends), [[1, 0], [0, 0], [0, 1], [0, 0]], atol=1e-12)
-    np.testing.assert_allclose(_hermite_slopes(ends), [[0, 0], [1, 0], [0, 0], [0, 1]], atol=1e-12)
-
-
 def test_last_and_first_of_two_against_monte_carlo():
     # Broad enough that the grid of nodes resolves them.
     ends = ((-1.2e-3, 8e-4), (-7e-4, 1.3e-3))
@@ -99,12 +85,6 @@ def test_last_and_first_of_two_against_monte_carlo():
         expected = np.bincount(chosen(*drawn), minlength=POINTS) / num
         found = combined(pair, WIDTH)
         np.testing.assert_allclose(found, (1 - UNIFORM) * expected + UNIFORM / POINTS, atol=5e-3)
-
-
-def test_known_needs_every_number():
-    assert SOME[0].known
-    for name in ("left", "right", "v_left", "v_right", "sd_left", "sd_right", "sd_v"):
-        assert not replace(SOME[0], **{name: np.nan}).known
 
 
 def test_quantiles_and_moments_of_a_known_distribution():
@@ -252,34 +232,3 @@ def test_ninety_percent_intervals_cover(case):
     share = coverage(case, np.random.default_rng(3))
     # Wider than nominal by design: bends that the cubic misses, a uniform part.
     assert 0.86 < share < 0.99, share
-
-
-def halted(rng: np.random.Generator, spread: float) -> tuple[float, Crossing]:
-    """A landing within whose interval one motion ends and another begins: when, and what its ends show."""
-    step = WIDTH / 500
-    while True:
-        rate = 0.05 + np.cumsum(np.r_[0.0, spread * np.sqrt(step) * rng.standard_normal(500)])
-        value = np.r_[0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * step)] - rng.uniform(0, 3e-3)
-        crossed = np.flatnonzero((value[:-1] < 0) & (value[1:] >= 0))
-        if value[0] < 0 and crossed.size == 1 and value[-1] > 0:
-            noise = 2e-5 * rng.standard_normal(2)
-            ends = value[0] + noise[0], value[-1] + noise[1], rate[0], rate[-1]
-            return crossed[0] * step, Crossing(*ends, 2e-5, 2e-5, 2e-3, "impact")
-
-
-def test_a_landing_by_several_motions_within_a_sample_is_as_uncertain_as_they_are():
-    rng, spread = np.random.default_rng(3), 0.5  # m/s after a second: 0.11 after a sample
-    held = {False: 0, True: 0}
-    for _ in range(200):
-        root, c = halted(rng, spread)
-        for told in held:
-            density = crossing_density([replace(c, restless=spread**2 * told)], WIDTH)
-            low, high = np.interp([0.05, 0.95], np.cumsum(density), NODES)
-            held[told] += low - 1e-3 <= root <= high + 1e-3
-    assert held[True] > 0.75 * 200 > held[False] + 10
-
-
-def test_one_motion_is_no_less_certain_for_what_several_could_do():
-    c = linear(0.03, 0.02, "impact", sd=2e-5)
-    one, either = (crossing_density([replace(c, restless=q)], WIDTH) for q in (0.0, 0.1))
-    assert np.abs(np.cumsum(one) - np.cumsum(either)).max() < 0.05
