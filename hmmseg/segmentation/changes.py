@@ -42,6 +42,7 @@ from hmmseg.segmentation.boundaries import (
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
+LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 
@@ -67,6 +68,14 @@ class Penetration:
     sd_rate: float
     form: float
     hidden: bool = False
+
+    def restless(self, n: int) -> float:
+        """How much the speed of what comes down wanders up to sample n: its variance a second [m^2/s^3]."""
+        last = slice(max(n - LOOKED_BACK, 0), n + 1)
+        change, step = np.diff(self.rate[0, last]), np.diff(self.t[last])
+        there = np.isfinite(change)
+        wandered = float(np.sum(change[there] ** 2)) - 2 * self.sd_rate**2 * there.sum()
+        return max(wandered, 0.0) / float(step[there].sum()) if there.any() else 0.0
 
 
 def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -175,7 +184,7 @@ class Change:
     """Contacts made, or broken, at one boundary: of two, the last one made and the first one broken count.
 
     `timing` [s] is the uncertainty of the forces' own clock. `slips` [m]: at which penetration each contact
-    that is broken slides.
+    that is broken slides. `unmoved`: the contacts, had the block stood still where it rests later.
     """
 
     contacts: tuple[Penetration, ...]
@@ -184,6 +193,7 @@ class Change:
     kind: Kind
     timing: float
     slips: tuple[float, ...] = ()
+    unmoved: tuple[Penetration, ...] = ()
 
     @property
     def sort(self) -> tuple[Kind, int]:
@@ -213,11 +223,12 @@ def cut(change: Change) -> Change | None:
     if not near.size:
         return None
     index = index[near[0] : near[-1] + 2]
-    contacts = tuple(
-        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
-        for c in change.contacts
-    )
-    return replace(change, contacts=contacts)
+    contacts, unmoved = (
+        tuple(replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
+              for c in each)
+        for each in (change.contacts, change.unmoved)
+    )  # fmt: skip
+    return replace(change, contacts=contacts, unmoved=unmoved)
 
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
@@ -271,6 +282,7 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
 
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
 VIEWS = (0.6, 0.2, 0.2)
+STOOD = 0.5  # prior: that a block stood still until the later finger touched it
 FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 
 
@@ -281,10 +293,16 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
     silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
     meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
 
-    Of two touches the later comes when both fingers are the block's width apart: the first pushes the block.
+    Of two touches the later comes when both fingers are the block's width apart, as the first pushes the
+    block; or, of a heavy block in soft pads and touches some ms apart, before it has moved (STOOD).
     """
-    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
+    contacts, unmoved = (
+        [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in each]
+        for each in (change.contacts, change.unmoved)
+    )
     views, weight = [contacts], (1.0,)
+    if unmoved:
+        views, weight = [contacts, unmoved], (1 - STOOD, STOOD)
     if change.slips:
         sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
         opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
@@ -351,7 +369,9 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
     before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
         found = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-        if n == 0 or len(change.contacts) == 1:
+        if len(change.contacts) == 1:  # a block is set down in several motions
+            return replace(found, restless=c.restless(n))
+        if n == 0:
             return found
         then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
         return replace(found, earlier=then) if np.isfinite(then).all() else found
