@@ -336,14 +336,16 @@ class Changes:
         gone = float(np.clip((before - after) / max(before - floor, 1e-9), 0, 1))
         fraction = gone if names else None
         explanations = {"+".join(sorted(c.effects)): c for c in (best, *self.others) if c.effects}
-        chances = self.probabilities
+        parts = [(n, c, sorted(c.effects)) for n, c in explanations.items()]
+        parts += [(n, best, [n]) for n in (names if len(names) > 1 else ()) if n not in explanations]
         effects = {
             name: {
-                "parameters": {n: v | {"nominal": v["old"]} for n, v in self.sizes(c).items()},
-                "log_evidence": float(np.sum(nothing.left - c.left)), "property_shift": {},
+                "parameters": self._parameters(c, of), "property_shift": {},
+                "log_evidence": float(np.sum(nothing.left - c.left)),
                 "heldout_score": float(np.mean(nothing.left - c.left)),
-            } for name, c in explanations.items()
+            } for name, c, of in parts
         }  # fmt: skip
+        chances = self.probabilities
         calibrated = {} if self.calibration is None else self.calibration.body()
         acting = {n: sum(p for e, p in chances.items() if n in e.split("+")) for n in (*names, *others)}
         p_none = min((c.p_value for c in (best, *self.others) if c.effects), default=1.0)
@@ -369,6 +371,16 @@ class Changes:
                          for n, v in calibrated.get("numerics", {}).items()},
             "next_experiment": self._next_experiment([*names, *others]),
         }  # fmt: skip
+
+    def _parameters(self, change: Change, effects: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """Sizes by short name, or by effect and short name where there are several effects."""
+        known, out = self.sizes(change), {}
+        for name in effects:
+            shorts = self.composed.effects[name].parameters
+            for short in shorts:
+                size = known[name if len(shorts) == 1 else f"{name}.{short}"]
+                out[short if len(effects) == 1 else f"{name}.{short}"] = size | {"nominal": size["old"]}
+        return out
 
     def _next_experiment(self, separates: Sequence[str]) -> dict[str, Any] | None:
         """Of the motions run, the one by whose losses the best explanation and the closest other differ most;

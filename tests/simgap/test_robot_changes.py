@@ -81,7 +81,16 @@ def test_a_gain_doubled_is_named_with_its_ratio():
     size = found.sizes()["gain"]
     low, high = size["ratio_90"]
     assert low <= 2.0 <= high and size["ratio"] == pytest.approx(2.0, rel=0.03)
-    assert found.body()["changes"][0].startswith("gain +")
+    body = found.body()
+    assert body["changes"][0].startswith("gain +") and body["effects"]["gain"]["parameters"].keys() == {
+        "gain"
+    }
+    pair = replace(found.best, effects=("gain", "mass"), **{n: np.repeat(getattr(found.best, n), 2) for n in
+                   ("x", "sd", "freedom")})  # fmt: skip
+    both = replace(found, best=pair).body()["effects"]
+    assert {n: {*e["parameters"]} for n, e in both.items()} == {
+        "gain+mass": {"gain.gain", "mass.mass"}, "gain": {"gain"}, "mass": {"mass"},
+    }  # fmt: skip
 
 
 @pytest.mark.slow
