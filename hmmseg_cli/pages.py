@@ -175,7 +175,8 @@ SHARES = (
 @dataclass(frozen=True)
 class Setting:
     """What a page shows besides the body: recordings, subtasks in order, the rig's pads, what was measured,
-    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there.
+    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
+    and where the motion to run next is.
     """
 
     files: Sequence[str]
@@ -185,6 +186,7 @@ class Setting:
     shows: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     own: Mapping[str, Own] = field(default_factory=dict)
+    motion: str = ""
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
@@ -209,6 +211,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
+        motion=setting.motion,
         calibrated=_calibrated(body, setting),
         numerics=_numerics(body),
         properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
