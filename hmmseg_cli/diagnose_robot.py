@@ -139,7 +139,12 @@ def _read(
 
 @contextmanager
 def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with what a long one is at; yields what is told of each stage that begins."""
+    """Progress by stages, with what a long one is at; yields what is told of each stage that begins.
+
+    InputError where the model runs so far from its logs that no equation can be solved.
+    """
+    from numpy.linalg import LinAlgError
+
     from simgap.progress import heard
 
     stage = text
@@ -150,7 +155,11 @@ def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
         advance(1, text)
 
     with out.progress(text, total=total) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
-        yield tell
+        try:
+            yield tell
+        except LinAlgError:
+            near = "a model that stays near its logs: a shorter time step?"
+            raise InputError("simulator", f"runs far away from the logs ({stage})", near) from None
 
 
 def _warn_of_engine(out: Output, own: OwnSimulator) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg_cli.console import Output
+from hmmseg_cli.diagnose_robot import _stages
 from hmmseg_cli.main import main
 from hmmseg_cli.pages import Setting, _parameters
 from simgap.report.robot import Course, Own, compared, history, intervals, motion_csv, write_rerun
@@ -97,6 +99,15 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
     assert [e for e, *_ in sent] == [f"a.csv/q/{n}" for n in ("recorded", "simulated", "corrected")]
     assert [list(v) for _, _, v in sent] == [[0, 1], [1, 2], [2, 3]]
     assert all(list(index) == [0, 1] for _, index, _ in sent)
+
+
+def test_a_model_that_flies_off_is_one_line():
+    with (
+        Output("diagnose", quiet=True) as out,
+        pytest.raises(InputError, match="runs far away from the logs"),
+    ):
+        with _stages(out, "diagnosing", 1):
+            np.linalg.cholesky(-np.eye(2))
 
 
 @pytest.mark.parametrize(
