@@ -105,9 +105,9 @@ def test_a_model_that_flies_off_is_one_line():
     with (
         Output("diagnose", quiet=True) as out,
         pytest.raises(InputError, match="runs far away from the logs"),
+        _stages(out, "diagnosing", 1),
     ):
-        with _stages(out, "diagnosing", 1):
-            np.linalg.cholesky(-np.eye(2))
+        np.linalg.cholesky(-np.eye(2))
 
 
 @pytest.mark.parametrize(
