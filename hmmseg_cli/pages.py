@@ -160,16 +160,7 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
 Body = Mapping[str, Any]
 MOST = 8  # look: rows of a table
 NOTHING = 5e-3  # look: probability, or share of a gap, that is shown as none
-SHARES = (
-    "gain",
-    "scale",
-    "finger1",
-    "finger2",
-    "fx1",
-    "fy1",
-    "fx2",
-    "fy2",
-)  # shown in per cent if in no unit
+SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # in per cent if unitless
 
 
 @dataclass(frozen=True)
@@ -252,15 +243,8 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
     lows, highs = [c["band"][0] for c in cells], [c["band"][1] for c in cells]
     band = f"{min(lows):g} to {max(highs):g}" if None not in highs else ""
     scores = [c["z"] for c in cells if c["z"] is not None]
-    trials = str(len({c["trial"] for c in cells}))
-    return (
-        key[0],
-        key[1],
-        percent(finding.share_of(cells)),
-        f"{max(scores):.0f}" if scores else "",
-        trials,
-        band,
-    )
+    score, trials = f"{max(scores):.0f}" if scores else "", str(len({c["trial"] for c in cells}))
+    return (*key, percent(finding.share_of(cells)), score, trials, band)
 
 
 def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setting) -> list[tuple[str, ...]]:
@@ -355,13 +339,11 @@ def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tup
 
 def _detection(body: Body) -> str:
     p, fineness = body["detection"]["p_value"], body["detection"].get("resolution")
-    of = (
-        "Logs of a robot that is as its model"
-        if finding.of_robot(body)
-        else "A healthy recording of this rig and task"
-    )
-    verb = "differ" if finding.of_robot(body) else "differs"
-    text = f"{of} {verb} from it as much with {finding.p_text(p)}"
+    text = f"A healthy recording of this rig and task differs from it as much with {finding.p_text(p)}"
+    if "changes" in body:
+        text = f"Logs of a robot that did not change differ as much with {finding.p_text(p)}"
+    elif finding.of_robot(body):
+        text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
     fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"

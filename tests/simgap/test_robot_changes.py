@@ -93,6 +93,18 @@ def test_a_gain_doubled_is_named_with_its_ratio():
     }  # fmt: skip
 
 
+def test_the_next_experiment_is_the_motion_by_which_a_set_differs_most():
+    found = compared(gain=5.2)
+    apart = 0.1 * np.arange(found.best.left.size)
+    other = replace(found.best, effects=("mass",), left=found.best.left + apart)
+    asked = replace(found, verdict="set", others=(other,)).body()["next_experiment"]
+    unit = found.runs.units[-1]
+    rows = found.runs.unit == unit
+    assert asked["log"] == found.composed.recordings[int(found.runs.log[rows][0])].name
+    assert asked["expected_gain_nats"] == pytest.approx(apart[-1] * rows.sum() / found.old.dependence)
+    assert asked["separates"] == ["gain", "mass"]
+
+
 @pytest.mark.slow
 def test_a_mass_is_named_or_in_a_set_with_length_and_its_interval_holds():
     found = compared(mass=0.7)
