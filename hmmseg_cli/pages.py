@@ -202,6 +202,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
+        compared="changes" in body,
         motion=setting.motion,
         calibrated=_calibrated(body, setting),
         numerics=_numerics(body),
@@ -355,6 +356,9 @@ def _far(body: Body) -> str:
     if not s or s.get("fraction") is None or s.get("before") is None:
         return ""
     fall = f"from {plain(s['before'])} to {plain(s['after'])}"
+    if "changes" in body:
+        rest = f"old ones leave {plain(s['noise_floor'])}"
+        return f"On {s['evaluated_on']} what is missed falls {fall} nats a row; {rest}."
     text = (
         f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
         f"healthy recordings leave {plain(s['noise_floor'])}."

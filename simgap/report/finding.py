@@ -146,7 +146,8 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
         if len(own) == 1 and _part(cause) is not None and own[0]["unit"] not in ("", "1"):
             shown, nominal = shown_as(own[0]["unit"]), own[0]["nominal"]
             value = estimate(own[0]["mean"], 0.0, shown)
-            text += f" {value} (model: {plain(shown[0] * nominal) if nominal else 0})"
+            before = "before" if "changes" in body else "model"
+            text += f" {value} ({before}: {plain(shown[0] * nominal) if nominal else 0})"
         texts.append(text)
     return " and ".join(texts)
 

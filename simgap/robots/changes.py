@@ -549,14 +549,14 @@ def _unlike(new: np.ndarray, old: np.ndarray) -> float:
 
 def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, float]:
     """A probability of nothing, of the unknown, and of every explanation. Of a p-value the odds of nothing
-    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations share
-    what is left as the paired tests have it."""
+    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations as simple
+    as the best share what is left as the paired tests have it."""
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)
         return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
 
-    changed = [c for c in tried if c.effects]
+    changed = [c for c in tried if c.effects and len(c.effects) == max(len(best.effects), 1)]
     none, unknown = odds(best.p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
     weight = {"+".join(sorted(c.effects)): beaten(c, best) for c in changed if c is not best}
     weight |= {"+".join(sorted(best.effects)): 1.0} if best.effects else {}
