@@ -114,7 +114,7 @@ def motion_csv(
 
 
 def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every parameter that a diagnosis tells, by name: what was calibrated, and over it what was named; of the
+    """Every parameter that a diagnosis tells, by name: what was calibrated, over it what was named; of the
     members of a set nothing is told."""
     keys = ("mean", "sd", "interval_90", "unit")
     known = (document.get("calibrated") or {}).get("parameters") or {}
