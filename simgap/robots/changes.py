@@ -540,11 +540,13 @@ def _concluded(
 
 
 def _unlike(new: np.ndarray, old: np.ndarray) -> float:
-    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t."""
+    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t of their
+    logarithms, as some motions are missed by far more than others."""
     if old.size < 2:
         return 0.5
-    sd = max(float(old.std(ddof=1)), 1e-12) * np.sqrt(1 / old.size + 1 / new.size)
-    return float(student.sf((new.mean() - old.mean()) / sd, old.size - 1))
+    a, b = np.log(np.maximum(new, 1e-12)), np.log(np.maximum(old, 1e-12))
+    sd = max(float(b.std(ddof=1)), 1e-12) * np.sqrt(1 / b.size + 1 / a.size)
+    return float(student.sf((a.mean() - b.mean()) / sd, b.size - 1))
 
 
 def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, float]:

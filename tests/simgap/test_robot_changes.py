@@ -13,7 +13,7 @@ from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Change, Changes, by_chance, changes, jackknife, widened
+from simgap.robots.changes import Change, Changes, _unlike, by_chance, changes, jackknife, widened
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -189,6 +189,12 @@ def test_a_size_takes_in_what_a_second_small_change_would_do_to_it():
 def test_gains_from_motion_to_motion_are_judged_by_student():
     gains = np.array([0.3, 0.1, 0.5, -0.1])
     assert by_chance(gains) == pytest.approx(ttest_1samp(gains, 0, alternative="greater").pvalue)
+
+
+def test_motions_missed_by_factors_are_called_unlike_as_often_as_stated():
+    rng = np.random.default_rng(0)
+    found = np.array([_unlike(np.exp(rng.normal(size=2)), np.exp(rng.normal(size=3))) for _ in range(2000)])
+    assert np.mean(found < 0.1) == pytest.approx(0.1, abs=0.02)
 
 
 def test_of_one_unit_nothing_is_sure():
