@@ -252,9 +252,9 @@ def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
     if out.figures is None and out.report is None:
         return
     from hmmseg_cli.gap_figures import draw_generic
-    from simgap.generic.effects import EFFECTS
+    from simgap.generic.effects import effects
 
-    shows = {name: candidate.shows for name, candidate in EFFECTS.items()}
+    shows = {name: candidate.shows for name, candidate in effects().items()}
     _show(out, found.body, files, task, lambda path: draw_generic(found, path), shows=shows)
 
 

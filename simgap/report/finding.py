@@ -10,7 +10,7 @@ from rich.table import Table
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
 
 if TYPE_CHECKING:
-    from simgap.effects.base import Effect
+    from simgap.effects.base import HandEffect
 
 
 def plain_name(
@@ -54,6 +54,7 @@ PARTS = {
     "actuator.gain": ("strength", "Command a known torque of {0}, or hold a known weight, and measure."),
     "actuator.damping": ("velocity gain", "Look up the velocity gain in the drive of {0}."),
     "actuator.limit": ("largest force", "Look up the current limit in the drive of {0}."),
+    "actuator.fade": ("a drive that falls behind", "Load {0} up to its most and measure its torque."),
     "gravity.direction": ("a base that is tilted", "Put a level on the robot's base."),
 }
 
@@ -71,7 +72,7 @@ def _part(name: str) -> tuple[str, str] | None:
     return f"{where}: {called}", check.format(where)
 
 
-def _words(name: str) -> tuple[str, str, Effect | None]:
+def _words(name: str) -> tuple[str, str, HandEffect | None]:
     """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
     from simgap.robot_effects import words
 
