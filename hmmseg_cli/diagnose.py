@@ -31,10 +31,12 @@ from hmmseg_cli.console import (
 )
 from hmmseg_cli.diagnose_robot import (
     CandidateOption,
+    HistoryOption,
     MapOption,
     MjcfOption,
     OwnSimulator,
     PatchOption,
+    RerunOption,
     SimulatorOption,
     compare_robot,
     diagnose_robot,
@@ -101,6 +103,8 @@ def diagnose(
     model: ModelFile = None,
     effect: EffectOption = None,
     patch: PatchOption = None,
+    history: HistoryOption = None,
+    rerun: RerunOption = None,
     json: JsonOption = None,
     figures: FiguresOption = None,
     report: ReportOption = None,
@@ -115,7 +119,7 @@ def diagnose(
         paths = distinct_trials(trials)
         if model is not None and mjcf is None and model.suffix.lower() != ".npz":
             model, mjcf = None, model  # a robot's, not the emissions of a task
-        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
+        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch, history, rerun)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
             if healthy:
@@ -248,9 +252,9 @@ def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
     if out.figures is None and out.report is None:
         return
     from hmmseg_cli.gap_figures import draw_generic
-    from simgap.generic.effects import EFFECTS
+    from simgap.generic.effects import effects
 
-    shows = {name: candidate.shows for name, candidate in EFFECTS.items()}
+    shows = {name: candidate.shows for name, candidate in effects().items()}
     _show(out, found.body, files, task, lambda path: draw_generic(found, path), shows=shows)
 
 

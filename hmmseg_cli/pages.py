@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 
@@ -32,6 +32,9 @@ from hmmseg.plot.signals import draw_signals
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
 from simgap.report.finding import plain_name
+
+if TYPE_CHECKING:
+    from simgap.report.robot import Own
 
 
 def rendered(template: str, **values: Any) -> str:
@@ -172,7 +175,7 @@ SHARES = (
 @dataclass(frozen=True)
 class Setting:
     """What a page shows besides the body: recordings, subtasks in order, the rig's pads, what was measured,
-    and how each effect would show.
+    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there.
     """
 
     files: Sequence[str]
@@ -181,6 +184,7 @@ class Setting:
     measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
     shows: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[str] = ()
+    own: Mapping[str, Own] = field(default_factory=dict)
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
@@ -196,7 +200,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         lines=finding.sentences(body),
         to_do=_to_do(body, setting) if body["verdict"] != "none" else [],
         remains=finding.remains(body),
-        parameters=_parameters(effect, body["causes"]) if effect and body["causes"] else [],
+        parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
         subtasks=setting.subtasks,
         heat=_heat(cells, setting.subtasks) if cells else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
@@ -205,7 +209,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
-        calibrated=_calibrated(body),
+        calibrated=_calibrated(body, setting),
         numerics=_numerics(body),
         properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
         measured=setting.measured is not None,
@@ -256,36 +260,49 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
     )
 
 
-def _parameters(effect: Mapping[str, Any], causes: Sequence[str]) -> list[tuple[str, ...]]:
+def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setting) -> list[tuple[str, ...]]:
     """Parameter, the model's value where it is known, what was found, interval."""
     rows = []
     for name, p in effect["parameters"].items():
         cause = next((c for c in causes if name.startswith(f"{c}.")), causes[0])
         last = name.rpartition(".")[2]
         shown = SHOWN[last] if last in SHOWN else shown_as(p["unit"], share=last in SHARES)
-        low, high = p["interval_90"]
-        ends = "" if None in (low, high) else interval(low, high, shown)
-        words, nominal = last.replace("_", " "), p.get("nominal")
-        if nominal is not None:
+        words = last.replace("_", " ")
+        if p.get("nominal") is not None:
             words = plain_name(cause) + (f", {words}" if not cause.endswith(f".{last}") else "")
-        model = "" if nominal is None else estimate(nominal, 0.0, shown)
-        rows.append((words, model, estimate(p["mean"], p["sd"] or 0.0, shown), ends))
+        if cause.endswith(".payload") and (where := setting.shows.get(cause, "").partition(", ")[2]):
+            words += f" {where}"
+        rows.append((words, *_values(cause, p, shown, setting)))
     return rows
 
 
-def _calibrated(body: Body) -> list[tuple[str, ...]]:
+def _calibrated(body: Body, setting: Setting) -> list[tuple[str, ...]]:
     """What was fitted along before any cause was sought: parameter, the model's value, found, interval."""
-    rows = []
-    for name, p in ((body.get("calibrated") or {}).get("parameters") or {}).items():
-        shown = shown_as(p["unit"])
-        found, ends = "not told by these logs", ""
-        if p["mean"] is not None:
-            found = estimate(p["mean"], p["sd"] or 0.0, shown)
-            if p["interval_90"]:
-                low, high = p["interval_90"]
-                ends = interval(low, high, shown)
-        rows.append((plain_name(name), estimate(p["nominal"], 0.0, shown), found, ends))
-    return rows
+    known = (body.get("calibrated") or {}).get("parameters") or {}
+    return [(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in known.items()]
+
+
+def _values(
+    name: str, p: Mapping[str, Any], shown: tuple[float, str], setting: Setting
+) -> tuple[str, str, str]:
+    """The model's value, what was found and its interval; each in its column's own unit too, where it has
+    one."""
+    part, _, last = name.rpartition(".")
+    own = setting.own.get(part, setting.own.get(part.partition(":")[2]))
+    both = [shown]
+    if own is not None and own.si == p["unit"] and (own.offset == 0 or last == "bias"):
+        both.insert(0, (1 / own.factor, own.unit))
+
+    def told(write: Callable[[tuple[float, str]], str]) -> str:
+        first, *rest = map(write, both)
+        return first + "".join(f" ({text})" for text in rest)
+
+    model = "" if p.get("nominal") is None else told(lambda u: estimate(p["nominal"], 0.0, u))
+    if p["mean"] is None:
+        return model, "not told by these logs", ""
+    low, high = p["interval_90"] or (None, None)
+    ends = "" if None in (low, high) else told(lambda u: interval(low, high, u))
+    return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
 
 
 def _numerics(body: Body) -> str:

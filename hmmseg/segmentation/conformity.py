@@ -29,7 +29,7 @@ from hmmseg.contact.decompose import (
     height_equations,
     subtasks,
 )
-from hmmseg.hmm import Chain, viterbi
+from hmmseg.hmm import Chain, dense, viterbi
 from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED
 from hmmseg.segmentation.boundaries import BoundaryPosterior
@@ -40,8 +40,6 @@ from hmmseg.segmentation.free_contacts import (
     Block,
     FreeContacts,
     fit_free_contacts,
-    log_evidence,
-    most_probable,
     switching,
 )
 
@@ -377,10 +375,10 @@ def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[st
         every[-1, ~np.tile(in_these, stages + 1)] = -np.inf
         return every
 
-    log_left, log_complete = (log_evidence(ending(ends), *model) for ends in (~last, last))
+    log_left, log_complete = (dense.log_evidence(ending(ends), *model) for ends in (~last, last))
     failing = None
     if log_left > log_complete:
-        runs = _runs(most_probable(ending(~last), *model) % num_states, steps, free, columns)
+        runs = _runs(dense.viterbi(ending(~last), *model).path % num_states, steps, free, columns)
         failing = min(sum(r.subtask is not None for r in runs), num_subtasks - 1)
     else:
         chain = scored(free, columns)[:, :num_subtasks]

@@ -18,7 +18,7 @@ from scipy.special import log_ndtr
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import block_width
-from hmmseg.hmm import dense as ergodic
+from hmmseg.hmm import dense
 from hmmseg.levels import SURE
 from hmmseg.robust import NORMAL, median_of_known
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
@@ -210,7 +210,7 @@ def _schwarz(fit: Trained) -> float:
     """Log evidence of a fit, a width and a weight of each block paid for (Schwarz, Ann. Stat. 6, 1978)."""
     states, blocks, _, table, _ = fit
     num = len(blocks) + sum(np.isfinite(b.weight) for b in blocks)
-    return log_evidence(table, *_any_order(states, len(table))) - 0.5 * num * float(np.log(len(table)))
+    return dense.log_evidence(table, *_any_order(states, len(table))) - 0.5 * num * float(np.log(len(table)))
 
 
 def _trained(
@@ -232,7 +232,7 @@ def _trained(
         )
         states = _states(blocks, sliding)
         table = free_table(f, states, parameters)
-        before, path = path, most_probable(table, *_any_order(states, len(table)))
+        before, path = path, dense.viterbi(table, *_any_order(states, len(table))).path
         used = [i for i in range(len(blocks)) if any(states[k][1] == i for k in np.unique(path))]
         if not blocks or np.array_equal(path, before):
             known = _unweighed(states, path, blocks)
@@ -316,16 +316,6 @@ def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Param
     for that.
     """
     return log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY, rung=0.0)
-
-
-def most_probable(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> np.ndarray:
-    """Most probable path (num_timesteps,) of a dense model."""
-    return ergodic.viterbi(table, log_initial, log_transition).path
-
-
-def log_evidence(table: np.ndarray, log_initial: np.ndarray, log_transition: np.ndarray) -> float:
-    """Log evidence of a dense model."""
-    return ergodic.log_evidence(table, log_initial, log_transition)
 
 
 def switching(states: tuple[tuple[str, int | None], ...], leave: float) -> np.ndarray:

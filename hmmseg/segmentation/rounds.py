@@ -18,11 +18,12 @@ import numpy as np
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
 from hmmseg.hand.read import LongRecording
 from hmmseg.hand.signals import Signals, come_late, differenced, group_size, task_space
+from hmmseg.hmm import dense
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.conformity import DEPARTURE, Conformity, assignments, column, departing, settled
 from hmmseg.segmentation.emissions import Features, thin
-from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts, log_evidence, most_probable
+from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts
 
 MARGIN = 64  # numerics: rows read on either side of a part, for differences of its neighbours
 
@@ -148,10 +149,11 @@ def cut(f: Features, task: BlockTask) -> list[float]:
     ways = assignments(free, steps)
     if len(ways) > 1:  # only the best one's table is made for the whole of a recording that may be long
         glance = replace(free, table=free.table[:GLANCE])
-        ways = [max(ways, key=lambda each: _glanced(glance, steps, each, leave))]
+        tables = [_closed(glance, steps, each, leave) for each in ways]
+        ways = [ways[int(np.argmax([dense.log_evidence(table, *model) for table, model in tables]))]]
     table, model = _closed(free, steps, ways[0], leave)
     num_states = len(steps) + len(free.states)
-    path = most_probable(table, *model) % num_states
+    path = dense.viterbi(table, *model).path % num_states
     states = np.array([s.state for s in steps] + [state for state, _ in free.states])
     open_ = (states == FREE)[path]
     begins = np.flatnonzero((path[1:] == 1) & open_[:-1]) + 1
@@ -163,13 +165,6 @@ def cut(f: Features, task: BlockTask) -> list[float]:
         before = held[-1] + 1 if held.size else 0  # the first sample of the free motion before the round
         cuts.append(float(f.t[(before + begin) // 2]))
     return cuts
-
-
-def _glanced(
-    free: FreeContacts, steps: Sequence[Subtask], assignment: dict[str, int | None], leave: float
-) -> float:
-    table, model = _closed(free, steps, assignment, leave)
-    return log_evidence(table, *model)
 
 
 def _closed(

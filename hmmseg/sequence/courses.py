@@ -45,7 +45,8 @@ def partition(
     edges = np.linspace(0, num_cells, min(num_cells, MAX_BLOCKS) + 1).round().astype(int)
     edges = np.unique(np.concatenate([edges, np.asarray(cuts, int)]))
     means = np.add.reduceat(values, edges[:-1], axis=0) / np.diff(edges)[:, None]
-    cost = _costs(means, floor)
+    means = means - means.mean(0)
+    cost = pooled_costs(np.ones(len(means)), means, means**2, floor)
     for at in np.searchsorted(edges, cuts):
         cost[:at, at + 1 :] = np.inf
     best, sources = cost[0].copy(), []
@@ -60,20 +61,20 @@ def partition(
     return np.searchsorted(np.array(found[::-1]), np.arange(num_cells), side="right")
 
 
-def _costs(means: np.ndarray, floor: float) -> np.ndarray:
-    """Cost [a, b] of the stretch of blocks a <= i < b, inf where it is empty."""
-    num_blocks = len(means)
-    index = np.arange(num_blocks + 1)
-    length = (index[None] - index[:, None]).astype(float)
-    count = np.where(length > 0, length, 1.0)
-    cost = np.zeros_like(length)
-    for column in (means - means.mean(0)).T:
-        first = np.concatenate([[0.0], np.cumsum(column)])
-        second = np.concatenate([[0.0], np.cumsum(column**2)])
-        mean = (first[None] - first[:, None]) / count
-        variance = np.maximum((second[None] - second[:, None]) / count - mean**2, 0.0)
-        cost += count / 2 * np.log(variance + floor**2)
-    return np.where(length > 0, cost, np.inf)
+def pooled_costs(count: np.ndarray, first: np.ndarray, second: np.ndarray, floor: float) -> np.ndarray:
+    """Cost [a, b] (N + 1, N + 1) of the parts a <= k < b as one stretch, inf where it is empty.
+
+    `count` (N,): cells of each part, `first`, `second` (N, num_features): sums of values and of squares.
+    """
+    n, x, x2 = (np.concatenate([np.zeros((1, *v.shape[1:])), np.cumsum(v, axis=0)])
+                for v in (count.astype(float), first, second))  # fmt: skip
+    number = n[None] - n[:, None]
+    safe, cost = np.where(number > 0, number, 1.0), np.zeros_like(number)
+    for s1, s2 in zip(x.T, x2.T, strict=True):
+        mean = (s1[None] - s1[:, None]) / safe
+        variance = np.maximum((s2[None] - s2[:, None]) / safe - mean**2, 0.0)
+        cost += np.maximum(number, 0.0) / 2 * np.log(variance + floor**2)
+    return np.where(np.tri(len(n), dtype=bool), np.inf, cost)
 
 
 COARSE_CELLS = 300  # numerics: a trial, on the grid on which courses are learned
@@ -171,18 +172,8 @@ def merged_costs(
 ) -> np.ndarray:
     """Cost [a, b] (number + 1, number + 1) of stretches a <= k < b as one state, pooled over trials."""
     stacked = np.arcsinh(np.vstack([filled(v) for v in values]))
-    path = np.concatenate(paths)
-    one_hot = np.eye(number)[path]
-    pad = np.zeros((1, stacked.shape[1]))
-    count = np.concatenate([[0.0], np.cumsum(one_hot.sum(0))])
-    first = np.concatenate([pad, np.cumsum(one_hot.T @ stacked, 0)])
-    second = np.concatenate([pad, np.cumsum(one_hot.T @ stacked**2, 0)])
-    n = count[None] - count[:, None]
-    safe = np.where(n > 0, n, 1.0)[..., None]
-    mean = (first[None] - first[:, None]) / safe
-    variance = np.maximum((second[None] - second[:, None]) / safe - mean**2, 0.0)
-    cost = np.maximum(n, 0) / 2 * np.log(variance + floor**2).sum(-1)
-    return np.where(np.arange(number + 1)[None] > np.arange(number + 1)[:, None], cost, np.inf)
+    one_hot = np.eye(number)[np.concatenate(paths)]
+    return pooled_costs(one_hot.sum(0), one_hot.T @ stacked, one_hot.T @ stacked**2, floor)
 
 
 LEAST_SHARE = 1e-3  # numerics: of a trial, for a duration's logarithm

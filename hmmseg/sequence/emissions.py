@@ -24,6 +24,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from hmmseg.hmm import Chain
+from hmmseg.hmm.chain import jumps_between
 
 DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
 ONE_CELL = 1e-9  # numerics: a state without even so much weight is left as it is
@@ -212,27 +213,10 @@ class Transitions:
 
 def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Transitions:
     """Transitions from mean durations [cells] and the probability that an optional state occurs."""
-    num_states = len(mean_cells)
-    skippable = np.asarray(optional, bool)
-    present = np.where(skippable, np.log(presence), 0.0)
-    absent = np.where(skippable, np.log1p(-np.where(skippable, presence, 0.5)), -np.inf)
+    there = np.where(np.asarray(optional, bool), np.clip(presence, 1e-12, 1 - 1e-12), 1.0)
+    jumps, initial, final = jumps_between(there)
     leave = 1.0 / np.maximum(mean_cells, 1.5)
     stay = np.log1p(-leave)
     stay[-1] = 0.0  # the last state lasts as long as the recording does
-    jumps = [stay]
-    for d in range(1, max(2, _longest_run(skippable) + 2)):
-        band = np.array([
-            np.log(leave[k]) + absent[k + 1 : k + d].sum() + present[k + d] for k in range(num_states - d)
-        ])  # fmt: skip
-        jumps.append(band)
-    initial = np.array([absent[:k].sum() + present[k] for k in range(num_states)])
-    final = np.array([absent[k + 1 :].sum() for k in range(num_states)])
-    return Transitions(tuple(jumps), initial, final)
-
-
-def _longest_run(flags: np.ndarray) -> int:
-    longest = run = 0
-    for flag in flags:
-        run = run + 1 if flag else 0
-        longest = max(longest, run)
-    return longest
+    bands = [np.log(leave[: jump.size]) + jump for jump in jumps]
+    return Transitions((stay, *bands), initial, final)

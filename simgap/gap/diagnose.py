@@ -206,10 +206,10 @@ def drawn(
     """Draws (DRAWS,) of an effect's parameters given that it acts, and their units, as the interface names
     them."""
     effect, rng = catalogue()[name], np.random.default_rng(seed)
-    of = {p.name: p for p in effect.parameters}
+    of = effect.parameters
     scatter = next((s for s in found.scatters if s.effect == name), None)
     if scatter is not None:
-        p = effect.parameters[0]
+        (p,) = of.values()
         return {p.name: (scatter.value * np.exp(scatter.log_sd * rng.standard_normal(DRAWS)), p.unit)}
     draws = {}
     for key, p in posterior.parameters.items():
@@ -221,7 +221,7 @@ def drawn(
         draws[key] = np.asarray(of[key].value(np.clip(u, *of[key].limits)))
     if effect.report is not None:
         return effect.report(draws, found.problem.frame.rig)
-    return {p.name: (draws[p.name], p.unit) for p in effect.parameters if p.name in draws and not p.hidden}
+    return {p.name: (draws[p.name], p.unit) for p in of.values() if p.name in draws and not p.hidden}
 
 
 def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:

@@ -14,9 +14,10 @@ import numpy as np
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from hmmseg.contact.decompose import PROPERTIES
 from simgap.bounded import least
+from simgap.effect import Parameter
 from simgap.effects import fitted as known_effects
 from simgap.effects import free_parameters, name_of
-from simgap.effects.base import Effect, Parameter, World
+from simgap.effects.base import HandEffect, World
 from simgap.gap.frame import CHANNELS, Arrays, Frame
 from simgap.gap.residuals import contact, residuals
 
@@ -72,7 +73,7 @@ MEASURED = (2e-3, 3e-5, 4e-5)
 class Slot:
     """One effect's place among the columns of all parameters."""
 
-    effect: Effect
+    effect: HandEffect
     start: int
 
     @property
@@ -172,7 +173,7 @@ def _bare(frame: Frame, centre: np.ndarray, sd: np.ndarray, measured: np.ndarray
 
 def free_of(key: str) -> list[Parameter]:
     """The free parameters of an effect's form, in the order of its columns."""
-    return [p for p in known_effects()[name_of(key)].parameters if p.name in free_parameters(key)]
+    return [p for p in known_effects()[name_of(key)].parameters.values() if p.name in free_parameters(key)]
 
 
 def neutral(given: Problem) -> np.ndarray:
@@ -180,9 +181,9 @@ def neutral(given: Problem) -> np.ndarray:
     places, total = slots(given.num_properties)
     u = np.zeros(total)
     for slot in places:
-        for j, p in enumerate(slot.effect.parameters):
+        for j, p in enumerate(slot.effect.parameters.values()):
             if not p.log:
-                u[slot.start + j] = p.coordinate(p.neutral)
+                u[slot.start + j] = p.coordinate(p.nominal)
     return u
 
 
@@ -192,9 +193,7 @@ def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
     places = {s.effect.name: s for s in slots(given.num_properties)[0]}
     for key in effects:
         slot, names = places[name_of(key)], free_parameters(key)
-        out.append(
-            np.array([slot.start + j for j, p in enumerate(slot.effect.parameters) if p.name in names])
-        )
+        out.append(np.array([slot.start + j for j, n in enumerate(slot.effect.parameters) if n in names]))
     return np.concatenate(out).astype(int)
 
 
@@ -203,7 +202,7 @@ def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
     places, total = slots(given.num_properties)
     low, high = np.full(total, -np.inf), np.full(total, np.inf)
     for slot in places:
-        for j, p in enumerate(slot.effect.parameters):
+        for j, p in enumerate(slot.effect.parameters.values()):
             low[slot.start + j], high[slot.start + j] = p.limits
     return low, high
 
@@ -251,7 +250,7 @@ def corrected(world: World, u: jax.Array, on: jax.Array, num_properties: int) ->
     """The world with every effect of coordinates u (all columns) taken out; `on` (num_slots,)."""
     world = jax.tree.map(lambda z: jnp.asarray(z, float), world)
     for k, slot in enumerate(slots(num_properties)[0]):
-        values = {p.name: p.value(u[slot.start + j]) for j, p in enumerate(slot.effect.parameters)}
+        values = {p.name: p.value(u[slot.start + j]) for j, p in enumerate(slot.effect.parameters.values())}
 
         def taken_out(values=values, effect=slot.effect, k=k, world=world) -> World:
             changed = effect.correct(world, values, on[k])  # type: ignore[misc]

@@ -63,7 +63,7 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     grids = [
         [(slot.start + j, p.coordinate(value)) for value in p.starts]
-        for j, p in enumerate(slot.effect.parameters)
+        for j, p in enumerate(slot.effect.parameters.values())
         if p.gridded and p.name in free_parameters(key)
     ]
     out = []
@@ -110,7 +110,7 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> _Ranked:
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     fixed = [
         slot.start + j
-        for j, p in enumerate(slot.effect.parameters)
+        for j, p in enumerate(slot.effect.parameters.values())
         if p.gridded and p.name in free_parameters(key)
     ]
     low, high = limits(given)

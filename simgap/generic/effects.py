@@ -1,95 +1,95 @@
 """What effects that need no contact model do to simulated trials, and a ring found in recorded ones.
 
-Each acts in one channel on the mean simulated course, on the spectra of the simulated trials, or on
-durations. Recorded = what is simulated + effect, in this order: shifted in time, smoothed, scaled,
-then offset and drift, then vibration and noise added. Names are the catalogue's where it has the effect.
+Each acts in one channel on the mean simulated course and on the simulated trials, whose spectra are then
+taken anew, or on durations. A channel has the effects of `simgap.channels`, from the true value outwards;
+vibration and noise are added to what they give.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 
-from simgap.generic.trials import Layout, bin_edges, log_power, means, resampled, transformed, windowed
+from simgap.channels import ChannelEffect, Theta, at_rest, channel_effects
+from simgap.effect import Parameter
+from simgap.generic.trials import Cut, Layout, bin_edges, log_power, means, resampled, transformed, windowed
 
 FINE = 2048  # numerics: points of the mean course
-SMALLEST = 1e-6  # numerics: s; a shorter time constant is none
 SMOOTH = 9  # numerics: coefficients over which a spectrum is smoothed
 LEAST = 4  # numerics: coefficients that a mean power is taken of
+COARSE = 10.0  # prior: what a given simulation is off by, of what a calibrated robot's sensors are
+NOISE = "noise_level"
 
 
 @dataclass(frozen=True)
-class Change:
-    """An effect on given trials: `keys` of its parameters in a channel, each with its usual size (times the
-    channel's scale, or that over the task's duration, as `per` says), bounds and starts in usual sizes.
+class EnsembleEffect(ChannelEffect):
+    """An effect on given trials. `each`: one in each channel, one a channel and event (an oscillation's sine
+    and cosine), or one a subtask (durations)."""
 
-    `each`: one of each a channel, one a channel and event (an oscillation's sine and cosine), or one a
-    subtask (durations).
-    """
-
-    name: str
-    says: str
-    shows: str
-    keys: tuple[str, ...]
-    usual: float
-    per: str = ""  # "", "scale" or "rate"
-    unit: str = ""  # of the channel's unit: "", "/s"; or one of its own
-    starts: tuple[tuple[float, ...], ...] = ((0.0,),)
-    low: float = -8.0
-    high: float = 8.0
     each: str = "channel"
 
 
-EFFECTS = {
-    c.name: c
-    for c in (
-        Change("force_bias", "recorded = simulated + b", "the slow course of every subtask alike", ("bias",),
-               0.5, "scale"),
-        Change("force_gain", "recorded = (1 + g) simulated", "course and fluctuation, in proportion",
-               ("gain",), 0.3, unit="1", low=-1.6, high=3.3),
-        Change("force_drift", "recorded = simulated + c t", "a ramp over the whole task", ("slope",), 0.5,
-               "rate", "/s"),
-        Change("force_lag", "recorded = simulated(t - delay)", "every change of the course, late", ("delay",),
-               0.1, unit="s", starts=((0.3,), (1.0,), (3.0,)), low=0.0, high=5.0),
-        Change("force_lowpass", "tau recorded' + recorded = simulated", "rounded changes, fast power gone",
-               ("time_constant",), 0.1, unit="s", starts=((0.1,), (0.5,), (2.0,)), low=0.0, high=5.0),
-        Change("structural_vibration", "a damped mode rung at the start of a subtask",
-               "power about one frequency", ("sin", "cos"), 0.2, "scale", each="event",
-               starts=((0.3, 0.0), (0.0, 0.3), (-0.3, 0.0), (0.0, -0.3))),
-        Change("noise_level", "white noise added (less, if negative)", "power at all frequencies alike",
-               ("sd",), 0.05, "scale", starts=((0.05,), (0.5,), (-0.05,))),
-        Change("timing", "durations of subtasks multiplied", "durations alone", ("log_ratio",), 0.5, unit="1",
-               each="subtask"),
-    )
-}  # fmt: skip
+@cache
+def effects() -> dict[str, ChannelEffect]:
+    """All effects on given trials, those of any channel by the names that they have in a hand's forces."""
+    own = (
+        EnsembleEffect(
+            "structural_vibration", "a damped mode rung at the start of a subtask",
+            {"sin": Parameter(0.0, 0.02, "", starts=(0.06, 0.0, -0.06, 0.0)),
+             "cos": Parameter(0.0, 0.02, "", starts=(0.0, 0.06, 0.0, -0.06))},
+            "power about one frequency", each="event",
+        ),
+        EnsembleEffect(
+            NOISE, "white noise added (less, if negative)",
+            {"sd": Parameter(0.0, 0.005, "", starts=(0.0025, 0.025, -0.0025))},
+            "power at all frequencies alike",
+        ),
+        EnsembleEffect(
+            "timing", "durations of subtasks multiplied", {"log_ratio": Parameter(0.0, 0.05)},
+            "durations alone", each="subtask",
+        ),
+    )  # fmt: skip
+    of_any = (replace(e, name=f"force_{e.name}") for e in channel_effects().values())
+    return {e.name: e for e in (*of_any, *own)}
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect in a channel (-1: durations); `place`: its event or subtask, else -1."""
+class Slot:
+    """A parameter of an effect in a channel (-1: durations); `place`: its event or subtask, else -1."""
 
     effect: str
-    key: str
+    parameter: Parameter
     channel: int
     place: int
-    usual: float
+
+    @property
+    def label(self) -> str:
+        """A name of its own."""
+        return f"{self.channel}/{self.place}/{self.parameter.name}"
 
 
-def parameters(given: Scene, effect: str, channel: int) -> list[Parameter]:
-    """The parameters that an effect has in a channel, or of durations (-1)."""
-    change, count = EFFECTS[effect], len(given.layout.ensembles.subtasks)
-    if (change.each == "subtask") != (channel < 0):
+def slots(given: Scene, effect: str, channel: int) -> list[Slot]:
+    """Parameters of an effect in a channel (-1: durations); none where it does not act there."""
+    acting, lay = effects()[effect], given.layout
+    each = getattr(acting, "each", "channel")
+    if (each == "subtask") != (channel < 0) or (each == "event" and given.ring is None):
         return []
-    usual = change.usual * (float(given.layout.scale[channel]) if change.per else 1.0)
-    usual /= float(given.edges[-1]) if change.per == "rate" else 1.0
-    places = {"channel": [-1], "event": range(1, count), "subtask": range(count)}[change.each]
-    return [Parameter(effect, key, channel, k, usual) for k in places for key in change.keys]
+    size, unit = (
+        (1.0, "") if channel < 0 else (lay.scale[channel], f"unit of {lay.ensembles.channels[channel]}")
+    )
+    sized = acting.sized(float(size), unit, float(given.edges[-1]), COARSE)
+    count = len(lay.ensembles.subtasks)
+    places = {"channel": [-1], "event": range(1, count), "subtask": range(count)}[each]
+    return [Slot(effect, p, channel, k) for k in places for p in sized.values()]
+
+
+Acting = Mapping[str, Theta]  # values by effect
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Scene:
     course: np.ndarray
     floor: np.ndarray
     ring: Ring | None = None
-    cache: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
+    cache: dict[tuple, list[np.ndarray]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def bins(self) -> np.ndarray:
@@ -123,8 +123,7 @@ class Scene:
     @cached_property
     def plain(self) -> list[np.ndarray]:
         """Features of every channel without any effect."""
-        none = np.zeros((len(self.layout.window), 2))
-        return [predicted(self, c, {}, none) for c in range(len(self.course))]
+        return [predicted(self, c, {}) for c in range(len(self.course))]
 
 
 def scene(layout: Layout, ring: Ring | None = None) -> Scene:
@@ -154,83 +153,75 @@ def _floor(layout: Layout) -> np.ndarray:
     return out
 
 
-def predicted(given: Scene, channel: int, values: Mapping[str, float], rung: np.ndarray) -> np.ndarray:
+def predicted(given: Scene, channel: int, acting: Acting, rung: np.ndarray | None = None) -> np.ndarray:
     """Predicted features of a channel in the order of `Layout.of_channel`.
 
     `rung` (K, 2): sine and cosine amplitudes of a vibration from each subtask's start on.
     """
-    x, layout = given.course[channel], given.layout
-    delay, tau = values.get("delay", 0.0), values.get("time_constant", 0.0)
-    if delay:
-        x = np.interp(given.t - delay, given.t, x)
-    if tau > SMALLEST:
-        x = smoothed(x, tau / (given.t[1] - given.t[0]))
-    x = (1 + values.get("gain", 0.0)) * x + values.get("bias", 0.0) + values.get("slope", 0.0) * given.t
+    x, layout = read(given.t, given.course[channel], acting), given.layout
+    rung = np.zeros((len(layout.window), 2)) if rung is None else rung
     for k in np.flatnonzero(rung.any(1)):
         x = x + rung[k] @ given.waves[k]
     out = [means(given.t, x, given.bins)]
-    whole, part = divmod(delay * layout.rate, 1.0)
-    louder = tuple(values.get(key, 0.0) for key in ("gain", "time_constant", "sd"))
-    for k in range(len(layout.window)):
+    more = acting.get(NOISE, {}).get("sd", 0.0)
+    added = max(more * abs(more), -given.floor[channel])  # no more noise can be missing than there is
+    for k, wave in enumerate(_waves(given, channel, acting)):
         if layout.coefficients[k]:
-            now = _log_power(given, channel, k, int(whole), louder, tuple(rung[k]))
-            if part > 1e-9:  # between two neighbouring samples' shifts
-                later = _log_power(given, channel, k, int(whole) + 1, louder, tuple(rung[k]))
-                now = (1 - part) * now + part * later
-            out.append(now)
+            if rung[k].any():
+                t = (np.arange(wave.shape[1]) + 0.5) / layout.rate
+                wave = wave + transformed(rung[k] @ ring_waves(given, t))
+            out.append(log_power(layout, np.maximum(wave**2 + added, 0.0), channel, k).mean(0))
     return np.concatenate(out)
 
 
-def _log_power(
-    given: Scene, channel: int, subtask: int, shift: int, louder: tuple[float, ...], rung: tuple[float, ...]
-) -> np.ndarray:
-    """Mean log powers (B,) of the simulated trials, `shift` samples late, with a gain, low-pass and noise
-    (`louder`) and a ring."""
-    key = channel, subtask, shift, louder, rung
-    if key not in given.cache:
-        given.cache[key] = _computed_power(given, *key)
-    return given.cache[key]
+def read(t: np.ndarray, values: np.ndarray, acting: Acting) -> np.ndarray:
+    """Values (n,) as they are read where these effects act."""
+    for effect in reversed(channel_effects().values()):
+        theta = acting.get(f"force_{effect.name}")
+        if theta is not None:
+            values = at_rest(effect.read, t, values, theta)
+    return values
 
 
-def _computed_power(given, channel, subtask, shift, louder, rung) -> np.ndarray:
-    layout, n = given.layout, int(given.layout.window[subtask])
-    gain, tau, sd = louder
-    wave = _simulated(given, channel, subtask, shift, tau)
-    quiet, noise = _simulated(given, channel, subtask, shift, 0.0), given.floor[channel]
-    kept = 1 / (1 + (2 * np.pi * np.arange(n) * layout.rate / (2 * n) * tau) ** 2)
-    # What lies at the noise floor is the sensor's own noise: neither filter nor gain changes it.
-    near = np.maximum(uniform_filter1d((quiet**2).mean(0), SMOOTH, mode="nearest"), 1e-300)
-    share = np.clip(noise / near, 0.0, 1.0)
-    wave = np.sqrt(share + (1 - share) * (1 + gain) ** 2) * wave
-    if any(rung):
-        wave = wave + transformed(np.array(rung) @ ring_waves(given, (np.arange(n) + 0.5) / layout.rate))
-    added = max(sd * abs(sd), -noise)  # no more noise can be missing than there is
-    spectra = np.maximum(wave**2 + noise * (1 - kept) + added, 0.0)
-    return log_power(layout, spectra, channel, subtask).mean(0)
+def _waves(given: Scene, channel: int, acting: Acting) -> list[np.ndarray]:
+    """DCT coefficients (S, window) of the simulated trials in each subtask, as they are read.
+
+    What lies at the noise floor is the sensor's own noise, which is added behind what it is read through: its
+    power there is put back to what it was, by what becomes of noise alone.
+    """
+    known = {f"force_{e.name}" for e in channel_effects().values()}
+    key = channel, tuple((n, *sorted(v.items())) for n, v in sorted(acting.items()) if n in known)
+    if key in given.cache:
+        return given.cache[key]
+    lay, name = given.layout, given.layout.ensembles.channels[channel]
+    cuts, noise = lay.ensembles.sim, given.floor[channel]
+
+    def cut_up(cut: Cut, values: np.ndarray) -> list[np.ndarray]:
+        values = read(cut.trial.t - cut.edges[0], values, acting) if key[1] else values
+        return [transformed(windowed(lay, cut, channel, k, values)) for k in range(len(lay.window))]
+
+    each = [cut_up(cut, _bridged(cut.trial.t, cut.trial.channels[name])) for cut in cuts]
+    out = [np.array(waves) for waves in zip(*each, strict=True)]
+    hiss = np.sqrt(noise) * np.random.default_rng(0).standard_normal(cuts[0].trial.t.size)
+    alone = given.cache[(channel, "noise", key[1])] = [_smooth(w) for w in cut_up(cuts[0], hiss)]
+    if key[1]:
+        _waves(given, channel, {})
+        for k, before in enumerate(given.cache[(channel, "noise", ())]):
+            now = _smooth(out[k])
+            out[k] = out[k] * np.sqrt(np.maximum(now + noise * (1 - alone[k] / before), 0.0) / now)
+    given.cache[key] = out
+    return out
 
 
-def _simulated(given: Scene, channel: int, subtask: int, shift: int, tau: float) -> np.ndarray:
-    """DCT coefficients (S, window) of the simulated trials, smoothed with time constant `tau` [s]."""
-    key = channel, subtask, shift, 0.0 if tau <= SMALLEST else tau
-    if key not in given.cache:
-        name, windows = given.layout.ensembles.channels[channel], []
-        for cut in given.layout.ensembles.sim:
-            values = cut.trial.channels[name]
-            if tau > SMALLEST:
-                known = np.isfinite(values)
-                filled = np.interp(cut.trial.t, cut.trial.t[known], values[known])
-                values = smoothed(filled, tau * cut.trial.rate)
-            windows.append(windowed(given.layout, cut, channel, subtask, shift, values))
-        given.cache[key] = transformed(np.array(windows))
-    return given.cache[key]
+def _bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    there = np.isfinite(values)
+    return values if there.all() else np.interp(t, t[there], values[there])
 
 
-def smoothed(x: np.ndarray, tau: float) -> np.ndarray:
-    """A first-order low pass with its time constant in samples, settled at the start."""
-    from scipy.signal import lfilter  # slow to import
-
-    keep = np.exp(-1 / tau)
-    return np.asarray(lfilter([1 - keep], [1, -keep], x, zi=[keep * x[0]])[0])
+def _smooth(waves: np.ndarray) -> np.ndarray:
+    """Power (window,) of coefficients (..., window), smoothed."""
+    power = np.square(np.atleast_2d(waves)).mean(0)
+    return np.maximum(uniform_filter1d(power, SMOOTH, mode="nearest"), 1e-300)
 
 
 def ring_waves(given: Scene, t: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from rich.table import Table
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
 
 if TYPE_CHECKING:
-    from simgap.effects.base import Effect
+    from simgap.effects.base import HandEffect
 
 
 def plain_name(
@@ -71,7 +71,7 @@ def _part(name: str) -> tuple[str, str] | None:
     return f"{where}: {called}", check.format(where)
 
 
-def _words(name: str) -> tuple[str, str, Effect | None]:
+def _words(name: str) -> tuple[str, str, HandEffect | None]:
     """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
     from simgap.robot_effects import words
 
@@ -154,6 +154,8 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The verdict in a line."""
     verdict = body["verdict"]
+    if "changes" in body and verdict in ("none", "unknown"):
+        return "Nothing changed" if verdict == "none" else "A change that no known cause explains"
     if verdict == "none":
         return "No gap that matters" if body.get("small_gap") else "No gap"
     if verdict == "unknown":
@@ -168,6 +170,8 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 def sentences(body: Body) -> list[str]:
     """What was found, how sure, and how far it goes, for an engineer who must act."""
     verdict, p, small = body["verdict"], p_text(body["detection"]["p_value"]), body.get("small_gap")
+    if "changes" in body:
+        return changed(body)
     if verdict == "none" and small:
         size = ""
         if small.get("size") is not None:
@@ -191,6 +195,22 @@ def sentences(body: Body) -> list[str]:
             for cause, others in instead.items()
         ]
     out += [t for t in (explained(body), shrunk(body)) if t]
+    return out
+
+
+def changed(body: Body) -> list[str]:
+    """What two sets of logs tell of a robot that may have changed between them."""
+    if body["verdict"] == "none":
+        return ["Nothing that these logs can tell: the new ones are met as the old ones are."]
+    if body["verdict"] == "unknown":
+        over = body["remainder"]["rms_over_noise"]
+        best = [f"The best that is known, {text}, leaves too much." for text in body["changes"]]
+        return [f"New logs are missed by {over:.2g} times what old ones are.", *best]
+    p = p_text(body["detection"]["p_value"])
+    out = [f"Changed: {'; '.join(body['changes'])} ({p} that nothing did)."]
+    if body["verdict"] == "set":
+        others = ", ".join(body["indistinguishable"]) or "the same in other parts"
+        out.append(f"These logs cannot tell it from a change of {others}.")
     return out
 
 
@@ -247,7 +267,7 @@ def shrunk(body: Body) -> str:
 def remains(body: Body) -> list[str]:
     """What no cause explains, in words."""
     rest = body.get("remainder")
-    if not rest or rest.get("share") is None or body["verdict"] == "none":
+    if not rest or rest.get("share") is None or body["verdict"] == "none" or "changes" in body:
         return []
     noise = rest.get("rms_over_noise")
     size = f" All that is left is {plain(noise)} times the noise." if noise else ""

@@ -15,6 +15,7 @@ from simgap.robots.model import Composed, Point
 Whiten = Callable[[np.ndarray], np.ndarray]  # rows (N,) or columns (N, k)
 STEPS = 8  # numerics: of a least-squares fit, at most
 HALVINGS = 5  # numerics: of a step that straight lines took too far
+FLAT = 1e-12  # numerics: of the usual bend, so that one that is none in some direction has a least
 SHORTEN, SHORTER = (
     0.1,
     10.0,
@@ -63,7 +64,7 @@ def moved_to(
         usual = np.diag(np.maximum(np.diag(bend), 1.0))
         for _ in range(HALVINGS):
             # About x, so that what is held at a bound stays exactly there.
-            move, _ = least(bend + damping * usual, pull, squares.low - x, squares.high - x)
+            move, _ = least(bend + (damping + FLAT) * usual, pull, squares.low - x, squares.high - x)
             there = squares.cost(x + move)
             if there < cost:
                 break
