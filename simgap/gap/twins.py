@@ -145,7 +145,8 @@ def twin_statistics(
     are known.
 
     What sensors' noise makes of a twin's candidates is seen only where its statistic without that, which is
-    larger, leaves `value` in doubt. Where this hand or these blocks cannot be simulated there are none.
+    no smaller, is a sign of a gap and leaves `value` in doubt. Where this hand or these blocks cannot be
+    simulated there are none.
     """
     frame = found.problem.frame
     file = _file(found.trials, frame.task, frame.rig, actual, seed)
@@ -168,7 +169,7 @@ def twin_statistics(
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
                 most = healthy_statistic(twin, actual, found.identified, noisy=False)
-                sure = clear(value, most)
+                sure = most <= 0 or clear(value, most)  # what is no sign of a gap counts as nothing
                 known.append(most if sure else healthy_statistic(twin, actual, found.identified))
                 keep_value(file, known)
                 yield known[-1]
