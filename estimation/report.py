@@ -14,6 +14,7 @@ from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import CONTRADICTS
+from hmmseg.numbers import SHOWN, estimate, interval, plain
 
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
 
@@ -90,26 +91,19 @@ def disagreements(properties: dict[str, Any], compared: dict[str, Any]) -> list[
         for prop, row in entries.items():
             if not row.get("disagrees"):
                 continue
-            found, unit = properties[obj][prop], UNITS[prop]
-            value = _shown(row["value"], row["sd"], unit)
+            found, shown = properties[obj][prop], SHOWN[prop]
+            value = estimate(row["value"], row["sd"], shown)
             if "z" not in row:
                 bound = f"{found['lower_bound']:.3g}"
                 lines.append(f"{obj}.{prop}: measured as {value}, but it was held at {bound}")
                 continue
-            share, said = 100 * row["relative_deviation"], _shown(found["mean"], found["sd"], unit)
+            share, said = 100 * row["relative_deviation"], estimate(found["mean"], found["sd"], shown)
             side = "above" if share > 0 else "below"
             lines.append(
                 f"{obj}.{prop}: the recordings say {said}, {abs(share):.2g} % {side} what was measured "
                 f"({value}), {abs(row['z']):.0f} standard deviations away: one of the two is wrong"
             )
     return lines
-
-
-def _shown(value: float, sd: float, unit: str) -> str:
-    """As `0.4656 +- 0.0014 N`, lengths in mm, with the digits that the deviation leaves."""
-    factor, name = (1e3, " mm") if unit == "m" else (1.0, "" if unit == "1" else f" {unit}")
-    digits = 4 if sd <= 0 else min(max(1 - math.floor(math.log10(sd * factor)), 0), 6)
-    return f"{value * factor:.{digits}f} +- {sd * factor:.{digits}f}{name}"
 
 
 def _parse_entry(entry: Any, prop: str, where: str) -> tuple[float, float]:
@@ -133,9 +127,6 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
     return float(value)
 
 
-SHOWN = {"weight": (1.0, "N", 4), "width": (100.0, "cm", 4), "height": (100.0, "cm", 4)}
-
-
 def properties_table(body: dict[str, Any], measured=None) -> Table:
     """The properties for people to read, lengths in cm as the paper has them."""
     table = Table(title=f"properties ({body['method']})", title_justify="left")
@@ -143,28 +134,22 @@ def properties_table(body: dict[str, Any], measured=None) -> Table:
         table.add_column(head, no_wrap=head != "estimate")
     for obj, entries in body["properties"].items():
         for prop, entry in entries.items():
-            cells = [obj, prop, *_cells(prop, entry)]
+            shown = SHOWN[prop]
+            cells = [obj, prop, "unknown", ""]
+            if entry is not None and entry.get("mean") is None:
+                cells[2] = f">= {plain(entry['lower_bound'])}"
+            elif entry is not None:
+                cells[2:] = (
+                    estimate(entry["mean"], entry["sd"], shown),
+                    interval(*entry["interval_95"], shown, 2 * 1.96),
+                )
             if measured:
                 value = measured.get(obj, {}).get(prop)
-                factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
                 against = body.get("actual", {}).get(obj, {}).get(prop, {})
                 mark = "  disagrees" if against.get("disagrees") else ""
-                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}{mark}")
+                cells.append("" if value is None else f"{estimate(*value, shown)}{mark}")
             table.add_row(*cells)
     return table
-
-
-def _cells(prop: str, entry: dict[str, Any] | None) -> tuple[str, str]:
-    if entry is None:
-        return "unknown", ""
-    factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
-    if entry.get("mean") is None:
-        return f">= {entry['lower_bound']:.{digits}f}", ""
-    low, high = (f"{v * factor:.{digits}f}" for v in entry["interval_95"])
-    return (
-        f"{entry['mean'] * factor:.{digits}f} +- {entry['sd'] * factor:.{digits}f} {unit}",
-        f"{low} to {high}",
-    )
 
 
 def inference_data(posterior: dict[str, np.ndarray]) -> Any:

@@ -1,6 +1,5 @@
 """A gripper with a wrist sensor: recordings made with known blocks, tools and mountings."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
-from hmmseg.contact.decompose import decompose, revealed_by
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.tool import applied_force, free_tool, pose_of
@@ -248,14 +246,3 @@ def test_an_arm_of_another_simulator(shared):
         assert properties.of(obj, "height").mean() == pytest.approx(actual["height"], abs=1e-4)
         low, high = np.percentile(properties.of(obj, "width"), [2.5, 97.5])
         assert low < actual["width"] < high
-
-
-def test_decompose_leaves_out_what_this_hand_cannot_reveal():
-    found = revealed_by(decompose(TASK), wrist_rig(PLAIN))
-    assert found.properties["a"]["friction"].evidence == ()
-    assert "wrist" in found.properties["a"]["friction"].reason
-    assert found.properties["a"]["weight"].kind == "value"
-    assert "opening" in found.properties["a"]["width"].evidence[0].condition
-    known = revealed_by(decompose(TASK), wrist_rig(PLAIN, grip_force=20.0))
-    assert known.properties["a"]["friction"].evidence
-    assert dataclasses.replace(known) == decompose(TASK)
