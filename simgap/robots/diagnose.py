@@ -14,16 +14,14 @@ from simgap.progress import Progress, silent
 from simgap.robot_effects import UNMEASURED, doubted, effects_of
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.heldout import Shrinkage, folds_of, shrinkage
-from simgap.robots.identifiable import Identifiability
 from simgap.robots.linear import Linear
-from simgap.robots.model import Composed
-from simgap.robots.noise import noises
+from simgap.robots.model import Composed, motions
 from simgap.robots.phases import Phases, phases_of
-from simgap.robots.repeats import motions
+from simgap.robots.rows import noises
 from simgap.robots.search import Search, Settled
-from simgap.robots.verdict import RobotVerdict, verdict_on
+from simgap.robots.sets import Identifiability
+from simgap.robots.verdict import NextLog, RobotVerdict, next_log, verdict_on
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 

@@ -21,10 +21,20 @@ from scipy.stats import t as student
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import moved_to, prior_cost
-from simgap.robots.identifiable import Identifiability, identifiability
 from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
 from simgap.robots.model import Composed, Point
-from simgap.robots.sets import Names, Sets, cancelling, log_odds, neighbours, pairs, point_of, without
+from simgap.robots.sets import (
+    Identifiability,
+    Names,
+    Sets,
+    cancelling,
+    identifiability,
+    log_odds,
+    neighbours,
+    pairs,
+    point_of,
+    without,
+)
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
 from simgap.robots.windows import STRIKES
 from simgap.simulators.protocol import Parameter
