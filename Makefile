@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs gap-forms
+.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -110,11 +110,6 @@ gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in th
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
 	$(BIN)/python -m experiments.write_tables
 
-gap-forms: $(INSTALLED)  ## how far true effects are from their own forms, and what each test of a cause buys; fills docs/gap_results.md
-	$(BIN)/python -m experiments.gap_forms $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 085 065) $(addprefix spent/case_,033 009 000 012 026 005))
-	$(BIN)/python -m experiments.gap_detectors $(addprefix ../shared/recordings_,$(addprefix labs/case_,180 065 080 045) $(addprefix spent/case_,009 033))
-	$(BIN)/python -m experiments.write_tables
-
 gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_arm $(or $(ARM),../shared/panda)
 	$(BIN)/python -m experiments.write_tables
@@ -126,15 +121,13 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 	$(BIN)/python -m experiments.write_tables
 
 sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
-	$(BIN)/python -m experiments.real.sts3215 $(SET) --part judge --cases 10 --output experiments/results/sts3215.json
-	$(BIN)/python -m experiments.real.sts3215 $(SET) --part mixed --cases 8 --output experiments/results/sts3215_mixed.json
+	$(BIN)/python -m experiments.real.sts3215 $(SET) --cases 5 --seed 1 --output experiments/results/sts3215.json
 	$(BIN)/python -m experiments.real.bam $(SET) --output experiments/results/sts3215_bam.json
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)
 real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECORDINGS; fills docs/results.md, draws their figures
 	$(BIN)/python -m experiments.real.hiro_snap $(REAL)/hiro_snap
-	$(BIN)/python -m experiments.real.hiro_network $(REAL)/hiro_snap
 	$(BIN)/python -m experiments.real.hiro_gap $(REAL)/hiro_snap
 	$(BIN)/python -m experiments.real.kth_handover $(REAL)/kth_handover
 	$(BIN)/python -m experiments.real.way_eeg_gal $(REAL)/way_eeg_gal_p1
@@ -142,7 +135,6 @@ real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECOR
 	$(BIN)/python -m experiments.real.robot_gap so101 $(REAL)/so101 --seconds 10 --figures docs/figures
 	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
 	$(BIN)/python -m experiments.real.collins $(REAL)/collins
-	$(BIN)/python -m experiments.real.collins_push $(REAL)/collins --figures docs/figures
 	$(BIN)/python -m paper_figs.hiro_gap
 	$(BIN)/python -m paper_figs.way_eeg_gal
 	$(BIN)/python -m experiments.write_tables

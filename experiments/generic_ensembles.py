@@ -14,7 +14,8 @@ import numpy as np
 
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from simgap.generic.effects import smoothed
+from simgap.channels import at_rest
+from simgap.channels.sensors import LOWPASS
 
 TASK = SequenceTask(("approach", "press", "hold"))
 DURATIONS = (1.5, 2.0, 1.2)  # prior: s
@@ -76,7 +77,7 @@ def _trial(rng, effects: Values, s: Scatter, file: str) -> tuple[Trial, np.ndarr
     fa, fb = course(t)
     fa = course(t - given("force_lag"))[0]
     if "force_lowpass" in effects:
-        fa = smoothed(fa, given("force_lowpass") * s.rate)
+        fa = at_rest(LOWPASS.read, t, fa, {"time_constant": given("force_lowpass")})
     fa = (1 + given("force_gain")) * fa + given("force_bias") + given("force_drift") * t
     omega = 2 * np.pi * given("structural_vibration", "frequency")
     for event in (a, b):

@@ -11,17 +11,24 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from experiments.saving import save
 from experiments.table_text import RESULTS, load, markdown
 from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
+from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg.segmentation.align import align
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.align import align, segment
 from simgap.gap.diagnose import diagnose
-from simgap.patch import files, reproduced
+from simgap.patch import files, replayed
+from simgap.world.properties import read_properties
 
 
 def measured(folder: Path) -> dict[str, Any]:
@@ -37,6 +44,39 @@ def measured(folder: Path) -> dict[str, Any]:
         return row
     nominal, patched = reproduced(written, body, trials[half:], task, rig)
     return row | {"nominal": nominal, "patched": patched}
+
+
+def reproduced(
+    written: Mapping[str, str], body: Mapping[str, Any], trials: Sequence[Trial], task: BlockTask, rig: Rig
+) -> tuple[float, float]:
+    """Root mean square [N] of recorded minus predicted forces, by the nominal and by the corrected model.
+
+    Both are driven by the trials' motions; `written` are the files of `simgap.patch.files` for the diagnosis
+    `body`, `rig` the nominal one. Trials that do not fit their task are left out; nan where none is left.
+    """
+    with tempfile.TemporaryDirectory(prefix="hmmseg-") as place:
+        for name, text in written.items():
+            (Path(place) / name).write_text(text, encoding="utf-8")
+        patched = read_rig(Path(place) / "rig.toml")
+        after = read_properties(Path(place) / "actual.toml", task)
+    shift = body["effects"]["+".join(body["causes"])]["property_shift"]
+    before = {n: replace(b, **_before(n, shift)) for n, b in after.items()}
+    squares: list[tuple[float, float]] = []
+    for trial, spans in zip(trials, segment(trials, task, rig), strict=True):
+        if spans.failed is None:
+            ends = [s.start for s in spans.spans[1:]]
+            both = (replayed(trial, task, *model, ends) for model in ((rig, before), (patched, after)))
+            nominal, corrected = (float(np.nanmean(r.residual**2)) for r in both)
+            squares.append((nominal, corrected))
+    if not squares:
+        return float("nan"), float("nan")
+    nominal, corrected = np.sqrt(np.mean(squares, axis=0))
+    return float(nominal), float(corrected)
+
+
+def _before(name: str, shift: Mapping[str, Any]) -> dict[str, float]:
+    """A block's properties as they were without the causes."""
+    return {k.partition(".")[2]: v["before"] for k, v in shift.items() if k.startswith(f"{name}.")}
 
 
 def table() -> str | None:

@@ -67,20 +67,3 @@ def handover() -> str | None:
         f"{1e3 * found['clearance']:g} mm above its rest. To reach: 200 ms."
     )
     return f"{note}\n\n{markdown(['recording', 'lift-off', 'putting-down'], rows)}"
-
-
-def hiro_network() -> str | None:
-    """docs/hmm.md: phases of a snap assembly learned from their order, by a network and by `segment`."""
-    found = load("hiro_network")
-    if found is None:
-        return None
-    names = {"network": "network trained on `log_evidence`", "own": "`segment`, learned without labels"}
-    rows = [
-        [
-            title,
-            *(f"{found['median_error'][name][b]:.2f} s ({found['p90_error'][name][b]:.2f})" for b in (0, 1)),
-        ]
-        for name, title in names.items()
-    ]
-    head = ["error of the boundary, median (90 %)", "approach -> rotation", "insertion -> mating"]
-    return markdown(head, rows) + f"\n\n{found['trials']} trials, {found['seeds']} random crops."

@@ -15,9 +15,7 @@ from pathlib import Path
 from experiments import (
     ablation,
     gap_arm,
-    gap_detectors,
     gap_drawn,
-    gap_forms,
     patch_heldout,
     table_calibration,
     table_gap,
@@ -26,7 +24,7 @@ from experiments import (
     table_speed,
     wrist,
 )
-from experiments.table_real import hiro_network, real
+from experiments.table_real import real
 from experiments.table_text import as_csv, covered, load, markdown, milliseconds, percent
 from hmmseg.contact.decompose import PROPERTIES
 
@@ -106,13 +104,10 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
     ("docs/gap_results.md", "labs", gap_drawn.labs_table, "gap-labs"),
-    ("docs/gap_results.md", "forms", gap_forms.table, "gap-forms"),
-    ("docs/gap_results.md", "detectors", gap_detectors.table, "gap-forms"),
     ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),
     ("docs/tables/special_cases.csv", "", ablation.table, "ablation"),
-    ("docs/hmm.md", "hiro_network", hiro_network, "real"),
     ("docs/benchmarks.md", "alignment", table_speed.alignment, "bench"),
     ("docs/benchmarks.md", "accelerator", table_speed.accelerator, "bench-accelerator"),
     ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),
@@ -125,8 +120,6 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/robots_results.md", "robots_check_given", table_robots.given, "robots-given"),
     ("docs/robots_results.md", "robots_check", table_robots.check, "robots-check"),
     ("docs/robots_results.md", "sts3215", table_robots.changed, "sts3215"),
-    ("docs/robots_results.md", "sts3215_first", table_robots.first, "sts3215"),
-    ("docs/robots_results.md", "sts3215_mixed", table_robots.mixed, "sts3215"),
     ("docs/robots_results.md", "sts3215_bam", table_robots.bam, "sts3215"),
     ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
     ("docs/tables/wrist.csv", "", partial(wrist.wrist, every=True), "wrist"),

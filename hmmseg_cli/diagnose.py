@@ -31,10 +31,12 @@ from hmmseg_cli.console import (
 )
 from hmmseg_cli.diagnose_robot import (
     CandidateOption,
+    HistoryOption,
     MapOption,
     MjcfOption,
     OwnSimulator,
     PatchOption,
+    RerunOption,
     SimulatorOption,
     compare_robot,
     diagnose_robot,
@@ -101,6 +103,8 @@ def diagnose(
     model: ModelFile = None,
     effect: EffectOption = None,
     patch: PatchOption = None,
+    history: HistoryOption = None,
+    rerun: RerunOption = None,
     json: JsonOption = None,
     figures: FiguresOption = None,
     report: ReportOption = None,
@@ -115,7 +119,7 @@ def diagnose(
         paths = distinct_trials(trials)
         if model is not None and mjcf is None and model.suffix.lower() != ".npz":
             model, mjcf = None, model  # a robot's, not the emissions of a task
-        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch)
+        own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch, history, rerun)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
             if healthy:
@@ -219,7 +223,7 @@ def _against(
     """The generic diagnosis, against given simulated trials."""
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.diagnose import diagnose_blocks
-    from simgap.generic.effects import EFFECTS
+    from simgap.generic.effects import effects
 
     every = distinct_trials([*paths, *against])
     with out.progress("diagnosing", total=4) as advance:
@@ -241,7 +245,7 @@ def _against(
     for warning in found.warnings:
         out.warn(warning)
     out.print(sentence(found.body), *tables(found.body))
-    _draw(out, found, [trial.name for trial in read[: len(paths)]], task, EFFECTS)
+    _draw(out, found, [trial.name for trial in read[: len(paths)]], task, effects())
     out.finish(found.body)
 
 

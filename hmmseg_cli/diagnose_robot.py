@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,54 +16,48 @@ import typer
 from rich.table import Table
 
 from hmmseg.errors import InputError
-from hmmseg_cli.console import Output, check_folder
+from hmmseg_cli.console import Output, check_file, check_folder, strict_json
 from simgap.report.finding import sentence
 from simgap.report.finding import tables as usual_tables
 
 if TYPE_CHECKING:
     from simgap.progress import Progress
+    from simgap.robot_effects.base import RobotEffect
+    from simgap.robots.changes import Changes
     from simgap.robots.diagnose import RobotDiagnosis
     from simgap.simulators.mjcf.load import Loaded
     from simgap.simulators.protocol import Simulator
     from simgap.simulators.recording import Recording
 
 ROBOT = "A robot against your own model of it"
+
+
+def _option(flag: str, metavar: str, text: str) -> Any:
+    return typer.Option(flag, metavar=metavar, rich_help_panel=ROBOT, help=text)
+
+
 SimulatorOption = Annotated[
-    str | None,
-    typer.Option(
-        "--simulator",
-        metavar="FILE.py:NAME",
-        rich_help_panel="A robot against your own model of it",
-        help="Your own model instead of the virtual blocks.",
-    ),
+    str | None, _option("--simulator", "FILE.py:NAME", "Your own model instead of the virtual blocks.")
 ]
 MjcfOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--mjcf",
-        metavar="XML",
-        rich_help_panel="A robot against your own model of it",
-        help="Your own model, as MuJoCo reads it; it needs --map.",
-    ),
+    Path | None, _option("--mjcf", "XML", "Your own model, as MuJoCo reads it; it needs --map.")
 ]
 MapOption = Annotated[
     Path | None,
-    typer.Option(
-        "--map",
-        metavar="MAP.toml",
-        rich_help_panel="A robot against your own model of it",
-        help="Which column of the logs is which joint, actuator, sensor "
-        "or body of the MJCF model, in what unit.",
-    ),
-]
+    _option("--map", "MAP.toml", "Which column of the logs is which joint, actuator, sensor "
+            "or body of the MJCF model, in what unit."),
+]  # fmt: skip
 CandidateOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--candidate",
-        metavar="NAME",
-        rich_help_panel="A robot against your own model of it",
-        help="Offer one more thing the MJCF model can set as a cause, such as joint:elbow.frictionloss.",
-    ),
+    _option("--candidate", "NAME", "Offer one more thing the MJCF model can set as a cause, such as "
+            "joint:elbow.frictionloss."),
+]  # fmt: skip
+HistoryOption = Annotated[
+    Path | None,
+    _option("--history", "FILE.jsonl", "Keep this run's intervals in that file, and say what moved since."),
+]
+RerunOption = Annotated[
+    Path | None, _option("--rerun", "FILE.rrd", "Recorded, simulated and corrected, for Rerun's viewer.")
 ]
 PatchOption = Annotated[
     Path | None,
@@ -76,37 +74,45 @@ class OwnSimulator:
     map_file: Path | None
     candidates: Sequence[str]
     patch: Path | None
+    history: Path | None = None
+    rerun: Path | None = None
 
     @property
     def given(self) -> bool:
         """Whether a model was brought; InputError for what goes only with one."""
-        if self.simulator is None and self.mjcf is None:
-            if self.map_file is not None:
-                raise InputError(f"--map {self.map_file}", "goes with a MuJoCo model", "--mjcf XML")
-            if self.candidates:
-                raise InputError(
-                    f"--candidate {self.candidates[0]}", "goes with a MuJoCo model", "--mjcf XML"
-                )
-            return False
-        if self.simulator is not None and self.mjcf is not None:
+        of_mjcf = {"--map": self.map_file, "--candidate": next(iter(self.candidates), None)}
+        if self.mjcf is None:
+            for option, value in of_mjcf.items():
+                if value is not None:
+                    raise InputError(f"{option} {value}", "goes with a MuJoCo model", "--mjcf XML")
+        elif self.simulator is not None:
             raise InputError("--mjcf", "does not go with --simulator", "one model")
-        if self.mjcf is not None and self.map_file is None:
-            raise InputError(
-                "--map", "missing", "which column is which joint, actuator or sensor of the model"
-            )
-        if self.mjcf is None and (self.map_file is not None or self.candidates):
-            raise InputError(
-                "--map" if self.map_file else "--candidate", "goes with a MuJoCo model", "--mjcf XML"
-            )
-        return True
+        elif self.map_file is None:
+            what = "which column is which joint, actuator or sensor of the model"
+            raise InputError("--map", "missing", what)
+        if self.simulator is not None or self.mjcf is not None:
+            return True
+        for option, value in {"--history": self.history, "--rerun": self.rerun}.items():
+            if value is not None:
+                raise InputError(f"{option} {value}", "goes with a model of a robot", "--mjcf XML")
+        return False
 
     def check_alone(self, others: Mapping[str, Any]) -> None:
-        """InputError for an option that has no meaning with the owner's model."""
+        """InputError for an option that has no meaning with the owner's model, and for places to write."""
         for option, value in others.items():
             if value:
                 raise InputError(option, "does not go with a simulator of your own")
         if self.patch is not None:
             check_folder("--patch", self.patch)
+        if self.history is not None:
+            from simgap.report.robot import history
+
+            check_file("--history", self.history, (".jsonl",))
+            history(self.history)
+        if self.rerun is not None:
+            check_file("--rerun", self.rerun, (".rrd",))
+            if importlib.util.find_spec("rerun") is None:
+                raise InputError("--rerun", "needs rerun-sdk", "pip install rerun-sdk")
 
 
 def _read(
@@ -133,7 +139,12 @@ def _read(
 
 @contextmanager
 def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with what a long one is at; yields what is told of each stage that begins."""
+    """Progress by stages, with what a long one is at; yields what is told of each stage that begins.
+
+    InputError where the model runs so far from its logs that no equation can be solved.
+    """
+    from numpy.linalg import LinAlgError
+
     from simgap.progress import heard
 
     stage = text
@@ -144,7 +155,11 @@ def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
         advance(1, text)
 
     with out.progress(text, total=total) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
-        yield tell
+        try:
+            yield tell
+        except LinAlgError:
+            near = "a model that stays near its logs: a shorter time step?"
+            raise InputError("simulator", f"runs far away from the logs ({stage})", near) from None
 
 
 def _warn_of_engine(out: Output, own: OwnSimulator) -> None:
@@ -192,24 +207,14 @@ def diagnose_robot(
     _warn_of_engine(out, own)
     left = document["remainder"]["rms_over_noise"]
     out.print(sentence(document), f"What is left is {left:.3g} times the noise.", *tables(document, found))
-    if out.figures is not None or out.report is not None:
-        _draw(out, found, document)
+    _deliver(out, own, found, document, loaded, recordings, found.composed.effects)
     if own.patch is not None:
-        from simgap.robots.patch import write_patch
-
-        folder = own.patch
-        given = found.composed, found.linear.point, document, document["causes"], own.mjcf
+        given = found.composed, found.linear.point, document, document["causes"]
         if document["verdict"] == "unknown" and found.calibrated is not None:  # the best model there is
             whole, point = found.calibrated.composed, found.calibrated.point
             moved = [n for n in point if not whole.numeric(n)]
-            given = whole, point, document["calibrated"], moved, own.mjcf
-        write_patch(*given, lambda name: out.stage(folder / name))
-        import json
-
-        ranges, model = own.patch / "ranges.json", "" if own.mjcf is None else f" and {own.mjcf.name}"
-        out.print(f"what was found is in {ranges}{model}")
-        for line in json.loads(out.stage(ranges).read_text(encoding="utf-8")).get("not_in_xml", ()):
-            out.warn(f"--patch: an MJCF has no place for {line}; correct the driver by ranges.json")
+            given = whole, point, document["calibrated"], moved
+        _patch(out, own, *given)
     out.finish(document)
 
 
@@ -229,44 +234,95 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
     document = found.body()
     for b in document["broken"]:
         out.warn(f"{b['trial']}: {b['channel']} is {b['value']:.4g} at {b['time']:.3f} s, left out")
-    out.print(changed(document), *usual_tables(document))
-    if out.figures is not None or out.report is not None:
-        from hmmseg_cli.gap_figures import draw_changes
-
-        if out.figures is not None:
-            draw_changes(found, out.figure("changes.png"))
-        if out.report is not None:
-            from hmmseg_cli.pages import Setting, page
-
-            shows = {n: e.says for n, e in effects.items()}
-            setting = Setting(
-                [log.name for log in logs[: len(paths)]], ["all"], shows=shows, warnings=out.warnings
-            )
-            text = page(document, setting, lambda path: draw_changes(found, path("gap_signal.png")))
-            out.stage(out.report).write_text(text, encoding="utf-8")
+    out.print(sentence(document), *usual_tables(document))
+    _deliver(out, own, found, document, loaded, logs[: len(paths)], effects)
     if own.patch is not None:
-        from simgap.robots.patch import write_patch
-
-        folder, causes = own.patch, document["causes"]
         point = {n: v for n, v in found.point().items() if not found.composed.numeric(n)}
-        write_patch(found.composed, point, document, causes, own.mjcf, lambda name: out.stage(folder / name))
+        _patch(out, own, found.composed, point, document, document["causes"])
     out.finish(document)
 
 
-def changed(document: Mapping[str, Any]) -> str:
-    """The verdict on two sets of logs in a paragraph."""
-    p = document["detection"]["p_value"]
-    if document["verdict"] == "none":
-        return "Nothing changed that these logs can tell: the new ones are met as the old ones are."
-    if document["verdict"] == "unknown":
-        best = "".join(f" The best that is known, {text}, leaves too much." for text in document["changes"])
-        over = document["remainder"]["rms_over_noise"]
-        return f"Something changed that no known cause explains: {over:.2g} times what old logs leave.{best}"
-    lines = [f"Changed: {'; '.join(document['changes'])} (p = {p:.2g} that nothing did)."]
-    if document["verdict"] == "set":
-        others = ", ".join(document["indistinguishable"]) or "the same in other parts"
-        lines.append(f"These logs cannot tell it from a change of {others}.")
-    return " ".join(lines)
+def _patch(out: Output, own: OwnSimulator, composed: Any, point: Any, document: Any, causes: Any) -> None:
+    """Write the corrected model, and say where, and what an MJCF has no place for."""
+    from simgap.robots.patch import write_patch
+
+    folder = own.patch
+    assert folder is not None
+    write_patch(composed, point, document, causes, own.mjcf, lambda name: out.stage(folder / name))
+    ranges, model = folder / "ranges.json", "" if own.mjcf is None else f" and {own.mjcf.name}"
+    out.print(f"what was found is in {ranges}{model}")
+    for line in json.loads(out.stage(ranges).read_text(encoding="utf-8")).get("not_in_xml", ()):
+        out.warn(f"--patch: an MJCF has no place for {line}; correct the driver by ranges.json")
+
+
+def _deliver(
+    out: Output,
+    own: OwnSimulator,
+    found: RobotDiagnosis | Changes,
+    document: dict[str, Any],
+    loaded: Loaded | None,
+    logs: Sequence[Recording],
+    effects: Mapping[str, RobotEffect],
+) -> None:
+    """History, the motion to run next, courses for Rerun, figures and the page."""
+    from simgap.report import robot
+    from simgap.robots.changes import Changes
+
+    units = robot.own_units(loaded)
+    if own.history is not None:
+        past, now = robot.history(own.history), robot.intervals(document)
+        document["history"] = robot.compared(past, now)
+        out.print(*_history(document["history"], now))
+        today = {"date": date.today().isoformat(), "files": [log.name for log in logs], "parameters": now}
+        lines = "".join(
+            json.dumps(json.loads(strict_json(e)), ensure_ascii=False) + "\n" for e in (*past, today)
+        )
+        out.stage(own.history).write_text(lines, encoding="utf-8")
+    folder = own.patch or out.figures or (out.report.parent if out.report is not None else None)
+    motion, place = robot.next_motion(document, logs), None
+    if motion is not None and folder is not None:
+        name = "next_motion.csv"
+        while any(log.name == name for log in logs):  # recorded when it was asked for last
+            name = f"next_{name}"
+        place = folder / name
+        time = ("t", 1.0) if loaded is None else (loaded.map.time, loaded.map.time_factor)
+        commands = [n for n, c in found.composed.simulator.channels.items() if c.kind == "command"]
+        text = robot.motion_csv(motion, commands, units, time)
+        out.stage(place).write_text(text, encoding="utf-8")
+        document["next_experiment"]["file"] = str(place)
+        out.print(f"the motion to run next is in {place}")
+    if own.rerun is not None:
+        robot.write_rerun(out.stage(own.rerun), robot.courses(found, units))
+    if out.figures is None and out.report is None:
+        return
+    from hmmseg_cli.gap_figures import draw_robot, draw_robot_page
+
+    if out.figures is not None:
+        draw_robot(found, document, units, out.figure)
+    if out.report is not None:
+        from hmmseg_cli.pages import Setting, page
+
+        phases = ["all"] if isinstance(found, Changes) else sorted({c["subtask"] for c in document["where"]})
+        shows = {n: e.says for n, e in effects.items()}
+        setting = Setting(
+            [log.name for log in logs], phases, shows=shows, warnings=out.warnings, own=units,
+            motion="" if place is None else os.path.relpath(place, out.report.parent),
+        )  # fmt: skip
+        text = page(document, setting, lambda path: draw_robot_page(found, units, path))
+        out.stage(out.report).write_text(text, encoding="utf-8")
+
+
+def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
+    """What moved since each parameter was known last, as a table."""
+    if not said:
+        return [f"the history begins with this run: {len(now)} parameters"]
+    table = Table(title="since it was known last", title_justify="left")
+    for head in ("parameter", "then", "now", "since", ""):
+        table.add_column(head)
+    for name, p in said.items():
+        ends = [("" if v is None else f"{v:.4g} {p['unit']}") for v in (p["then"], p["now"])]
+        table.add_row(name, *ends, p["since"], p["says"])
+    return [table]
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
@@ -296,23 +352,3 @@ def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
             )
         out.append(rms)
     return out
-
-
-def _draw(out: Output, found: RobotDiagnosis, document: dict[str, Any]) -> None:
-    """Figures where asked for, and the page with the same figures inside."""
-    from hmmseg_cli.gap_figures import Drawn, draw_robot, draw_robot_page
-
-    drawn = Drawn(found, document, found.warnings)
-    if out.figures is not None:
-        draw_robot(drawn, out.figure)
-    if out.report is not None:
-        from hmmseg_cli.pages import Setting, page
-
-        setting = Setting(
-            files=[r.name for r in found.composed.recordings],
-            subtasks=sorted({cell["subtask"] for cell in document["where"]}),
-            shows={n: e.says for n, e in found.composed.effects.items()},
-            warnings=out.warnings,
-        )
-        text = page(document, setting, lambda path: draw_robot_page(drawn, path))
-        out.stage(out.report).write_text(text, encoding="utf-8")

@@ -25,16 +25,16 @@ def description(effect) -> dict[str, Any]:
         {
             "name": p.name,
             "unit": p.unit,
-            "starts": list(p.starts) if p.starts != (0.0,) else [p.neutral],
+            "starts": list(p.starts) or [p.nominal],
             "prior": {
                 "kind": "log-normal" if p.log else "normal",
-                "centre": p.neutral,
+                "centre": p.nominal,
                 "sd": p.sd,
                 "low": p.low,
                 "high": p.high,
             },
         }
-        for p in effect.parameters
+        for p in effect.parameters.values()
         if not p.hidden
     ]
     return {

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,9 @@ from simgap.gap.frame import CHANNELS
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.generic.trials import SLOW, bin_edges
 from simgap.report.figures import draw_heat_map, draw_suspects
+from simgap.report.robot import Course, Own, courses
 from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
-from simgap.robots.linear import base_at
 
 LABELS = {
     "x": "x [cm]",
@@ -106,7 +105,9 @@ def draw_generic(found: GenericDiagnosis, path: Path) -> None:
             above.plot(t, rows.T, color=colour, lw=0.5, alpha=0.35)
             above.plot(t, rows.mean(0), color=colour, lw=1.4, label=label)
         moved = sim.mean(0) + found.shift[index]
-        above.plot(t, moved, color="black", lw=1, ls="--", label=f"simulated + {' + '.join(found.leading)}")
+        if found.leading:
+            what = " + ".join(found.leading)
+            above.plot(t, moved, color="black", lw=1, ls="--", label=f"corrected: {what}")
         above.legend(fontsize=6.5)
         above.set_ylabel(lay.ensembles.channels[channel])
         sd = np.sqrt(found.variance[index])
@@ -122,28 +123,26 @@ def draw_generic(found: GenericDiagnosis, path: Path) -> None:
         above.set_title(f"Largest difference of a course: {lay.ensembles.channels[channel]} (shaded subtask)")
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A diagnosis with its document, as the page takes it."""
-
-    found: RobotDiagnosis
-    body: dict[str, Any]
-    warnings: Sequence[str]
+Robot = RobotDiagnosis | Changes
 
 
-def draw_robot(drawn: Drawn, path: Callable[[str], Path]) -> None:
+def draw_robot(
+    found: Robot, body: dict[str, Any], own: Mapping[str, Own], path: Callable[[str], Path]
+) -> None:
     """All figures, at the paths that `path(name)` gives."""
-    phases = sorted({cell["subtask"] for cell in drawn.body["where"]})
-    if phases:
-        draw_heat_map(drawn.body, phases, path("gap_where.png"))
-    draw_suspects(drawn.body, path("gap_probabilities.png"))
-    draw_robot_page(drawn, path)
+    if isinstance(found, RobotDiagnosis):
+        phases = sorted({cell["subtask"] for cell in body["where"]})
+        if phases:
+            draw_heat_map(body, phases, path("gap_where.png"))
+        draw_suspects(body, path("gap_probabilities.png"))
+    draw_robot_page(found, own, path)
 
 
-def draw_robot_page(drawn: Drawn, path: Callable[[str], Path]) -> None:
+def draw_robot_page(found: Robot, own: Mapping[str, Own], path: Callable[[str], Path]) -> None:
     """Those that a page shows next to its own tables."""
-    draw_windows(drawn, path("gap_signal.png"))
-    draw_before_after(drawn, path("gap_before_after.png"))
+    draw_course(max(courses(found, own), key=lambda c: c.over), found, path("gap_signal.png"))
+    if isinstance(found, RobotDiagnosis):
+        draw_before_after(found, path("gap_before_after.png"))
 
 
 def _short(name: str) -> str:
@@ -151,57 +150,39 @@ def _short(name: str) -> str:
     return stem if len(stem) <= 22 else "…" + stem[-21:]
 
 
-def draw_windows(drawn: Drawn, path: Path) -> None:
-    """Recorded, and simulated as it came and with the causes, in the log and channel that part most."""
-    found = drawn.found
-    rows = found.composed.rows
-    size = np.sqrt(rows.variance)
-    square = np.where(np.isfinite(found.plain.residual), (found.plain.residual / size) ** 2, 0.0)
-    key = rows.log * len(rows.channels) + rows.channel
-    log, channel = divmod(int(np.bincount(key, square).argmax()), len(rows.channels))
-    mine = (rows.log == log) & (rows.channel == channel)
-    t, window = rows.time[mine], rows.window[mine]
-    breaks = np.flatnonzero(np.diff(window)) + 1
-    unit = found.composed.simulator.channels[rows.channels[channel]].unit
-    before, after = _both_residuals(found)
-    label = "with the causes, held out" if found.shrinkage is not None else "with what was fitted"
-
-    def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan)
-
+def draw_course(one: Course, found: Robot, path: Path) -> None:
+    """Recorded, simulated and corrected, and what each leaves beneath."""
+    if isinstance(found, Changes):
+        names, how = ("as it was", "with what changed"), "run freely from its first sample"
+    else:
+        last = "with the causes, held out" if found.shrinkage is not None else "with what was fitted"
+        names, how = ("model as it came", last), "windows restarted from the recording"
     with canvas(path, height=4.2) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        observed = rows.observed[mine]
-        above.plot(t, observed, color="black", lw=1.2, label="recorded")
-        for residual, colour, name in ((before, RED, "model as it came"), (after, BLUE, label)):
-            above.plot(*split(observed - residual[mine]), color=colour, lw=0.8, label=name)
-            below.plot(*split(residual[mine]), color=colour, lw=0.8, label=name)
-        above.set_ylabel(f"{rows.channels[channel]} [{unit}]")
-        below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
+        above.plot(one.t, one.recorded, color="black", lw=1.2, label="recorded")
+        for run, colour, name in zip((one.simulated, one.corrected), (RED, BLUE), names, strict=True):
+            above.plot(one.t, run, color=colour, lw=0.8, label=name)
+            below.plot(one.t, one.recorded - run, color=colour, lw=0.8)
+        above.set_ylabel(f"{one.channel} [{one.unit}]")
+        below.set(xlabel="time [s]", ylabel=f"residual [{one.unit}]")
         below.axhline(0, color=GREY, lw=0.5)
         above.legend(fontsize=6.5)
-        above.set_title(
-            f"{_short(found.composed.recordings[log].name)}: windows restarted from the recording"
-        )
+        above.set_title(f"{_short(one.log)}: {how}")
 
 
-def _both_residuals(found: RobotDiagnosis) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals before and after, each log predicted from the others where that was done."""
-    far = found.shrinkage
-    return (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
-
-
-def draw_before_after(drawn: Drawn, path: Path) -> None:
-    """Root mean square residual by log of the channel with the largest gap, before and after, held out."""
-    found = drawn.found
-    rows = found.composed.rows
-    before, after = _both_residuals(found)
+def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
+    """Root mean square residual by log, before and after, each log predicted from the others where that was
+    done."""
+    rows, far = found.composed.rows, found.shrinkage
+    both = (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)
     at = np.arange(len(logs))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
-        for place, residual, colour, name in ((-0.2, before, RED, "before"), (0.2, after, BLUE, "after")):
+        for place, residual, colour, name in zip(
+            (-0.2, 0.2), both, (RED, BLUE), ("before", "after"), strict=True
+        ):
             each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
             axes.bar(at + place, each, 0.4, color=colour, label=name)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
@@ -209,23 +190,4 @@ def draw_before_after(drawn: Drawn, path: Path) -> None:
         axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-        axes.set_title("Held-out logs" if found.shrinkage is not None else "All logs")
-
-
-def draw_changes(found: Changes, path: Path) -> None:
-    """Recorded, the model of the old logs, and with what changed, in the new log that parts most."""
-    rows, point = found.composed.rows, found.old.point
-    runs = [base_at(found.composed, p).rows for p in (point, found.point())]
-    size = np.sqrt(rows.variance)
-    log = int(np.bincount(rows.log, ((rows.observed - runs[0]) / size) ** 2).argmax())
-    with canvas(path, height=1.2 + 1.5 * len(rows.channels)) as figure:
-        axes = np.atleast_1d(figure.subplots(len(rows.channels), 1, sharex=True))
-        for c, (name, ax) in enumerate(zip(rows.channels, axes, strict=True)):
-            mine = (rows.log == log) & (rows.channel == c)
-            ax.plot(rows.time[mine], rows.observed[mine], color="black", lw=1.2, label="recorded")
-            for run, colour, label in zip(runs, (RED, BLUE), ("as it was", "with what changed"), strict=True):
-                ax.plot(rows.time[mine], run[mine], color=colour, lw=0.8, label=label)
-            ax.set_ylabel(f"{name} [{found.composed.simulator.channels[name].unit}]")
-        axes[0].legend(fontsize=6.5)
-        axes[0].set_title(f"{_short(found.composed.recordings[log].name)}, run freely from its first sample")
-        axes[-1].set_xlabel("time [s]")
+        axes.set_title("Held-out logs" if far is not None else "All logs")

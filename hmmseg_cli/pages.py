@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 
@@ -32,6 +32,9 @@ from hmmseg.plot.signals import draw_signals
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
 from simgap.report.finding import plain_name
+
+if TYPE_CHECKING:
+    from simgap.report.robot import Own
 
 
 def rendered(template: str, **values: Any) -> str:
@@ -157,22 +160,14 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
 Body = Mapping[str, Any]
 MOST = 8  # look: rows of a table
 NOTHING = 5e-3  # look: probability, or share of a gap, that is shown as none
-SHARES = (
-    "gain",
-    "scale",
-    "finger1",
-    "finger2",
-    "fx1",
-    "fy1",
-    "fx2",
-    "fy2",
-)  # shown in per cent if in no unit
+SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # in per cent if unitless
 
 
 @dataclass(frozen=True)
 class Setting:
     """What a page shows besides the body: recordings, subtasks in order, the rig's pads, what was measured,
-    and how each effect would show.
+    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
+    and where the motion to run next is.
     """
 
     files: Sequence[str]
@@ -181,6 +176,8 @@ class Setting:
     measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
     shows: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[str] = ()
+    own: Mapping[str, Own] = field(default_factory=dict)
+    motion: str = ""
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
@@ -196,7 +193,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         lines=finding.sentences(body),
         to_do=_to_do(body, setting) if body["verdict"] != "none" else [],
         remains=finding.remains(body),
-        parameters=_parameters(effect, body["causes"]) if effect and body["causes"] else [],
+        parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
         subtasks=setting.subtasks,
         heat=_heat(cells, setting.subtasks) if cells else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
@@ -205,7 +202,9 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
-        calibrated=_calibrated(body),
+        compared="changes" in body,
+        motion=setting.motion,
+        calibrated=_calibrated(body, setting),
         numerics=_numerics(body),
         properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
         measured=setting.measured is not None,
@@ -245,47 +244,53 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
     lows, highs = [c["band"][0] for c in cells], [c["band"][1] for c in cells]
     band = f"{min(lows):g} to {max(highs):g}" if None not in highs else ""
     scores = [c["z"] for c in cells if c["z"] is not None]
-    trials = str(len({c["trial"] for c in cells}))
-    return (
-        key[0],
-        key[1],
-        percent(finding.share_of(cells)),
-        f"{max(scores):.0f}" if scores else "",
-        trials,
-        band,
-    )
+    score, trials = f"{max(scores):.0f}" if scores else "", str(len({c["trial"] for c in cells}))
+    return (*key, percent(finding.share_of(cells)), score, trials, band)
 
 
-def _parameters(effect: Mapping[str, Any], causes: Sequence[str]) -> list[tuple[str, ...]]:
+def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setting) -> list[tuple[str, ...]]:
     """Parameter, the model's value where it is known, what was found, interval."""
     rows = []
     for name, p in effect["parameters"].items():
         cause = next((c for c in causes if name.startswith(f"{c}.")), causes[0])
         last = name.rpartition(".")[2]
         shown = SHOWN[last] if last in SHOWN else shown_as(p["unit"], share=last in SHARES)
-        low, high = p["interval_90"]
-        ends = "" if None in (low, high) else interval(low, high, shown)
-        words, nominal = last.replace("_", " "), p.get("nominal")
-        if nominal is not None:
+        words = last.replace("_", " ")
+        if p.get("nominal") is not None:
             words = plain_name(cause) + (f", {words}" if not cause.endswith(f".{last}") else "")
-        model = "" if nominal is None else estimate(nominal, 0.0, shown)
-        rows.append((words, model, estimate(p["mean"], p["sd"] or 0.0, shown), ends))
+        if cause.endswith(".payload") and (where := setting.shows.get(cause, "").partition(", ")[2]):
+            words += f" {where}"
+        rows.append((words, *_values(cause, p, shown, setting)))
     return rows
 
 
-def _calibrated(body: Body) -> list[tuple[str, ...]]:
+def _calibrated(body: Body, setting: Setting) -> list[tuple[str, ...]]:
     """What was fitted along before any cause was sought: parameter, the model's value, found, interval."""
-    rows = []
-    for name, p in ((body.get("calibrated") or {}).get("parameters") or {}).items():
-        shown = shown_as(p["unit"])
-        found, ends = "not told by these logs", ""
-        if p["mean"] is not None:
-            found = estimate(p["mean"], p["sd"] or 0.0, shown)
-            if p["interval_90"]:
-                low, high = p["interval_90"]
-                ends = interval(low, high, shown)
-        rows.append((plain_name(name), estimate(p["nominal"], 0.0, shown), found, ends))
-    return rows
+    known = (body.get("calibrated") or {}).get("parameters") or {}
+    return [(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in known.items()]
+
+
+def _values(
+    name: str, p: Mapping[str, Any], shown: tuple[float, str], setting: Setting
+) -> tuple[str, str, str]:
+    """The model's value, what was found and its interval; each in its column's own unit too, where it has
+    one."""
+    part, _, last = name.rpartition(".")
+    own = setting.own.get(part, setting.own.get(part.partition(":")[2]))
+    both = [shown]
+    if own is not None and own.si == p["unit"] and (own.offset == 0 or last == "bias"):
+        both.insert(0, (1 / own.factor, own.unit))
+
+    def told(write: Callable[[tuple[float, str]], str]) -> str:
+        first, *rest = map(write, both)
+        return first + "".join(f" ({text})" for text in rest)
+
+    model = "" if p.get("nominal") is None else told(lambda u: estimate(p["nominal"], 0.0, u))
+    if p["mean"] is None:
+        return model, "not told by these logs", ""
+    low, high = p["interval_90"] or (None, None)
+    ends = "" if None in (low, high) else told(lambda u: interval(low, high, u))
+    return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
 
 
 def _numerics(body: Body) -> str:
@@ -335,13 +340,11 @@ def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tup
 
 def _detection(body: Body) -> str:
     p, fineness = body["detection"]["p_value"], body["detection"].get("resolution")
-    of = (
-        "Logs of a robot that is as its model"
-        if finding.of_robot(body)
-        else "A healthy recording of this rig and task"
-    )
-    verb = "differ" if finding.of_robot(body) else "differs"
-    text = f"{of} {verb} from it as much with {finding.p_text(p)}"
+    text = f"A healthy recording of this rig and task differs from it as much with {finding.p_text(p)}"
+    if "changes" in body:
+        text = f"Logs of a robot that did not change differ as much with {finding.p_text(p)}"
+    elif finding.of_robot(body):
+        text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
     fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"
@@ -353,6 +356,9 @@ def _far(body: Body) -> str:
     if not s or s.get("fraction") is None or s.get("before") is None:
         return ""
     fall = f"from {plain(s['before'])} to {plain(s['after'])}"
+    if "changes" in body:
+        rest = f"old ones leave {plain(s['noise_floor'])}"
+        return f"On {s['evaluated_on']} what is missed falls {fall} nats a row; {rest}."
     text = (
         f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
         f"healthy recordings leave {plain(s['noise_floor'])}."

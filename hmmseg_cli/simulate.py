@@ -168,7 +168,7 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     traces = [Trace(f"{label} [N]", [("recording", signals.t, getattr(signals, key)),
                                      ("virtual model", signals.t, model[key])])
               for label, key in (("Grip", "grip"), ("Net $f_y$", "fy"), ("Shear", "shear"))]  # fmt: skip
-    films.append(("trial_01", Scene(result.t, result.tips, result.motion.blocks,
+    films.append(("trial_01", Scene(result.t, result.motion.position, result.motion.blocks,
                                     {name: blocks[name] for name in task.objects}, rig), traces))  # fmt: skip
     document = {"replay": {"file": str(path), "boundaries": boundaries, "complete": segmentation.complete,
                            "net_force_residual_over_noise": summary}}  # fmt: skip

@@ -47,7 +47,7 @@ def scenes(index: int) -> list[dict]:
         share = MOMENT.get(step.name, 0.5)
         k = int(np.searchsorted(played.t, span.start + share * (span.end - span.start)))
         out.append({"subtask": step.name, "object": step.object, "state": step.state,
-                    "fingers": played.tips[k], "blocks": played.motion.blocks[k]})  # fmt: skip
+                    "fingers": played.motion.position[k], "blocks": played.motion.blocks[k]})  # fmt: skip
     return out
 
 

@@ -27,11 +27,11 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.segmentation.thresholds import segment_qualitative
-from simgap.world.dynamics import CONTROL_PERIOD
+from simgap.world.dynamics import CONTROL_PERIOD, Record
 from simgap.world.operator import minimum_jerk
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.simulate import SimulatedTrial, record, simulate_trials
-from simgap.world.virtual_model import Rollout, physics, rollout, standing, substeps_for
+from simgap.world.virtual_model import physics, rollout, standing, substeps_for
 
 STACK = BlockTask({"block1": GROUND, "block2": GROUND}, (Move("block2", "block1"),))
 PLACES = {"block1": 0.15, "block2": 0.11}  # m
@@ -96,14 +96,14 @@ def stack(rig: Rig, friction: float, overtravel: float) -> Placed:
     return _measured(rig, friction, t, tips, velocity, motion, slid)
 
 
-def _slid(rig: Rig, tips: np.ndarray, motion: Rollout) -> np.ndarray:
+def _slid(rig: Rig, tips: np.ndarray, motion: Record) -> np.ndarray:
     """How far block 2 has slid down between the fingers (T,) [m], the pads' shear taken out."""
     over = tips[:, :, 1].mean(axis=1) - np.asarray(motion.blocks)[:, 1, 1]
     return over - np.asarray(motion.force)[:, :, 1].mean(axis=1) / rig.fingertip.shear_stiffness
 
 
 def _measured(rig: Rig, friction: float, t: np.ndarray, tips: np.ndarray, velocity: np.ndarray,
-              motion: Rollout, slid: np.ndarray) -> Placed:  # fmt: skip
+              motion: Record, slid: np.ndarray) -> Placed:  # fmt: skip
     """What the paper's method makes of the noiseless record of it."""
     rate = rig.rate or 20.0
     k = np.arange(0, t.size, round(1 / rate / CONTROL_PERIOD))

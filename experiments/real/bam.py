@@ -10,7 +10,7 @@ registers as stated:
     m6      Rhoban/bam's friction model M6 (Duclusaud, Passault, Padois & Ly, Extended friction models for the
             physics simulation of servo actuators, 2024/2025: directional and quadratic in the load, Stribeck
             with an exponent), with the drive as its authors have it: duty in proportion to the error
-    m6+     the same friction with the drive of `ours`: a limit of speed on the goal and a least duty
+    m6+     the same friction with the drive of `ours`: a limit of speed of the goal, dead zone, least duty
 
 One gain is left out at a time, then one mass; every log of it is run freely from its first sample to its
 last. The difference of two models' root mean squares is given with a 95 % interval by a bootstrap that draws
@@ -28,7 +28,7 @@ import pandas as pd
 from numba import njit
 from scipy.optimize import least_squares
 
-from experiments.real.servo import COUNTS, STEP, SUPPLY, UNIT, G, Servo, turn
+from experiments.real.servo import DEAD, STEP, SUPPLY, UNIT, G, Servo, asked, sent_in, slowed, turn
 from experiments.real.sts3215 import read
 from experiments.saving import save
 from simgap.robots.unchanged import without_broken
@@ -66,19 +66,11 @@ def turn_m6(p, t, goal, volts, on, mass, length, register, q, w):
         steps = max(1, int(np.ceil((t[i + 1] - t[i]) / STEP - 1e-9)))
         h = (t[i + 1] - t[i]) / steps
         for k in range(steps):
-            begin = t[i] + k * h
-            while sent + 1 < t.size and t[sent + 1] + delay <= begin:
-                sent += 1
-            target, drive = goal[sent], on[sent]
-            if sent + 1 < t.size and t[sent + 1] + delay < begin + h:
-                part = (begin + h - t[sent + 1] - delay) / h
-                target += part * (goal[sent + 1] - target)
-                drive += part * (on[sent + 1] - drive)
+            target, drive, sent = sent_in(t, goal, on, sent, t[i] + k * h, h, delay)
             follow += min(max(target - follow, -pace * h), pace * h)
-            error = follow - q
-            duty = unit * register * error + start * min(1.0, max(-1.0, error / COUNTS))
+            duty = asked(unit * register, start, follow - q, DEAD if start > 0 else 0.0)
             weight = -mass * G * length * np.sin(q - zero)
-            push = drive * (stall * min(1.0, max(-1.0, duty)) * volts[i] / SUPPLY - emf * w)
+            push = drive * (stall * duty * volts[i] / SUPPLY - emf * w)
             slow = np.exp(-((abs(w) / speed) ** alpha))
             hold = base + abs(weight * external_load - push * motor_load) + slow * stribeck
             hold += slow * abs(weight * external_extra - push * motor_extra)
@@ -87,10 +79,8 @@ def turn_m6(p, t, goal, volts, on, mass, length, register, q, w):
                     hold += slow * external_quad * weight**2
                 else:
                     hold += slow * motor_quad * push**2
-            w += h * (push + drive * emf * w + weight) / inertia
-            w /= 1 + h * (viscous + drive * emf) / inertia
-            brake = h * hold / inertia
-            w = 0.0 if abs(w) <= brake else w - np.sign(w) * brake
+            each, drag = h / inertia, viscous + drive * emf
+            w = slowed(w + each * (push + drive * emf * w + weight), each * drag, each * hold)
             q += h * w
     return out
 
@@ -119,7 +109,7 @@ def fitted(model: str, logs: list[tuple[Recording, tuple]]) -> tuple[list[str], 
     """Names and values of all parameters of a model."""
     if model == "ours":
         known = {
-            n: (p["nominal"], p.get("low", -np.inf), np.inf, p["sd"])
+            n: (p["nominal"], p.get("low", -np.inf), p.get("high", np.inf), p["sd"])
             for n, p in Servo().parameters.items() if n not in ("mass", "length", "gain")
         } | {"unit": M6["unit"]}  # fmt: skip
     else:

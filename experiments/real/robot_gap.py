@@ -18,7 +18,8 @@ import numpy as np
 
 from experiments.real.hiro_gap import rounded
 from experiments.saving import save
-from hmmseg_cli.gap_figures import Drawn, draw_before_after, draw_windows
+from hmmseg_cli.gap_figures import draw_before_after, draw_course
+from simgap.report.robot import courses
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.recording import Recording, read_recording
@@ -95,9 +96,9 @@ def published(found: RobotDiagnosis, name: str, output: Path | None, figures: Pa
     """Write the summary, and the figures NAME_signal.png and NAME_before_after.png where asked for."""
     save(output or RESULTS / f"{name}.json", summary(found))
     if figures is not None:
-        drawn = Drawn(found, body(found), found.warnings)
-        draw_windows(drawn, figures / f"{name}_signal.png")
-        draw_before_after(drawn, figures / f"{name}_before_after.png")
+        widest = max(courses(found, {}), key=lambda c: c.over)
+        draw_course(widest, found, figures / f"{name}_signal.png")
+        draw_before_after(found, figures / f"{name}_before_after.png")
 
 
 def asked(doc: str, kinds: Sequence[str] = ()) -> argparse.Namespace:

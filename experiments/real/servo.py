@@ -3,15 +3,24 @@
 Torques at the shaft, q the angle from hanging down, w its rate, V the supply, g the goal that the drive
 follows, which is the command, `delay` late, at `pace` at most; `on` is 1 while the drive is on, as late:
 
-    duty = on clip(gain (g - q) + start sign(g - q), -1, 1)
-    J w' = stall duty V / 12 - on emf w - viscous w - friction(w, load) - m G l sin(q - zero)
-    J = m l^2 + armature
+    duty = on clip(sign(g - q) (gain max(|g - q| - DEAD, 0) + start), -1, 1), 0 within DEAD
+    J w' = stall duty V / 12 - on emf w - viscous w - friction(w, load) - W sin(q - zero)
+    W = (m l + arm l^2 / 2) G
+    J = m l^2 + arm l^3 / 3 + armature
 
-`gain` has the firmware's register of the P gain in it, as duty per radian. Friction is Coulomb's, larger near
-standstill (Stribeck) and under load, the torque that the gears pass on: Duclusaud et al., Extended friction
-models for the physics simulation of servo actuators (2024), model 4. It is one law, of the gears: with the
-drive off all that goes is the motor's torque and the back-EMF. The duty is that of the recorded angle, so
-that it tells of the drive alone. Mass and length are stated; all else was never measured and is fitted along.
+`gain` has the firmware's register of the P gain in it, as duty per radian. The firmware leaves out the first
+count of an error (its dead zone) and adds a least duty (its starting force).
+`arm` is the mass of a metre of the rod, which is evenly thick. All torques but the weight's scale with the
+motor's, which was never measured, and armature adds to every inertia: as what it was, the robot moves alike
+with any arm if these grow as its weight does. So `stall`, `emf`, `viscous`, `coulomb`, `stribeck` and
+`armature` are those of a robot with a weightless arm, and grow with it: logs of one configuration then tell
+nothing of `arm` at all, and how far a mass or length changed is known no better than it.
+
+Friction is Coulomb's, larger near standstill (Stribeck) and under load, the torque that the gears pass on:
+Duclusaud et al., Extended friction models for the physics simulation of servo actuators (2024), model 4. It
+is one law, of the gears: with the drive off all that goes is the motor's torque and the back-EMF. The duty is
+that of the recorded angle, so that it tells of the drive alone. Mass and length are stated; all else was
+never measured and is fitted along.
 """
 
 from __future__ import annotations
@@ -22,12 +31,14 @@ from numba import njit
 G = 9.80665
 STEP = 5e-3  # s, at most
 SUPPLY = 12.0  # V
-COUNTS = 0.003  # rad; two of the encoder, within which the drive starts gradually
+DEAD = 2 * np.pi / 4096  # data sheet: rad; the dead zone, one count of the encoder
 UNIT = 4096 / (2 * np.pi) / 4000  # duty per radian and unit of the gain's register
 
+TORQUES = ("stall", "emf", "viscous", "coulomb", "stribeck")
 
-def _wide(nominal: float, sd: float, unit: str, low: float = 0.0) -> dict:
-    return {"nominal": nominal, "sd": sd, "unit": unit, "low": low, "fitted": True}
+
+def _wide(nominal: float, sd: float, unit: str, low: float = 0.0, high: float = np.inf) -> dict:
+    return {"nominal": nominal, "sd": sd, "unit": unit, "low": low, "high": high, "fitted": True}
 
 
 class Servo:
@@ -57,17 +68,26 @@ class Servo:
             "stribeck": _wide(0.02, 0.05, "N m"),
             "stribeck_speed": _wide(0.3, 0.3, "rad/s", 0.03),
             "armature": _wide(0.02, 0.02, "kg m^2", 1e-4),
+            "arm": _wide(0.6, 0.6, "kg/m", high=2.5),  # printed: 0.3; a bar of aluminium, 20 by 20 mm: 1.1
             "zero": _wide(0.0, 0.03, "rad", -0.5),
-            "start": _wide(0.012, 0.02, "1"),
+            "start": _wide(0.016, 0.001, "1"),  # data sheet: a starting force of 16 of 1000
             "delay": _wide(0.02, 0.01, "s"),
             "pace": _wide(5.0, 2.0, "rad/s", 0.5),
             "age": _wide(0.004, 0.005, "s", -0.03),
         }  # fmt: skip
 
+    def with_arm(self, parameters):
+        """Parameters of the equations, what grows with the weight of the robot as it was grown."""
+        mass, length = (self.parameters[n]["nominal"] for n in ("mass", "length"))
+        more = 1 + parameters["arm"] * length / (2 * mass)
+        rod = mass * length**2 + parameters["arm"] * length**3 / 3
+        out = {n: more * v if n in TORQUES else v for n, v in parameters.items()}
+        return out | {"armature": more * (mass * length**2 + parameters["armature"]) - rod}
+
     def simulate(self, parameters, recording, start=None):
         """Semi-implicit Euler at 5 ms or less; friction holds where it can."""
         begin = (0.0, 0.0) if start is None else (start["position"], start["position_rate"])
-        values = np.array([parameters[n] for n in self.parameters])
+        values = np.array([self.with_arm(parameters)[n] for n in self.parameters])
         columns = [np.ascontiguousarray(recording[n], dtype=float) for n in ("goal", "volts", "on")]
         t = recording.t
         seen = np.isfinite(recording["position"])
@@ -77,19 +97,43 @@ class Servo:
 
 
 @njit(cache=True)
-def asked(gain, start, error):
+def asked(gain, start, error, dead=DEAD):
     """The duty that the firmware makes of an error [rad]."""
-    return min(1.0, max(-1.0, gain * error + start * min(1.0, max(-1.0, error / COUNTS))))
+    more = max(abs(error) - dead, 0.0)
+    return np.sign(error) * min(1.0, gain * more + start * min(1.0, more / DEAD))
+
+
+@njit(cache=True)
+def sent_in(t, goal, on, sent, begin, h, delay):
+    """Goal and whether the drive is on in a step from `begin` [s], and the number of the last command before
+    it. A command that comes within the step acts for its part of it, so that angles have a derivative by the
+    delay."""
+    while sent + 1 < t.size and t[sent + 1] + delay <= begin:
+        sent += 1
+    target, drive = goal[sent], on[sent]
+    if sent + 1 < t.size and t[sent + 1] + delay < begin + h:
+        part = (begin + h - t[sent + 1] - delay) / h
+        target += part * (goal[sent + 1] - target)
+        drive += part * (on[sent + 1] - drive)
+    return target, drive, sent
+
+
+@njit(cache=True)
+def slowed(w, drag, hold):
+    """A rate [rad/s] after a step of viscous drag, implicitly, and of friction that can hold; both in units
+    of the inertia over the step."""
+    w /= 1 + drag
+    return 0.0 if abs(w) <= hold else w - np.sign(w) * hold
 
 
 @njit(cache=True)
 def turn(p, t, goal, volts, on, angle, q, w):
     """Angles, and duties at the recorded `angle`, (num_timesteps,) at times t; parameters in the order of
-    `Servo.parameters`. A command that comes within a step acts for its part of it, so that angles have a
-    derivative by the delay."""
-    (mass, length, gain, stall, emf, viscous, coulomb, load, load_extra, extra, speed, armature, zero,
+    `Servo.parameters`."""
+    (mass, length, gain, stall, emf, viscous, coulomb, load, load_extra, extra, speed, armature, arm, zero,
      start, delay, pace, _) = p  # fmt: skip
-    inertia = mass * length**2 + armature
+    inertia = mass * length**2 + arm * length**3 / 3 + armature
+    heavy = G * (mass * length + arm * length**2 / 2)
     position, duties = np.empty(t.size), np.empty(t.size)
     follow, sent = goal[0], 0
     for i in range(t.size):
@@ -100,23 +144,14 @@ def turn(p, t, goal, volts, on, angle, q, w):
         steps = max(1, int(np.ceil((t[i + 1] - t[i]) / STEP - 1e-9)))
         h = (t[i + 1] - t[i]) / steps
         for k in range(steps):
-            begin = t[i] + k * h
-            while sent + 1 < t.size and t[sent + 1] + delay <= begin:
-                sent += 1
-            target, drive = goal[sent], on[sent]
-            if sent + 1 < t.size and t[sent + 1] + delay < begin + h:
-                part = (begin + h - t[sent + 1] - delay) / h
-                target += part * (goal[sent + 1] - target)
-                drive += part * (on[sent + 1] - drive)
+            target, drive, sent = sent_in(t, goal, on, sent, t[i] + k * h, h, delay)
             follow += min(max(target - follow, -pace * h), pace * h)
-            weight = -mass * G * length * np.sin(q - zero)
+            weight = -heavy * np.sin(q - zero)
             slow = np.exp(-((w / speed) ** 2))
             motor = stall * drive * asked(gain, start, follow - q) * volts[i] / SUPPLY
             pressed = abs(motor - drive * emf * w - weight)
             hold = coulomb + extra * slow + (load + load_extra * slow) * pressed
-            w += h * (motor + weight) / inertia
-            w /= 1 + h * (viscous + drive * emf) / inertia
-            brake = h * hold / inertia
-            w = 0.0 if abs(w) <= brake else w - np.sign(w) * brake
+            each = h / inertia
+            w = slowed(w + each * (motor + weight), each * (viscous + drive * emf), each * hold)
             q += h * w
     return position, duties

@@ -10,33 +10,37 @@ import pkgutil
 from functools import cache
 
 from hmmseg.errors import InputError, nearest
-from simgap.effects.base import Effect
+from simgap.channels import channel_effects
+from simgap.effects.base import HandEffect, of_forces
 
 
 @cache
-def _defined(decoy: bool) -> dict[str, Effect]:
+def _defined(decoy: bool) -> dict[str, HandEffect]:
     modules = [m for m in pkgutil.iter_modules(__path__) if (m.name == "unnamed") == decoy]
     found = [vars(importlib.import_module(f"{__name__}.{m.name}")).values() for m in modules]
-    effects = {e.name: e for each in found for e in each if isinstance(e, Effect)}
+    effects = {e.name: e for each in found for e in each if isinstance(e, HandEffect)}
+    if not decoy:  # those on any channel, but where hands have forms of their own
+        on_forces = (of_forces(channel) for channel in channel_effects().values())
+        effects = {e.name: e for e in on_forces if e.correct or e.name in effects} | effects
     return dict(sorted(effects.items()))
 
 
-def catalogue() -> dict[str, Effect]:
+def catalogue() -> dict[str, HandEffect]:
     """All effects by name, in alphabetical order."""
     return _defined(decoy=False)
 
 
-def decoys() -> dict[str, Effect]:
+def decoys() -> dict[str, HandEffect]:
     """Effects that are fitted to be told from the catalogue's, and never named."""
     return _defined(decoy=True)
 
 
-def fitted() -> dict[str, Effect]:
+def fitted() -> dict[str, HandEffect]:
     """The catalogue's effects and the decoys."""
     return catalogue() | decoys()
 
 
-def effect_named(name: str) -> Effect:
+def effect_named(name: str) -> HandEffect:
     """The effect of this name; InputError with the nearest one otherwise."""
     known = catalogue()
     if name not in known:
@@ -52,7 +56,7 @@ def name_of(key: str) -> str:
 def free_parameters(key: str) -> tuple[str, ...]:
     """Parameters that are free in a form of an effect."""
     effect, _, form = fitted()[name_of(key)], *key.partition("/")[1:]
-    return effect.forms[int(form or 0)] if effect.forms else tuple(p.name for p in effect.parameters)
+    return effect.forms[int(form or 0)] if effect.forms else tuple(effect.parameters)
 
 
 def forms_of(name: str) -> list[str]:

@@ -7,18 +7,22 @@ truth is taken forward (`apply`, `scene`) to make recordings with a known effect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.hand.kinematics import turning
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from simgap.channels import ChannelEffect, Theta, at_rest
+from simgap.effect import Array, Effect
 
-Array = Any  # jax.Array under a trace, np.ndarray outside of one
 Values = dict[str, Array]  # parameter name -> scalar
+Numbers = dict[str, float]  # the same outside of a trace
 
 
 class World(NamedTuple):
@@ -74,7 +78,6 @@ class World(NamedTuple):
     events: Array
 
 
-GROSS = 100.0  # prior: times the usual size: a fault so large has been seen on the bench
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 
@@ -93,51 +96,14 @@ class Performance(NamedTuple):
     width: np.ndarray  # (n,) width [m] of the block in the air, else 1
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter: prior normal about `neutral` with `sd`, in `unit`; `low`, `high` bound it.
-
-    `starts` are the values a search starts from. `log`: the prior is of the logarithm, with median
-    `neutral` and `sd` in natural units. `hidden` parameters are fitted but not reported. `shape`: it bends
-    what others amplify and is nothing by itself.
-    """
-
-    name: str
-    unit: str
-    sd: float
-    neutral: float = 0.0
-    starts: tuple[float, ...] = (0.0,)
-    low: float = -np.inf
-    high: float = np.inf
-    log: bool = False
-    hidden: bool = False
-    shape: bool = False
-
-    def value(self, u: Array) -> Array:
-        """The parameter from its standard normal coordinate."""
-        return self.neutral * jnp.exp(self.sd * u) if self.log else self.neutral + self.sd * u
-
-    def coordinate(self, value: float) -> float:
-        """The inverse of `value`."""
-        return float(np.log(value / self.neutral) / self.sd if self.log else (value - self.neutral) / self.sd)
-
-    @property
-    def gridded(self) -> bool:
-        """Whether a search has to try several start values of it."""
-        return self.starts != (0.0,)
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Bounds of the coordinate: five standard deviations of a logarithm, GROSS of others, at most."""
-        low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -np.inf
-        high = self.coordinate(self.high) if np.isfinite(self.high) else np.inf
-        most = 5.0 if self.log else GROSS
-        return max(low, -most), min(high, most)
+Correct = Callable[[World, Values, Array], World]
+Apply = Callable[[Performance, Numbers, np.random.Generator], Performance]
 
 
 @dataclass(frozen=True)
-class Effect:
-    """One mechanism. `stage` orders corrections: what is nearest to the recorded number comes first.
+class HandEffect(Effect):
+    """One mechanism of a hand that moves blocks. `acts_on`: "sensing", "kinematics", "contact", "dynamics",
+    "motion" or "measurement"; `stage` orders corrections: what is nearest to the recorded number comes first.
 
     `correct(world, values, on)` takes the recording back; `on` is 1 where the effect is in the
     candidate and 0 elsewhere, for parameters that have no neutral value. `scatter(problem, residual)`
@@ -152,45 +118,40 @@ class Effect:
     by default from its priors; empty for one that cannot be felt. `turns`: the parameter
     [rad] by up to which blocks turn in the grip on the ground where it acts, as they please.
 
-    `called`: the effect in plain words, `phrase(means, rig)` where its parameters decide them, and what to
-    `check` on the rig. `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]:
-    least and most that blocks are held with, so that it shows. `restored(channels, values)`: recorded
-    channels as they would be without it. `patched(document, found)`: puts what was found into numbers that
-    rig.toml has of its own, and says where each parameter stands; None where it has none.
-    `wrong(problem, push)`: candidates of the gap that stand for measurements rather than for what acts.
+    `phrase(means, rig)`: the effect in plain words where its parameters decide them.
+    `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]: least and most that
+    blocks are held with, so that it shows. `restored(channels, values)`: recorded channels as they would be
+    without it. `patched(document, found)`: puts what was found into numbers that rig.toml has of its own, and
+    says where each parameter stands; None where it has none. `wrong(problem, push)`: candidates of the gap
+    that stand for measurements rather than for what acts.
     """
 
-    name: str
-    acts_on: str
-    says: str
-    shows: str
-    mistaken_for: tuple[str, ...]
-    parameters: tuple[Parameter, ...]
-    stage: int
-    correct: Callable[[World, Values, Array], World] | None = None
-    apply: Callable[[Performance, dict[str, float], np.random.Generator], Performance] | None = None
-    scene: Callable[[dict[str, float]], dict[str, float]] | None = None
-    finish: Callable[[np.ndarray, dict[str, float]], np.ndarray] | None = None
+    acts_on: str = "sensing"
+    mistaken_for: tuple[str, ...] = ()
+    stage: int = 0
+    correct: Correct | None = None
+    apply: Apply | None = None
+    scene: Callable[[Numbers], Numbers] | None = None
+    finish: Callable[[np.ndarray, Numbers], np.ndarray] | None = None
     chosen: bool = True
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
     forms: tuple[tuple[str, ...], ...] = ()
     scatter: Callable[[Any, np.ndarray], Any] | None = None
-    admitted: Callable[[Rig], tuple[str, dict[str, float]]] | None = None
+    admitted: Callable[[Rig], tuple[str, Numbers]] | None = None
     wrist: bool = False
     played: Mapping[str, float] | None = None
-    called: str = ""
-    check: str = ""
     phrase: Callable[[Mapping[str, float], Mapping[str, Any]], str] | None = None
-    sampled: Callable[[np.ndarray, dict[str, float], np.random.Generator], np.ndarray] | None = None
+    sampled: Callable[[np.ndarray, Numbers, np.random.Generator], np.ndarray] | None = None
     grip: tuple[float, float] | None = None
-    restored: Callable[[dict[str, np.ndarray], dict[str, float]], dict[str, np.ndarray]] | None = None
+    restored: Callable[[dict[str, np.ndarray], Numbers], dict[str, np.ndarray]] | None = None
     patched: Callable[[Any, Mapping[str, Any]], dict[str, str] | None] | None = None
     wrong: Callable[[Any, np.ndarray], list[Any]] | None = None
     turns: str = ""
 
-    def neutral(self) -> dict[str, float]:
-        """Values at which nothing is changed (where that exists)."""
-        return {p.name: p.neutral for p in self.parameters}
+    @property
+    def simulated(self) -> bool:
+        """Whether the virtual model can have it."""
+        return bool(self.apply or self.scene or self.finish)
 
 
 # Stages: the sensor's chain backwards, then what the hand carries, then the contact.
@@ -235,11 +196,6 @@ def gradient(t: Array, values: Array) -> Array:
     return jnp.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
 
 
-def per_channel(values: Values, names: tuple[str, ...]) -> Array:
-    """Scalars stacked and shaped (1, 1, len(names)) to act on (T, N, channels)."""
-    return jnp.stack([jnp.asarray(values[n], float) for n in names])[None, None, :]
-
-
 def flat(performance: Performance) -> np.ndarray:
     """Forces of a performance as columns fx1, fy1, fx2, fy2 (n, 4)."""
     return performance.force.reshape(-1, 4)
@@ -248,3 +204,126 @@ def flat(performance: Performance) -> np.ndarray:
 def with_force(performance: Performance, force: np.ndarray) -> Performance:
     """The performance with other forces (n, 4)."""
     return performance._replace(force=force.reshape(-1, 2, 2))
+
+
+# What many effects have in common: each gives an effect its `correct` and `apply` at once.
+
+# physics: what of channels fx1, fy1, fx2, fy2 net fx, net fy, grip and shear are
+NET = np.array([[1.0, 0, 1, 0], [0, 1, 0, 1], [0.5, 0, -0.5, 0], [0, 0.5, 0, -0.5]])
+USUAL = 3.0  # prior: N; of a hand's forces: what shares of a channel are shares of
+
+
+@contextmanager
+def as_numpy() -> Iterator[None]:
+    """JAX broadcasts and promotes as NumPy does, for functions that are written for both."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+class Motion(NamedTuple):
+    """What a load may depend on: times, tips' `position`, `velocity`, `acceleration` (..., 4) for x1, y1, x2,
+    y2, and how long ago each event was (..., events) [s]."""
+
+    t: Array
+    position: Array
+    velocity: Array
+    acceleration: Array
+    since: Array
+    gravity: Array
+
+
+def loading(
+    load: Callable[[Motion, Values, Any], Array], given: Callable[[Numbers], Numbers] | None = None,
+    **more: Any,
+) -> HandEffect:  # fmt: skip
+    """A force load(motion, values, xp) (..., 4) [N] on the fingers that is none of the contact's, in NumPy or
+    JAX (`xp`); `given` turns parameters as they are reported into those that are fitted."""
+
+    def correct(world: World, values: Values, on: Array) -> World:
+        position, velocity = tips(world)
+        since = world.t[:, :, None] - world.events[:, None, :]
+        motion = Motion(
+            world.t, position, velocity, gradient(world.t, velocity), since, jnp.asarray(world.gravity)
+        )
+        with as_numpy():
+            return with_load(world, load(motion, values, jnp))
+
+    def apply(p: Performance, values: Numbers, rng: np.random.Generator) -> Performance:
+        acceleration = np.gradient(p.velocity, p.t, axis=0)
+        place, speed, quick = (z.reshape(-1, 4) for z in (p.position, p.velocity, acceleration))
+        motion = Motion(p.t, place, speed, quick, p.t[:, None] - p.events[None, :], p.rig.gravity)
+        return with_force(p, flat(p) + load(motion, values if given is None else given(values), np))
+
+    return HandEffect(correct=correct, apply=apply, **more)
+
+
+def mixing(matrix: Callable[[Values, Any], Array], inverse: bool = False, **more: Any) -> HandEffect:
+    """Sensors that read matrix(values, xp) (4, 4) times the true forces, or its `inverse`.
+
+    The noise of net forces, grip and shear is by so much louder than that of corrected ones as the matrix
+    turns it.
+    """
+
+    def correct(world: World, values: Values, on: Array) -> World:
+        back = matrix(values, jnp)
+        back = back if inverse else jnp.linalg.inv(back)
+        quiet = jnp.sqrt(jnp.square(NET).sum(1) / jnp.square(NET @ back).sum(1))[None, None, :]
+        return world._replace(force=world.force @ back.T, loudness=world.loudness * quiet)
+
+    def apply(p: Performance, values: Numbers, rng: np.random.Generator) -> Performance:
+        there = matrix(values, np)
+        return with_force(p, flat(p) @ (np.linalg.inv(there) if inverse else there).T)
+
+    return HandEffect(correct=correct, apply=apply, **more)
+
+
+Spread = Callable[[Mapping[str, Array]], list[Theta]]  # parameters to those of each force channel
+Clock = Callable[[Array, Array, Mapping[str, Array]], Array]  # (time since the start, its end, parameters)
+
+
+def reading(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -> Apply:
+    """`apply` of an effect on every force channel, by a `clock` of its own where one is given."""
+
+    def apply(p: Performance, values: Numbers, rng: np.random.Generator) -> Performance:
+        since = p.t - p.t[0]
+        since = since if clock is None else clock(since, p.events.max() - p.t[0], values)
+        each = zip(flat(p).T, spread(values), strict=True)
+        return with_force(p, np.stack([at_rest(channel.read, since, f, theta) for f, theta in each], 1))
+
+    return apply
+
+
+def unread(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -> Correct:
+    """`correct` of an effect on every force channel that can be undone."""
+
+    def correct(world: World, values: Values, on: Array) -> World:
+        since, force = world.t - world.t[:, :1], jnp.asarray(world.force)
+        if clock is not None:
+            last = jnp.asarray(world.events).max(axis=1, keepdims=True) - world.t[:, :1]
+            since = clock(since, last, values)
+        assert channel.undo is not None
+        with as_numpy():
+            each = [channel.undo(since, force[..., c], theta) for c, theta in enumerate(spread(values))]
+        return world._replace(force=jnp.stack(each, -1))
+
+    return correct
+
+
+def own(channel: ChannelEffect) -> Spread:
+    """Each force channel has parameters of its own, called as the channel is where it has one."""
+    keys = {n: "" if len(channel.parameters) == 1 else f"_{n}" for n in channel.parameters}
+    return lambda values: [{n: values[c + end] for n, end in keys.items()} for c in FORCE_CHANNELS]
+
+
+def of_forces(channel: ChannelEffect, **more: Any) -> HandEffect:
+    """An effect on channels as one on a hand's forces, each of which has its own."""
+    sized, several = channel.sized(USUAL, "N", 10.0), len(channel.parameters) > 1
+    parameters = {f"{c}_{n}" if several else c: p for c in FORCE_CHANNELS for n, p in sized.items()}
+    fields: dict[str, Any] = {
+        "name": f"force_{channel.name}", "says": channel.says, "shows": channel.shows,
+        "called": channel.called, "check": channel.check, "parameters": parameters,
+        "stage": FILTER if channel.remembers else READOUT,
+        "apply": reading(channel, own(channel)),
+        "correct": None if channel.undo is None or channel.remembers else unread(channel, own(channel)),
+    }  # fmt: skip
+    return HandEffect(**(fields | more))

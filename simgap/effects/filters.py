@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -30,13 +27,3 @@ def faded(drive: jax.Array, ratio: jax.Array) -> jax.Array:
         before = jnp.concatenate([jnp.zeros_like(out[:, :reach]), out[:, :-reach]], 1)
         out, reach = out + jnp.exp(-ratio * reach) * before, 2 * reach
     return out
-
-
-def of_finger(words: str) -> Callable[[Mapping[str, float], Mapping[str, Any]], str]:
-    """These words, and the finger where it is of one alone."""
-
-    def phrase(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
-        acting = [k for k, v in means.items() if v > 0]
-        return f"{words} of finger {acting[0][-1]}" if [k[:6] for k in acting] == ["finger"] else words
-
-    return phrase

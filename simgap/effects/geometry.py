@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import jax
@@ -11,77 +10,55 @@ import numpy as np
 
 from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
-from simgap.effects.base import KINEMATICS, Effect, Parameter, Performance, World, gradient, per_channel
+from simgap import channels
+from simgap.effect import Parameter
+from simgap.effects.base import KINEMATICS, HandEffect, Performance, World, gradient
 from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
-# Helper of effects that act on joint angles: from true tips to what the nominal hand would read.
-
-Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
-def moved_joints(
-    performance: Performance,
-    change: Change,
-    scale: float | Sequence[float] = 0.0,
-    base: Sequence[float] = (0.0, 0.0),
-) -> Performance:
-    """Tips as read by a nominal hand whose angles and rates (n, 4) pass through `change`.
-
-    The true links are longer than nominal by `scale`, all or each (4,), the second finger stands beside its
-    place by `base` (2,) [m].
-    """
-    rig = performance.rig
-    if not rig.jointed:
-        raise ValueError("a Cartesian hand has no joints")
-    q, dq = [], []
-    longer, shift = np.broadcast_to(np.asarray(scale, float), 4).reshape(2, 2), np.array([[0.0, 0.0], base])
-    for i in (1, 2):
-        nominal = rig.finger(i)
-        true = nominal.model_copy(update={"links": tuple(nominal.links * (1 + longer[i - 1]))})
-        angles = inverse(true, i, performance.position[:, i - 1] - shift[i - 1])
-        q.append(angles)
-        dq.append(joint_velocity(true, angles, performance.velocity[:, i - 1]))
-    q, dq = change(np.concatenate(q, 1), np.concatenate(dq, 1))
-    position = np.stack([forward(rig.finger(i + 1), q[:, 2 * i : 2 * i + 2]) for i in (0, 1)], 1)
-    velocity = np.stack(
-        [tip_velocity(rig.finger(i + 1), q[:, 2 * i : 2 * i + 2], dq[:, 2 * i : 2 * i + 2]) for i in (0, 1)],
-        1,
-    )
-    return performance._replace(position=position, velocity=velocity)
-
-
-# Joint angles read with constant offsets.
+# A hand that is not as its drawing says: angles read with offsets, links longer than nominal, all alike or
+# each by its own, the second finger's base beside its place.
 
 JOINTS = ("q11", "q12", "q21", "q22")
-
-JOINT_OFFSET = Effect(
-    name="joint_offset",
-    acts_on="kinematics",
-    says="recorded q = q + q0, per joint",
-    shows="positions, widths, heights, by pose",
-    mistaken_for=("link_length",),
-    called="joint angles with a wrong zero",
-    check=(
-        "Home the joints again against their stops, or put the fingertips on a gauge block and compare "
-        "angles."
-    ),
-    parameters=tuple(Parameter(q, "rad", 0.012) for q in JOINTS),
-    admitted=lambda rig: ("joint_offset", dict(zip(JOINTS, rig.systematic.joint_offset, strict=True))),
-    stage=KINEMATICS,
-    restored=lambda channels, v: channels | {q: channels[q] - value for q, value in v.items()},
-    correct=lambda w, v, on: w._replace(joints=w.joints - per_channel(v, JOINTS) * w.jointed),
-    apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (q + [v[n] for n in JOINTS], dq)),
-)
-
-
-# Links longer or shorter than nominal: all alike, or each by its own.
-
 LINKS = ("link11", "link12", "link21", "link22")
+BASE = ("base_x", "base_y")
 
 
-def _longer(values, xp):
-    return xp.stack([xp.asarray(values.get("scale", 0.0) + values.get(n, 0.0)) for n in LINKS])
+def _numbers(values, names, xp, common: str = ""):
+    return xp.stack([xp.asarray(values.get(n, 0.0) + values.get(common, 0.0), float) for n in names])
+
+
+def correct_hand(world: World, values, on) -> World:
+    """The world of the true hand."""
+    return world._replace(
+        joints=world.joints - _numbers(values, JOINTS, jnp)[None, None, :] * world.jointed,
+        link=world.link * (1 + _numbers(values, LINKS, jnp, "scale")),
+        base=world.base + jnp.concatenate([jnp.zeros(2), _numbers(values, BASE, jnp)]),
+    )
+
+
+def apply_hand(p: Performance, values, rng) -> Performance:
+    """Tips as a nominal hand reads them that is not as nominal."""
+    return moved_joints(p, values, lambda q: q + _numbers(values, JOINTS, np))
+
+
+def moved_joints(p: Performance, values, change) -> Performance:
+    """Tips as read by a nominal hand whose angles (n, 4) pass through `change`."""
+    if not p.rig.jointed:
+        raise ValueError("a Cartesian hand has no joints")
+    longer = _numbers(values, LINKS, np, "scale").reshape(2, 2)
+    shift = np.array([[0.0, 0.0], _numbers(values, BASE, np)])
+    q, dq = [], []
+    for i in (1, 2):
+        nominal = p.rig.finger(i)
+        true = nominal.model_copy(update={"links": tuple(nominal.links * (1 + longer[i - 1]))})
+        q.append(inverse(true, i, p.position[:, i - 1] - shift[i - 1]))
+        dq.append(joint_velocity(true, q[-1], p.velocity[:, i - 1]))
+    read = np.split(change(np.concatenate(q, 1)), 2, axis=1)
+    fingers = [p.rig.finger(i) for i in (1, 2)]
+    position = np.stack([forward(f, a) for f, a in zip(fingers, read, strict=True)], 1)
+    velocity = np.stack([tip_velocity(f, a, da) for f, a, da in zip(fingers, read, dq, strict=True)], 1)
+    return p._replace(position=position, velocity=velocity)
 
 
 def _patched_link_length(document, found):
@@ -101,7 +78,26 @@ def _patched_link_length(document, found):
     return {k: f"fingers.links.{k}" for k in found}
 
 
-LINK_LENGTH = Effect(
+JOINT_OFFSET = HandEffect(
+    name="joint_offset",
+    acts_on="kinematics",
+    says="recorded q = q + q0, per joint",
+    shows="positions, widths, heights, by pose",
+    mistaken_for=("link_length",),
+    called="joint angles with a wrong zero",
+    check=(
+        "Home the joints again against their stops, or put the fingertips on a gauge block and compare "
+        "angles."
+    ),
+    parameters={q: Parameter(0.0, 0.012, "rad") for q in JOINTS},
+    admitted=lambda rig: ("joint_offset", dict(zip(JOINTS, rig.systematic.joint_offset, strict=True))),
+    stage=KINEMATICS,
+    restored=lambda channels, v: channels | {q: channels[q] - value for q, value in v.items()},
+    correct=correct_hand,
+    apply=apply_hand,
+)
+
+LINK_LENGTH = HandEffect(
     name="link_length",
     acts_on="kinematics",
     says="true link = (1 + scale) nominal, all links or each",
@@ -109,13 +105,13 @@ LINK_LENGTH = Effect(
     mistaken_for=("joint_offset",),
     called="links of another length than the model's",
     check="Measure the links from axis to axis, or touch two points a known distance apart.",
-    parameters=tuple(Parameter(n, "1", 0.02, low=-0.2, high=0.2) for n in ("scale", *LINKS)),
+    parameters={n: Parameter(0.0, 0.02, low=-0.2, high=0.2) for n in ("scale", *LINKS)},
     forms=(("scale",), LINKS),
     admitted=lambda rig: ("link_length/1", dict(zip(LINKS, rig.systematic.link_length, strict=True))),
     stage=KINEMATICS,
     patched=_patched_link_length,
-    correct=lambda w, v, on: w._replace(link=w.link * (1 + _longer(v, jnp))),
-    apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (q, dq), _longer(v, np).tolist()),
+    correct=correct_hand,
+    apply=apply_hand,
 )
 
 
@@ -208,16 +204,11 @@ def _correct_backlash(world: World, values, on) -> World:
     )
 
 
-def play(q: np.ndarray, width: float) -> np.ndarray:
-    """The play operator over rows of q (n, 4): the output follows only outside the dead band."""
-    out, last = np.empty_like(q), q[0].copy()
-    for k, row in enumerate(q):
-        last = np.clip(last, row - width / 2, row + width / 2)
-        out[k] = last
-    return out
+def _apply_backlash(p: Performance, values, rng) -> Performance:
+    return moved_joints(p, {}, lambda q: np.stack([channels.play(a, values["width"]) for a in q.T], 1))
 
 
-BACKLASH = Effect(
+BACKLASH = HandEffect(
     name="backlash",
     acts_on="kinematics",
     says="recorded q follows q only outside a dead band of `width`",
@@ -225,15 +216,15 @@ BACKLASH = Effect(
     mistaken_for=("fingertip_compliance",),
     called="play in the joints",
     check="Hold each motor still and move its fingertip by hand; look for slack in gears or cables.",
-    parameters=(
-        Parameter("width", "rad", 0.004, starts=(0.002, 0.006), low=0.0, high=0.05),
+    parameters={
+        "width": Parameter(0.0, 0.004, "rad", starts=(0.002, 0.006), low=0.0, high=0.05),
         # Rates from the encoder miss what it misses (1); a tachometer's do not (0).
-        Parameter("unseen", "1", 0.5, starts=(0.8,), low=0.0, high=1.0, hidden=True),
-    ),
+        "unseen": Parameter(0.0, 0.5, starts=(0.8,), low=0.0, high=1.0, hidden=True),
+    },
     forms=(("width",), ("width", "unseen")),
     stage=KINEMATICS,
     correct=_correct_backlash,
-    apply=lambda p, v, rng: moved_joints(p, lambda q, dq: (play(q, v["width"]), dq)),
+    apply=_apply_backlash,
 )
 
 
@@ -291,7 +282,7 @@ def _apply_hand_roll(performance: Performance, values, rng) -> Performance:
     return performance._replace(position=position)
 
 
-HAND_ROLL = Effect(
+HAND_ROLL = HandEffect(
     name="hand_roll",
     acts_on="motion",
     says="both fingers and the block turn about the grip by `amplitude` (rms) while carried",
@@ -302,7 +293,7 @@ HAND_ROLL = Effect(
         "Watch both fingertips' heights while carrying: the wrist or the arm turns; measure it, or "
         "stiffen it."
     ),
-    parameters=(Parameter("amplitude", "rad", 1.0, neutral=0.005, log=True, low=1e-4, high=0.2),),
+    parameters={"amplitude": Parameter(0.005, 1.0, "rad", log=True, low=1e-4, high=0.2)},
     stage=KINEMATICS,
     scatter=_scatter_hand_roll,
     apply=_apply_hand_roll,

@@ -1,4 +1,4 @@
-"""Effects of what moves or pulls: fingertips' mass, drag, a cable, a structure that vibrates."""
+"""Effects of what moves or pulls: fingertips' mass, drag, a cable, shocks, a structure that vibrates."""
 
 from __future__ import annotations
 
@@ -6,39 +6,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.io.rig import FORCE_CHANNELS
+from simgap.effect import Parameter
 from simgap.effects.base import (
+    CONTACT,
     HAND,
     READOUT,
     RINGING,
-    Effect,
-    Parameter,
+    HandEffect,
+    Motion,
     Performance,
     World,
     flat,
-    gradient,
-    tips,
+    loading,
     with_force,
-    with_load,
     with_mode,
 )
 
-# Mass of a fingertip outboard of its force sensor.
-
-
-def _correct_fingertip_mass(world: World, values, on) -> World:
-    _, velocity = tips(world)
-    up = jnp.stack([0.0 * world.gravity, world.gravity] * 2)[None, None, :]
-    return with_load(world, values["mass"] * (gradient(world.t, velocity) + up))
-
-
-def _apply_fingertip_mass(performance: Performance, values, rng) -> Performance:
-    a = np.gradient(performance.velocity, performance.t, axis=0).reshape(-1, 4)
-    return with_force(
-        performance, flat(performance) + values["mass"] * (a + [0, performance.rig.gravity] * 2)
-    )
-
-
-FINGERTIP_MASS = Effect(
+FINGERTIP_MASS = loading(  # outboard of its force sensor
+    lambda m, v, xp: v["mass"] * (m.acceleration + m.gravity * xp.asarray([0.0, 1.0, 0.0, 1.0])),
     name="fingertip_mass",
     acts_on="dynamics",
     says="recorded F = F + mass (a + g up), outboard of the sensor",
@@ -49,28 +34,12 @@ FINGERTIP_MASS = Effect(
         "Weigh what is mounted in front of the sensor, or hold the finger still at two heights and in two"
         " directions."
     ),
-    parameters=(Parameter("mass", "kg", 0.012, low=0.0, high=0.1),),
+    parameters={"mass": Parameter(0.0, 0.012, "kg", low=0.0, high=0.1)},
     stage=HAND,
-    correct=_correct_fingertip_mass,
-    apply=_apply_fingertip_mass,
 )
 
-
-# A drag on the fingers in proportion to their velocity.
-
-
-def _correct_viscous_drag(world: World, values, on) -> World:
-    _, velocity = tips(world)
-    return with_load(world, values["coefficient"] * velocity)
-
-
-def _apply_viscous_drag(performance: Performance, values, rng) -> Performance:
-    return with_force(
-        performance, flat(performance) + values["coefficient"] * performance.velocity.reshape(-1, 4)
-    )
-
-
-VISCOUS_DRAG = Effect(
+VISCOUS_DRAG = loading(
+    lambda m, v, xp: v["coefficient"] * m.velocity,
     name="viscous_drag",
     acts_on="dynamics",
     says="recorded F = F + coefficient v on each finger",
@@ -80,46 +49,31 @@ VISCOUS_DRAG = Effect(
     check=(
         "Move the open hand back and forth at two speeds and watch the forces; look at bearings and sleeves."
     ),
-    parameters=(Parameter("coefficient", "N s/m", 0.6),),
+    parameters={"coefficient": Parameter(0.0, 0.6, "N s/m")},
     stage=HAND,
-    correct=_correct_viscous_drag,
-    apply=_apply_viscous_drag,
 )
 
 
-# A cable that pulls on the fingers like a spring anchored somewhere.
+# A cable that pulls on the fingers like a spring anchored somewhere. What is fitted is its force at MIDDLE.
 
 MIDDLE = (0.13, 0.02)  # prior: m; about where the fingers work
 
 
-def _anchor(values, xp):
-    """Anchor (4,) for x1, y1, x2, y2; the force at MIDDLE is what is fitted."""
-    return xp.stack([xp.asarray(values["at_x"], float), xp.asarray(values["at_y"], float)] * 2)
-
-
-def _correct_cable_force(world: World, values, on) -> World:
-    position, _ = tips(world)
-    offset = position - jnp.asarray(MIDDLE * 2)[None, None, :]
-    return with_load(world, values["stiffness"] * offset + _anchor(values, jnp)[None, None, :])
-
-
-def _apply_cable_force(performance: Performance, values, rng) -> Performance:
-    position = performance.position.reshape(-1, 4)
-    pull = values["stiffness"] * (position - np.array([values["x0"], values["y0"]] * 2))
-    return with_force(performance, flat(performance) + pull)
+def _cable(m: Motion, values, xp):
+    at = xp.stack([xp.asarray(values[n], float) for n in ("at_x", "at_y")] * 2)
+    return values["stiffness"] * (m.position - xp.asarray(MIDDLE * 2)) + at
 
 
 def _report_cable_force(draws, rig):
     k = draws["stiffness"]
     k = np.where(np.abs(k) < 1e-3, 1e-3, k)
-    return {
-        "stiffness": (draws["stiffness"], "N/m"),
-        "x0": (MIDDLE[0] - draws["at_x"] / k, "m"),
-        "y0": (MIDDLE[1] - draws["at_y"] / k, "m"),
-    }
+    places = {f"{axis}0": (MIDDLE[i] - draws[f"at_{axis}"] / k, "m") for i, axis in enumerate("xy")}
+    return {"stiffness": (draws["stiffness"], "N/m")} | places
 
 
-CABLE_FORCE = Effect(
+CABLE_FORCE = loading(
+    _cable,
+    given=lambda v: v | {f"at_{a}": v["stiffness"] * (MIDDLE[i] - v[f"{a}0"]) for i, a in enumerate("xy")},
     name="cable_force",
     acts_on="dynamics",
     says="recorded F = F + stiffness (p - p0) on each finger",
@@ -127,15 +81,40 @@ CABLE_FORCE = Effect(
     mistaken_for=("force_bias",),
     called="a cable that pulls at the fingers",
     check="Move the open hand slowly through the workspace and watch the forces; tie the cables elsewhere.",
-    parameters=(
-        Parameter("stiffness", "N/m", 2.0),
-        Parameter("at_x", "N", 0.06),
-        Parameter("at_y", "N", 0.06),
-    ),
+    parameters={
+        "stiffness": Parameter(0.0, 2.0, "N/m"),
+        "at_x": Parameter(0.0, 0.06, "N"),
+        "at_y": Parameter(0.0, 0.06, "N"),
+    },
     stage=HAND,
-    correct=_correct_cable_force,
-    apply=_apply_cable_force,
     report=_report_cable_force,
+    wrist=True,
+)
+
+
+# A short pulse of vertical force when a block touches down: a raised cosine of unit area [1/s].
+
+LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known as an impulse only
+
+
+def _impact(m: Motion, values, xp):
+    since = m.since[..., 2::4]
+    inside = (since >= 0) & (since < LENGTH)
+    pulse = xp.where(inside, (1 - xp.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0).sum(-1)
+    return -values["impulse"] * pulse[..., None] * xp.asarray([0.0, 0.5, 0.0, 0.5])
+
+
+CONTACT_IMPACT = loading(
+    _impact,
+    name="contact_impact",
+    acts_on="dynamics",
+    says="a pulse of -impulse in net fy at touchdown",
+    shows="place, first samples",
+    mistaken_for=("structural_vibration",),
+    called="shocks as blocks touch down",
+    check="Set down more slowly, and see whether the gap is gone.",
+    parameters={"impulse": Parameter(0.0, 0.03, "N s", low=0.0)},
+    stage=CONTACT,
     wrist=True,
 )
 
@@ -187,7 +166,7 @@ def _report_structural_vibration(draws, rig):
     return {name: (draws[name], unit) for name, unit in units.items()} | {"gain": (size, "N")}
 
 
-STRUCTURAL_VIBRATION = Effect(
+STRUCTURAL_VIBRATION = HandEffect(
     name="structural_vibration",
     acts_on="dynamics",
     says="a mode rung by contact changes, gain exp(-damping w t) sin(w t), and by changes of load",
@@ -195,21 +174,14 @@ STRUCTURAL_VIBRATION = Effect(
     mistaken_for=("noise", "contact_impact"),
     called="a part of the structure that rings",
     check="Tap the finger and record at a high rate; tighten what rings, or damp it.",
-    parameters=(
-        Parameter(
-            "frequency",
-            "Hz",
-            0.7,
-            neutral=5.0,
-            starts=tuple(0.75 + 0.5 * k for k in range(19)),
-            low=0.7,
-            high=10.0,
-            log=True,
+    parameters={
+        "frequency": Parameter(
+            5.0, 0.7, "Hz", starts=tuple(0.75 + 0.5 * k for k in range(19)), low=0.7, high=10.0, log=True
         ),
-        Parameter("damping", "1", 1.0, neutral=0.05, starts=(0.05,), low=0.003, high=0.15, log=True),
-        Parameter("drive", "1", 0.2, low=-0.8, high=0.8, hidden=True),
-        *(Parameter(name, "N", 0.1, hidden=True) for name in AMPLITUDES),
-    ),
+        "damping": Parameter(0.05, 1.0, starts=(0.05,), low=0.003, high=0.15, log=True),
+        "drive": Parameter(0.0, 0.2, low=-0.8, high=0.8, hidden=True),
+    }
+    | {name: Parameter(0.0, 0.1, "N", hidden=True) for name in AMPLITUDES},
     stage=READOUT,
     correct=_correct_structural_vibration,
     apply=_apply_structural_vibration,

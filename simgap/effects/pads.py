@@ -1,4 +1,4 @@
-"""Effects where fingertips touch: their stiffness, creep, slip and impact."""
+"""Effects where fingertips touch: their stiffness, creep and slip."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from simgap.channels import at_rest
+from simgap.channels.sensors import LOWPASS
+from simgap.effect import Parameter
 from simgap.effects.base import (
     CONTACT,
     CREEPING,
     SLIDING,
-    Effect,
-    Parameter,
+    HandEffect,
     Performance,
     World,
     flat,
-    with_force,
-    with_load,
     with_mode,
 )
 
@@ -77,7 +77,7 @@ def _patched_fingertip_compliance(document, found):
     return {name: f"fingertip.{name}" for name in names}
 
 
-FINGERTIP_COMPLIANCE = Effect(
+FINGERTIP_COMPLIANCE = HandEffect(
     name="fingertip_compliance",
     acts_on="contact",
     says="pad stiffness differs from nominal (or is finite at all)",
@@ -89,11 +89,10 @@ FINGERTIP_COMPLIANCE = Effect(
         "for worn or replaced pads."
     ),
     phrase=_phrase_fingertip_compliance,
-    parameters=(
-        Parameter("give_normal", "m/N", 4e-4, low=-2.4e-4),
-        Parameter("give_shear", "m/N", 4e-4, low=-3.8e-4),
-        *(Parameter(n, "m/N", 4e-4, low=-2.4e-4 if "normal" in n else -3.8e-4) for n in FINGERS),
-    ),
+    parameters={
+        n: Parameter(0.0, 4e-4, "m/N", low=-2.4e-4 if "normal" in n else -3.8e-4)
+        for n in ("give_normal", "give_shear", *FINGERS)
+    },
     forms=(("give_normal", "give_shear"), FINGERS),
     stage=CONTACT,
     correct=_correct_fingertip_compliance,
@@ -121,18 +120,15 @@ def _correct_fingertip_creep(world: World, values, on) -> World:
 
 def _apply_fingertip_creep(performance: Performance, values, rng) -> Performance:
     """Tips of an unchanged grip force go where such a pad lets them."""
-    from scipy.signal import lfilter  # slow to import
-
     pad, ratio = performance.rig.fingertip, values["ratio"]
-    late = values["time_constant"] * (1 + ratio)
-    keep = np.exp(-float(np.median(np.diff(performance.t))) / late)
-    lagged = np.asarray(lfilter([1 - keep], [1, -keep], performance.force, axis=0))
-    more = ratio / (1 + ratio) * (lagged - performance.force)
-    give = np.array([1 / pad.normal_stiffness, 1 / pad.shear_stiffness])
-    return performance._replace(position=performance.position + more * give)
+    late = {"time_constant": values["time_constant"] * (1 + ratio)}
+    force = flat(performance)
+    lagged = np.stack([at_rest(LOWPASS.read, performance.t, f, late) for f in force.T], 1)
+    more = ratio / (1 + ratio) * (lagged - force) * ([1 / pad.normal_stiffness, 1 / pad.shear_stiffness] * 2)
+    return performance._replace(position=performance.position + more.reshape(-1, 2, 2))
 
 
-FINGERTIP_CREEP = Effect(
+FINGERTIP_CREEP = HandEffect(
     name="fingertip_creep",
     acts_on="contact",
     says="a viscoelastic arm on the pad (standard linear solid)",
@@ -140,12 +136,10 @@ FINGERTIP_CREEP = Effect(
     mistaken_for=("force_drift", "grip_slip"),
     called="fingertips that keep yielding under load",
     check="Grip a rigid block for ten seconds at constant force and watch the distance of the fingers.",
-    parameters=(
-        Parameter("ratio", "1", 0.7, starts=(0.3,), low=0.0, high=8.0),
-        Parameter(
-            "time_constant", "s", 0.8, neutral=0.6, starts=(0.25, 0.7, 1.8), low=0.05, high=8.0, log=True
-        ),
-    ),
+    parameters={
+        "ratio": Parameter(0.0, 0.7, starts=(0.3,), low=0.0, high=8.0),
+        "time_constant": Parameter(0.6, 0.8, "s", starts=(0.25, 0.7, 1.8), low=0.05, high=8.0, log=True),
+    },
     stage=CONTACT,
     correct=_correct_fingertip_creep,
     apply=_apply_fingertip_creep,
@@ -179,7 +173,7 @@ def _correct_grip_slip(world: World, values, on) -> World:
     )
 
 
-GRIP_SLIP = Effect(
+GRIP_SLIP = HandEffect(
     name="grip_slip",
     acts_on="contact",
     says="the pad slides on the block when shear exceeds mu N",
@@ -187,60 +181,12 @@ GRIP_SLIP = Effect(
     mistaken_for=("fingertip_creep",),
     called="blocks that slip in the grip",
     check="Mark the block at the pad and lift it harder than usual; clean the pads, or grip more firmly.",
-    parameters=(
-        Parameter(
-            "mu",
-            "1",
-            0.6,
-            neutral=0.5,
-            starts=(0.2, 0.28, 0.36, 0.46, 0.6, 0.8),
-            low=0.08,
-            high=1.5,
-            log=True,
-        ),
-    ),
+    parameters={
+        "mu": Parameter(0.5, 0.6, starts=(0.2, 0.28, 0.36, 0.46, 0.6, 0.8), low=0.08, high=1.5, log=True)
+    },
     stage=CONTACT,
     correct=_correct_grip_slip,
     scene=lambda v: {"friction": v["mu"]},
     grip=(1.2, 1.8),  # chosen: N: so lightly that pads of a low friction slide
     played={"mu": 0.12},
-)
-
-
-# A short pulse of vertical force when a block touches down.
-
-LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known as an impulse only
-
-
-def _pulse(since, xp):
-    """A raised cosine of unit area [1/s] over LENGTH from the event."""
-    inside = (since >= 0) & (since < LENGTH)
-    return xp.where(inside, (1 - xp.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0)
-
-
-def _correct_contact_impact(world: World, values, on) -> World:
-    since = world.t[:, :, None] - world.events[:, None, 2::4]
-    pulse = _pulse(since, jnp).sum(-1)[..., None] * jnp.asarray([0.0, 0.5, 0.0, 0.5])[None, None, :]
-    return with_load(world, -values["impulse"] * pulse)
-
-
-def _apply_contact_impact(performance: Performance, values, rng) -> Performance:
-    pulse = _pulse(performance.t[:, None] - performance.events[None, 2::4], np).sum(1)
-    share = np.array([0.0, 0.5, 0.0, 0.5])
-    return with_force(performance, flat(performance) - values["impulse"] * pulse[:, None] * share)
-
-
-CONTACT_IMPACT = Effect(
-    name="contact_impact",
-    acts_on="dynamics",
-    says="a pulse of -impulse in net fy at touchdown",
-    shows="place, first samples",
-    mistaken_for=("structural_vibration",),
-    called="shocks as blocks touch down",
-    check="Set down more slowly, and see whether the gap is gone.",
-    parameters=(Parameter("impulse", "N s", 0.03, low=0.0),),
-    stage=CONTACT,
-    correct=_correct_contact_impact,
-    apply=_apply_contact_impact,
-    wrist=True,
 )

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.io.rig import FORCE_CHANNELS
+from simgap.channels.sensors import BIAS, DRIFT, LAG, LOWPASS
+from simgap.effect import Parameter
 from simgap.effects.base import (
-    FILTER,
     LATE,
     MIX,
     READOUT,
     SCALE,
     SMOOTH,
-    Effect,
-    Parameter,
-    Performance,
-    World,
-    flat,
+    HandEffect,
+    Spread,
     gradient,
-    per_channel,
+    mixing,
+    of_forces,
+    own,
+    reading,
     tips,
-    with_force,
+    unread,
     with_mode,
 )
-from simgap.effects.filters import of_finger
 from simgap.gap.frame import CHANNELS
 
 # A constant offset of every force channel.
@@ -38,49 +41,33 @@ def _phrase_force_bias(means, rig):
     return f"a zero error of force sensor {worst}" if lone else "zero errors of the force sensors"
 
 
-FORCE_BIAS = Effect(
-    name="force_bias",
-    acts_on="sensing",
+FORCE_BIAS = of_forces(
+    BIAS,
     says="recorded F = F + b, per finger and axis",
     shows="all subtasks alike, free motion too",
     mistaken_for=("weight", "fingertip_mass"),
     called="zero errors of the force sensors",
     check="Tare the force sensors in free air, record two seconds at rest, and look at what is left.",
     phrase=_phrase_force_bias,
-    parameters=tuple(Parameter(c, "N", 0.1) for c in FORCE_CHANNELS),
-    stage=READOUT,
-    correct=lambda w, v, on: w._replace(force=w.force - per_channel(v, FORCE_CHANNELS)),
+    parameters={c: Parameter(0.0, 0.1, "N") for c in FORCE_CHANNELS},
     admitted=lambda rig: ("force_bias", dict(zip(FORCE_CHANNELS, rig.systematic.force_bias, strict=True))),
-    apply=lambda p, v, rng: with_force(p, flat(p) + [v[c] for c in FORCE_CHANNELS]),
 )
 
 
 # Force channels that drift from the start of every trial, evenly or the slower the longer it lasts.
 
 
-def _since_force_drift(t, last, bend):
+def _since(t, last, values):
     """Seconds since the start; what warms up slows down.
 
     The bend is nothing at the start and as the last block is left: the mean slope stays as it is.
     """
-    return t * (1 + bend * (1 - t / last))
+    last = jnp.maximum(last, 1e-3) if isinstance(last, jax.Array) else max(float(last), 1e-3)
+    return t * (1 + values.get("bend", 0.0) * (1 - t / last))
 
 
-def _correct_force_drift(world: World, values, on) -> World:
-    last = jnp.asarray(world.events).max(axis=1, keepdims=True) - world.t[:, :1]
-    since = _since_force_drift(world.t - world.t[:, :1], jnp.maximum(last, 1e-3), values["bend"])
-    return world._replace(force=world.force - since[..., None] * per_channel(values, FORCE_CHANNELS))
-
-
-def _apply_force_drift(performance: Performance, values, rng) -> Performance:
-    t, last = performance.t - performance.t[0], float(performance.events.max() - performance.t[0])
-    since = _since_force_drift(t, max(last, 1e-3), values.get("bend", 0.0))
-    return with_force(performance, flat(performance) + since[:, None] * [values[c] for c in FORCE_CHANNELS])
-
-
-FORCE_DRIFT = Effect(
-    name="force_drift",
-    acts_on="sensing",
+FORCE_DRIFT = of_forces(
+    DRIFT,
     says="recorded F = F + c t, per finger and axis",
     shows="a ramp over the trial, free motion too",
     mistaken_for=("fingertip_creep", "force_bias"),
@@ -88,13 +75,10 @@ FORCE_DRIFT = Effect(
     check=(
         "Record a minute in free air after switching on; let amplifiers and gauges warm up before a session."
     ),
-    parameters=(
-        *(Parameter(c, "N/s", 0.015) for c in FORCE_CHANNELS),
-        Parameter("bend", "1", 0.15, low=-0.6, high=0.6, hidden=True, shape=True),
-    ),
-    stage=READOUT,
-    correct=_correct_force_drift,
-    apply=_apply_force_drift,
+    parameters={c: Parameter(0.0, 0.015, "N/s") for c in FORCE_CHANNELS}
+    | {"bend": Parameter(0.0, 0.15, low=-0.6, high=0.6, hidden=True, shape=True)},
+    correct=unread(DRIFT, own(DRIFT), _since),
+    apply=reading(DRIFT, own(DRIFT), _since),
     played={},  # of a recording as a whole
 )
 
@@ -102,23 +86,14 @@ FORCE_DRIFT = Effect(
 # Force channels that read too much or too little, in proportion: all alike, a finger's, or each its own.
 
 FINGERS = ("finger1", "finger2")
-EVERY = ("gain", *FINGERS, *FORCE_CHANNELS)
-OWN = {c: ("gain", f"finger{c[-1]}", c) for c in FORCE_CHANNELS}  # what gains make up that of a channel
 
 
-def _gains(values, xp):
-    return xp.stack([sum((values.get(n, 0.0) for n in OWN[c]), xp.zeros(())) for c in FORCE_CHANNELS])
-
-
-def _correct_force_gain(world: World, values, on) -> World:
-    factor = 1 + _gains(values, jnp)
-    # Recorded noise over that of corrected forces, of a sum (or difference) of both fingers' channels.
-    one, two = factor[:2], factor[2:]
-    loud = jnp.sqrt(2 / (one**-2 + two**-2))
-    return world._replace(
-        force=world.force / factor[None, None, :],
-        loudness=world.loudness * jnp.concatenate([loud, loud])[None, None, :],
-    )
+def of_channels(values, common: str, xp) -> list:
+    """A parameter of each force channel, made up of what is common, of its finger and of its own."""
+    return [
+        xp.asarray(sum(values.get(n, 0.0) for n in (common, f"finger{c[-1]}", c)), float)
+        for c in FORCE_CHANNELS
+    ]
 
 
 def _phrase_force_gain(means, rig):
@@ -130,52 +105,45 @@ def _phrase_force_gain(means, rig):
     return f"force sensors that read too {'high' if means.get('gain', 0.0) > 0 else 'low'}"
 
 
-FORCE_GAIN = Effect(
+FORCE_GAIN = mixing(
+    lambda v, xp: xp.diag(1 + xp.stack(of_channels(v, "gain", xp))),
     name="force_gain",
-    acts_on="sensing",
     says="recorded F = (1 + gain) F, common to all channels, of a finger, or of each channel",
     shows="every load, in proportion",
     mistaken_for=("weight", "fingertip_compliance"),
     called="force sensors that read too high or too low",
     check="Hang a known weight from each fingertip and compare; check the calibration factors in the driver.",
     phrase=_phrase_force_gain,
-    parameters=tuple(Parameter(n, "1", 0.1, low=-0.5, high=0.5) for n in EVERY),
+    parameters={n: Parameter(0.0, 0.1, low=-0.5, high=0.5) for n in ("gain", *FINGERS, *FORCE_CHANNELS)},
     forms=(("gain",), FINGERS, FORCE_CHANNELS),
     admitted=lambda rig: ("force_gain/2", dict(zip(FORCE_CHANNELS, rig.systematic.force_gain, strict=True))),
     stage=SCALE,
-    correct=_correct_force_gain,
-    apply=lambda p, v, rng: with_force(p, flat(p) * (1 + _gains(v, np))),
     wrist=True,
 )
 
 
-# Each force axis picks up a share of the other one.
+# Each force axis picks up a share of the other one; and force sensors mounted with a turn.
 
 
-def mixed(force, matrix, xp):
-    """Forces (..., 4) with both fingers' (x, y) pairs multiplied by a 2 x 2 matrix of scalars."""
-    (a, b), (c, d) = matrix
-    fx1, fy1, fx2, fy2 = (force[..., k] for k in range(4))
-    return xp.stack([a * fx1 + b * fy1, c * fx1 + d * fy1, a * fx2 + b * fy2, c * fx2 + d * fy2], -1)
+def both_fingers(one, two, xp):
+    """A matrix (4, 4) of both fingers' (x, y) pairs from two of scalars."""
+    rows = [[*one[0], 0.0, 0.0], [*one[1], 0.0, 0.0], [0.0, 0.0, *two[0]], [0.0, 0.0, *two[1]]]
+    return xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in rows])
 
 
-def _correct_force_crosstalk(world: World, values, on) -> World:
-    e, h = values["fy_from_fx"], values["fx_from_fy"]
-    scale = 1 / (1 - e * h)
-    force = mixed(world.force, ((scale, -h * scale), (-e * scale, scale)), jnp)
-    # Of net fx, net fy, grip and shear: each has the noise of both axes.
-    quiet = jnp.stack([1 / jnp.sqrt(1 + h**2), 1 / jnp.sqrt(1 + e**2)] * 2) / scale
-    return world._replace(force=force, loudness=world.loudness * quiet[None, None, :])
+def _crosstalk(values, xp):
+    pair = ((1.0, values["fx_from_fy"]), (values["fy_from_fx"], 1.0))
+    return both_fingers(pair, pair, xp)
 
 
-def _apply_force_crosstalk(performance: Performance, values, rng) -> Performance:
-    matrix = ((1.0, values["fx_from_fy"]), (values["fy_from_fx"], 1.0))
-    return with_force(performance, mixed(flat(performance), matrix, np))
+def _turned(values, xp):
+    c, s = ([f(values[n]) for n in ("angle1", "angle2")] for f in (xp.cos, xp.sin))
+    return both_fingers(*(((c[k], -s[k]), (s[k], c[k])) for k in (0, 1)), xp)
 
 
-FORCE_CROSSTALK = Effect(
+FORCE_CROSSTALK = mixing(
+    _crosstalk,
     name="force_crosstalk",
-    acts_on="sensing",
     says="recorded fy = fy + e fx and fx = fx + h fy",
     shows="shear and net force follow the grip",
     mistaken_for=("sensor_rotation",),
@@ -184,71 +152,43 @@ FORCE_CROSSTALK = Effect(
         "Press straight against a wall with one finger and see whether the other axis moves; redo the "
         "calibration matrix."
     ),
-    parameters=(
-        Parameter("fy_from_fx", "1", 0.06, low=-0.2, high=0.2),
-        Parameter("fx_from_fy", "1", 0.06, low=-0.2, high=0.2),
-    ),
+    parameters={n: Parameter(0.0, 0.06, low=-0.2, high=0.2) for n in ("fy_from_fx", "fx_from_fy")},
     stage=MIX,
-    correct=_correct_force_crosstalk,
-    apply=_apply_force_crosstalk,
 )
 
-
-# Force sensors mounted with a turn.
-
-
-def _turned(force, angles, xp):
-    out = []
-    for finger, angle in enumerate(angles):
-        fx, fy = force[..., 2 * finger], force[..., 2 * finger + 1]
-        out += [xp.cos(angle) * fx - xp.sin(angle) * fy, xp.sin(angle) * fx + xp.cos(angle) * fy]
-    return xp.stack(out, -1)
-
-
-def _correct_sensor_rotation(world: World, values, on) -> World:
-    return world._replace(force=_turned(world.force, (-values["angle1"], -values["angle2"]), jnp))
-
-
-def _apply_sensor_rotation(performance: Performance, values, rng) -> Performance:
-    return with_force(performance, _turned(flat(performance), (values["angle1"], values["angle2"]), np))
-
-
-SENSOR_ROTATION = Effect(
+SENSOR_ROTATION = mixing(
+    _turned,
     name="sensor_rotation",
-    acts_on="sensing",
     says="recorded F = R(angle) F, per finger",
     shows="both axes, antisymmetric",
     mistaken_for=("force_crosstalk", "table_tilt"),
     called="a force sensor mounted at an angle",
     check="Check the mounting screws and the stated sensor frame: pull along one axis and read the other.",
-    parameters=tuple(Parameter(n, "rad", 0.06, low=-0.6, high=0.6) for n in ("angle1", "angle2")),
+    parameters={n: Parameter(0.0, 0.06, "rad", low=-0.6, high=0.6) for n in ("angle1", "angle2")},
     stage=MIX,
-    correct=_correct_sensor_rotation,
-    apply=_apply_sensor_rotation,
 )
 
 
-# Forces that arrive late by a constant delay: of all channels, or of one finger's sensor.
-
-FORCE_LAG_STARTS = (0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32)  # numerics: s; where searches start
-
-
-def _delays(values, xp):
-    one, two = (xp.asarray(values.get("delay", 0.0) + values.get(n, 0.0)) for n in ("finger1", "finger2"))
-    return xp.stack([one, one, two, two])
+# Forces that arrive late by a constant delay, or pass a first-order low-pass: of all channels, or of one
+# finger's sensor. Both are put into what loads should read, not taken out: noise would grow.
 
 
-def _apply_force_lag(performance: Performance, values, rng) -> Performance:
-    t, late = performance.t, _delays(values, np)
-    force = flat(performance).T
-    return with_force(
-        performance, np.stack([np.interp(t - d, t, f) for d, f in zip(late, force, strict=True)], 1)
-    )
+def _of_fingers(words: str) -> Callable[[Mapping[str, float], Mapping[str, Any]], str]:
+    """These words, and the finger where it is of one alone."""
+
+    def phrase(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
+        acting = [k for k, v in means.items() if v > 0]
+        return f"{words} of finger {acting[0][-1]}" if [k[:6] for k in acting] == ["finger"] else words
+
+    return phrase
 
 
-FORCE_LAG = Effect(
-    name="force_lag",
-    acts_on="sensing",
+def _spread(name: str) -> Spread:
+    return lambda values: [{name: v} for v in of_channels(values, name, np)]
+
+
+FORCE_LAG = of_forces(
+    LAG,
     says="recorded F(t) = F(t - delay)",
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
@@ -257,46 +197,24 @@ FORCE_LAG = Effect(
         "Tap a fingertip sharply and compare the time stamps of force and motion; look for a buffer in "
         "the force channel."
     ),
-    phrase=of_finger("force readings that come late"),
-    parameters=(
-        Parameter("delay", "s", 0.1, starts=FORCE_LAG_STARTS, low=0.0, high=0.4),
-        Parameter("finger1", "s", 0.1, starts=FORCE_LAG_STARTS, low=0.0, high=0.4),
-        Parameter("finger2", "s", 0.1, starts=FORCE_LAG_STARTS, low=0.0, high=0.4),
+    phrase=_of_fingers("force readings that come late"),
+    parameters={
+        n: Parameter(
+            0.0, 0.1, "s", starts=(0.015, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32), low=0.0, high=0.4
+        )
+        for n in ("delay", *FINGERS)
+    },
+    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(
+        delay=w.delay + jnp.stack(of_channels(v, "delay", jnp))
     ),
-    stage=FILTER,
-    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + _delays(v, jnp)),
     forms=(("delay",), ("finger1",), ("finger2",)),
-    apply=_apply_force_lag,
+    apply=reading(LAG, _spread("delay")),
     wrist=True,
     played={"delay": 0.15},
 )
 
-
-# Forces that pass a first-order low-pass.
-
-FORCE_LOWPASS_STARTS = (0.02, 0.06, 0.12, 0.2)  # numerics: s; where searches start
-
-
-def _times_force_lowpass(values, xp):
-    common = values.get("time_constant", 0.0)
-    one, two = (xp.asarray(common + values.get(n, 0.0)) for n in ("finger1", "finger2"))
-    return xp.stack([one, one, two, two])
-
-
-def _apply_force_lowpass(performance: Performance, values, rng) -> Performance:
-    from scipy.signal import lfilter  # slow to import
-
-    step = float(np.median(np.diff(performance.t)))
-    out = flat(performance).copy()
-    for c, time in enumerate(_times_force_lowpass(values, np)):
-        keep = np.exp(-step / max(time, 1e-6))
-        out[:, c] = lfilter([1 - keep], [1, -keep], out[:, c])
-    return with_force(performance, out)
-
-
-FORCE_LOWPASS = Effect(
-    name="force_lowpass",
-    acts_on="sensing",
+FORCE_LOWPASS = of_forces(
+    LOWPASS,
     says="time_constant dF_rec/dt + F_rec = F",
     shows="rounded contact changes",
     mistaken_for=("force_lag",),
@@ -305,18 +223,16 @@ FORCE_LOWPASS = Effect(
         "Look up the filter setting of the force amplifier or driver; tap a fingertip and see how fast "
         "the reading rises."
     ),
-    phrase=of_finger("a slow filter in the force channel"),
-    parameters=(
-        Parameter("time_constant", "s", 0.08, starts=FORCE_LOWPASS_STARTS, low=0.0, high=0.5),
-        Parameter("finger1", "s", 0.08, starts=FORCE_LOWPASS_STARTS, low=0.0, high=0.5),
-        Parameter("finger2", "s", 0.08, starts=FORCE_LOWPASS_STARTS, low=0.0, high=0.5),
-    ),
+    phrase=_of_fingers("a slow filter in the force channel"),
+    parameters={
+        n: Parameter(0.0, 0.08, "s", starts=(0.02, 0.06, 0.12, 0.2), low=0.0, high=0.5)
+        for n in ("time_constant", *FINGERS)
+    },
     forms=(("time_constant",), ("finger1",), ("finger2",)),
-    stage=FILTER,
     correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(
-        smoothing=w.smoothing + _times_force_lowpass(v, jnp)
+        smoothing=w.smoothing + jnp.stack(of_channels(v, "time_constant", jnp))
     ),
-    apply=_apply_force_lowpass,
+    apply=reading(LOWPASS, _spread("time_constant")),
     wrist=True,
     played={"time_constant": 0.15},
 )
@@ -355,15 +271,14 @@ def _scatter_quantisation(given, residual: np.ndarray):
     return Scatter("quantisation", step, 1e-3, rounded_variance(given, step), known)
 
 
-QUANTISATION = Effect(
+QUANTISATION = HandEffect(
     name="quantisation",
-    acts_on="sensing",
     says="recorded F = step * round(F / step)",
     shows="plateaus; repeated values",
     mistaken_for=("noise",),
     called="coarse steps in the force readings",
     check="Check the range and resolution of the converter: list the distinct values in a quiet stretch.",
-    parameters=(Parameter("step", "N", 1.0, neutral=0.05, log=True, low=1e-3, high=0.5),),
+    parameters={"step": Parameter(0.05, 1.0, "N", log=True, low=1e-3, high=0.5)},
     stage=READOUT,
     scatter=_scatter_quantisation,
     finish=lambda force, v: v["step"] * np.round(force / v["step"]),
@@ -401,15 +316,14 @@ def _rates_clock_jitter(given) -> np.ndarray:
     return out * given.whitening.weight
 
 
-CLOCK_JITTER = Effect(
+CLOCK_JITTER = HandEffect(
     name="clock_jitter",
-    acts_on="sensing",
     says="true sample times = t + normal(0, sd)",
     shows="noise in proportion to the rate of change",
     mistaken_for=("noise",),
     called="samples that are not taken when their time stamps say",
     check="Log the acquisition clock beside the time stamps; look for samples stamped on arrival.",
-    parameters=(Parameter("sd", "s", 1.0, neutral=0.004, log=True, low=1e-4, high=0.05),),
+    parameters={"sd": Parameter(0.004, 1.0, "s", log=True, low=1e-4, high=0.05)},
     stage=READOUT,
     sampled=lambda t, v, rng: t + rng.normal(0, v["sd"], t.size),
     scatter=_scatter_clock_jitter,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from simgap.effect import Parameter
 from simgap.effects.base import (
     CONTACT,
     HAND,
     YIELDING,
-    Effect,
-    Parameter,
+    HandEffect,
     Performance,
     World,
     flat,
@@ -19,7 +19,7 @@ from simgap.effects.base import (
 
 # The carried block's inertia, where a quasistatic model is asked for.
 
-OBJECT_INERTIA = Effect(
+OBJECT_INERTIA = HandEffect(
     name="object_inertia",
     acts_on="dynamics",
     says="m a of the carried block: 1 is the whole of it, 0 a quasistatic block",
@@ -27,7 +27,7 @@ OBJECT_INERTIA = Effect(
     mistaken_for=("force_lag",),
     called="inertia of the block that the model leaves out",
     check="Use a dynamic model, or carry more slowly.",
-    parameters=(Parameter("scale", "1", 1.0, neutral=1.0, low=-1.0, high=4.0),),
+    parameters={"scale": Parameter(1.0, 1.0, low=-1.0, high=4.0)},
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(inertia=w.inertia + v["scale"] - 1.0),
     chosen=False,
@@ -43,7 +43,7 @@ def _apply_offcentre_mass(performance: Performance, values, rng) -> Performance:
     return with_force(performance, flat(performance) + more[:, None] * np.array([0.0, -1.0, 0.0, 1.0]))
 
 
-OFFCENTRE_MASS = Effect(
+OFFCENTRE_MASS = HandEffect(
     name="offcentre_mass",
     acts_on="dynamics",
     says="mass `offset` to the right of the block's middle",
@@ -51,7 +51,7 @@ OFFCENTRE_MASS = Effect(
     mistaken_for=("force_crosstalk", "force_bias"),
     called="a block heavier on one side",
     check="Balance the block on an edge under its middle.",
-    parameters=(Parameter("offset", "m", 0.003),),
+    parameters={"offset": Parameter(0.0, 0.003, "m")},
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(couple=w.couple + v["offset"]),
     apply=_apply_offcentre_mass,
@@ -80,7 +80,7 @@ def _wrong_actual(given, push: np.ndarray) -> list:
     return out
 
 
-ACTUAL = Effect(
+ACTUAL = HandEffect(
     name="actual",
     acts_on="measurement",
     says="a value of actual.toml is off by a share of itself: its name is the parameter's",
@@ -88,7 +88,7 @@ ACTUAL = Effect(
     mistaken_for=("force_gain", "fingertip_compliance"),
     called="a measured block property that the recordings contradict",
     check="Weigh and measure the block again, and check the unit in actual.toml.",
-    parameters=(Parameter("property", "1", WRONG),),
+    parameters={"property": Parameter(0.0, WRONG)},
     stage=HAND,
     wrong=_wrong_actual,
     wrist=True,
@@ -99,7 +99,7 @@ ACTUAL = Effect(
 #
 # A block of which one foot touches first turns in the grip until the other one does, and pads slide on it.
 
-TABLE_TILT = Effect(
+TABLE_TILT = HandEffect(
     name="table_tilt",
     acts_on="contact",
     says="support inclined by `angle`, rising to the right",
@@ -107,7 +107,7 @@ TABLE_TILT = Effect(
     mistaken_for=("joint_offset", "height"),
     called="a table that is not level",
     check="Lay a spirit level on the table, along the line between the fingers.",
-    parameters=(Parameter("angle", "rad", 0.025),),
+    parameters={"angle": Parameter(0.0, 0.025, "rad")},
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),
     scene=lambda v: {"tilt": v["angle"]},
@@ -132,7 +132,7 @@ def _report_table_compliance(draws, rig):
     return {"stiffness": (1 / draws["give"].clip(1e-7), "N/m")}
 
 
-TABLE_COMPLIANCE = Effect(
+TABLE_COMPLIANCE = HandEffect(
     name="table_compliance",
     acts_on="contact",
     says="the support yields by load / stiffness",
@@ -140,10 +140,10 @@ TABLE_COMPLIANCE = Effect(
     mistaken_for=("fingertip_compliance",),
     called="a table that yields under load",
     check="Press on the table with a known weight beside a dial gauge; look for foam, a mat or a loose foot.",
-    parameters=(
-        Parameter("give", "m/N", 4e-4, low=0.0),
-        Parameter("settling", "s", 0.8, neutral=0.02, low=1e-3, high=0.2, log=True, hidden=True),
-    ),
+    parameters={
+        "give": Parameter(0.0, 4e-4, "m/N", low=0.0),
+        "settling": Parameter(0.02, 0.8, "s", low=1e-3, high=0.2, log=True, hidden=True),
+    },
     stage=CONTACT,
     correct=_correct_table_compliance,
     report=_report_table_compliance,

@@ -206,10 +206,10 @@ def drawn(
     """Draws (DRAWS,) of an effect's parameters given that it acts, and their units, as the interface names
     them."""
     effect, rng = catalogue()[name], np.random.default_rng(seed)
-    of = {p.name: p for p in effect.parameters}
+    of = effect.parameters
     scatter = next((s for s in found.scatters if s.effect == name), None)
     if scatter is not None:
-        p = effect.parameters[0]
+        (p,) = of.values()
         return {p.name: (scatter.value * np.exp(scatter.log_sd * rng.standard_normal(DRAWS)), p.unit)}
     draws = {}
     for key, p in posterior.parameters.items():
@@ -221,7 +221,7 @@ def drawn(
         draws[key] = np.asarray(of[key].value(np.clip(u, *of[key].limits)))
     if effect.report is not None:
         return effect.report(draws, found.problem.frame.rig)
-    return {p.name: (draws[p.name], p.unit) for p in effect.parameters if p.name in draws and not p.hidden}
+    return {p.name: (draws[p.name], p.unit) for p in of.values() if p.name in draws and not p.hidden}
 
 
 def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
@@ -346,7 +346,7 @@ def diagnose(
     def null(value: float) -> Iterable[float]:
         if healthy is not None:
             return own_healthy(found, healthy, actual)
-        return twin_statistics(found, actual, seed, tell) if twins and value > NIL else ()
+        return twin_statistics(found, value, actual, seed, tell) if twins and value > NIL else ()
 
     gap, verdict = attributed(found, forced, seed, null)
     causes = _causes(found, gap, verdict)
@@ -384,14 +384,16 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    models: list[Model] | None = sought(forms(gap))
+    models: list[Model] | None = sought(forms(gap), 1)
     leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    if models[0].effects and not forced:
+        models = None  # to be sought more widely
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(
             found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
         )
-        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
+        gap = together(found.problem, gap, found.healthy, joint, left, found.redrawn)
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 

@@ -21,6 +21,7 @@ from math import comb
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
@@ -32,17 +33,9 @@ from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.attribution.search import detected, sought, statistic
 from simgap.attribution.verdict import ALARM, entries, log_odds, rows
-from simgap.bounded import least
-from simgap.generic.effects import (
-    EFFECTS,
-    Parameter,
-    Ring,
-    Scene,
-    find_ring,
-    parameters,
-    predicted,
-    scene,
-)
+from simgap.channels import delayed
+from simgap.effect import Parameter
+from simgap.generic.effects import Scene, Slot, effects, find_ring, predicted, scene, slots
 from simgap.generic.trials import (
     FAST,
     SLOW,
@@ -53,17 +46,19 @@ from simgap.generic.trials import (
     bin_edges,
     both,
     layout,
+    means,
 )
 from simgap.progress import Progress, silent
 
 MODERATION = 4.0  # prior: degrees of freedom that a cell's mean variance is worth
+LATE = 0.02  # numerics: s; a small delay
 PACE = 0.02  # chosen: of a duration: clocks repeat themselves exactly, and nobody minds less
 NOTHING = 1e-6  # numerics: of a channel's scale: no sd is smaller
 EXCHANGES = 20  # numerics: of labels, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
 STEP = 1e-3  # numerics: of a usual size, for derivatives by differences
-STEPS = 12  # numerics: of a fit, at most
-CLOSE = 0.02  # numerics: nats
+STEPS = 20  # numerics: of a fit, at most
+CLOSE = 1e-4  # numerics: relative, of a fit's cost
 AT_END = 0.02  # numerics: share of a range within which a descent that stays inside has run to its end
 NEUTRAL = 1e-9  # numerics: a coordinate that has not moved
 APART = 1e4  # numerics: s; powers have no order in time
@@ -128,9 +123,9 @@ def diagnose_blocks(
 
 def _check(forced: Sequence[str]) -> None:
     for name in forced:
-        if name not in EFFECTS:
+        if name not in effects():
             raise InputError(f"effect {name!r}", "needs the virtual model or is unknown",
-                             nearest(name, list(EFFECTS)))  # fmt: skip
+                             nearest(name, list(effects())))  # fmt: skip
 
 
 def diagnosed(
@@ -163,8 +158,7 @@ def diagnosed(
 def searched(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[tuple[Block, ...], Gap]:
     """The gap with every effect fitted by itself, and what whitens it."""
     white = whitening(given, real, sim)
-    names = [n for n in EFFECTS if EFFECTS[n].each != "event" or given.ring is not None]
-    found = [fit(given, white, real.mean(0) - sim.mean(0), (n,)) for n in names]
+    found = [fit(given, white, real.mean(0) - sim.mean(0), (n,)) for n in effects()]
     return white, gap_of(
         given.layout, white, real, sim, [c for f in found for c in _candidates(white, f, len(real))]
     )
@@ -197,13 +191,14 @@ def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> It
 @dataclass(frozen=True)
 class Block:
     """Features of one channel (-1: durations): their indices (n,), `root` (n, n) that whitens rows of the
-    gap, covariance (n, n) of the mean difference, and mean square (n,) of a whitened row."""
+    gap of so many real `trials`, variances (n,) of a row, and mean square (n,) of a whitened one."""
 
     channel: int
     index: np.ndarray
     root: np.ndarray
-    covariance: np.ndarray
+    variance: np.ndarray
     told: np.ndarray
+    trials: int
 
 
 def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Block, ...]:
@@ -215,11 +210,11 @@ def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Block, .
         basis = _common(given, c) if c >= 0 else np.zeros((index.size, 0))
         each = [_covariance(lay, v[:, index], basis, index) for v in kinds]
         a, b = each[0], each[-1]  # a single trial borrows the other kind's
-        mean = a / len(real) + b / len(sim)
-        values, vectors = np.linalg.eigh(mean * len(real))
+        of_row = a + b * len(real) / len(sim)
+        values, vectors = np.linalg.eigh(of_row)
         root = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))) @ vectors.T
         told = np.einsum("ij,jk,ik->i", root, a + b / len(sim), root)
-        out.append(Block(c, index, root, mean, told))
+        out.append(Block(c, index, root, np.diag(of_row), told, len(real)))
     return tuple(out)
 
 
@@ -239,13 +234,12 @@ def variances(lay: Layout, deviations: np.ndarray, index: np.ndarray) -> np.ndar
 def _common(given: Scene, channel: int) -> np.ndarray:
     """Orthonormal ways (n, q) in which whole trials differ: offset, slope, size and time of the course,
     an offset of each subtask, loudness."""
-    lay, none = given.layout, np.zeros((len(given.layout.window), 2))
-    index = lay.of_channel(channel)
-    slowly = (lay.kind[index] == SLOW).astype(float)
-    base = predicted(given, channel, {}, none)
-    columns = [slowly * (predicted(given, channel, {k: v}, none) - base)
-               for k, v in (("slope", 1.0), ("gain", 0.1), ("delay", 0.02))]  # fmt: skip
-    columns += [slowly * (lay.subtask[index] == k) for k in range(len(none))] + [1 - slowly]
+    lay, t, x = given.layout, given.t, given.course[channel]
+    slowly = (lay.kind[lay.of_channel(channel)] == SLOW).astype(float)
+    moved = [t, x, delayed(t, x, LATE) - x]  # a drift, a gain, a lag
+    columns = [np.concatenate([means(t, m, given.bins), np.zeros(int((slowly == 0).sum()))]) for m in moved]
+    subtask = lay.subtask[lay.of_channel(channel)]
+    columns += [slowly * (subtask == k) for k in range(len(lay.window))] + [1 - slowly]
     ways = np.stack([c / max(np.linalg.norm(c), 1e-12) for c in columns], 1)
     left, size, _ = np.linalg.svd(ways, full_matrices=False)
     return left[:, size > 1e-6]
@@ -310,164 +304,136 @@ def _whitened(white: Sequence[Block], values: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """Effects fitted to the mean difference: their parameters, coordinates `u` (k,) in usual sizes, `shift`
-    (F,) of features, its derivatives (F, k) by usual sizes."""
+class Part:
+    """Effects fitted in one channel, or to one duration: coordinates `u` (k,) of their slots, `shift` (F,) of
+    all features, its derivatives (F, k) by coordinates."""
 
-    parameters: tuple[Parameter, ...]
+    slots: tuple[Slot, ...]
     u: np.ndarray
     shift: np.ndarray
     slopes: np.ndarray
 
 
-def shift_at(given: Scene, block: Block, mine: Sequence[Parameter], u: np.ndarray) -> np.ndarray:
+def shift_at(given: Scene, block: Block, mine: Sequence[Slot], u: np.ndarray) -> np.ndarray:
     """Features (n,) of a block with effects at coordinates u, less those without."""
+    values = [s.parameter.value(float(v)) for s, v in zip(mine, u, strict=True)]
     if block.channel < 0:
         out = np.zeros(block.index.size)
-        for p, value in zip(mine, u, strict=True):
-            out[p.place] += p.usual * value
+        np.add.at(out, [s.place for s in mine], values)
         return out
-    values, rung = dict[str, float](), np.zeros((len(given.layout.window), 2))
-    for p, value in zip(mine, u, strict=True):
-        if EFFECTS[p.effect].each == "event":
-            rung[p.place, int(p.key == "cos")] = p.usual * value
+    acting, rung = dict[str, dict[str, float]](), np.zeros((len(given.layout.window), 2))
+    for s, value in zip(mine, values, strict=True):
+        if s.place >= 0:
+            rung[s.place, int(s.parameter.name == "cos")] = value
         else:
-            values[p.key] = p.usual * float(value)
-    return predicted(given, block.channel, values, rung) - given.plain[block.channel]
+            acting.setdefault(s.effect, {})[s.parameter.name] = value
+    return predicted(given, block.channel, acting, rung) - given.plain[block.channel]
 
 
-def fit(given: Scene, white: Sequence[Block], difference: np.ndarray, effects: Sequence[str]) -> Fit:
-    """Effects together fitted to the mean difference (F,), channel by channel, from every start."""
-    found, shift, slopes = [], np.zeros(difference.size), []
-    for block in white:
-        mine = [p for name in effects for p in parameters(given, name, block.channel)]
-        there, starts = np.linalg.inv(block.covariance), range(max(len(EFFECTS[n].starts) for n in effects))
-        while mine:
-            target = difference[block.index]
-            descents = [_descended(given, block, there, target, mine, _start(mine, j)) for j in starts]
-            _, u, moved, push = min(descents, key=lambda d: d[0])
-            inside = [not _ended(p, v) for p, v in zip(mine, u, strict=True)]
-            if all(inside):
-                break
-            mine = [p for p, kept in zip(mine, inside, strict=True) if kept]
-        if not mine:
-            continue
-        shift[block.index] = moved
-        wide = np.zeros((difference.size, len(mine)))
-        wide[block.index] = push
-        slopes.append(wide)
-        found.append((mine, u))
-    every = tuple(p for mine, _ in found for p in mine)
-    u = np.concatenate([np.zeros(0), *(u for _, u in found)])
-    return Fit(every, u, shift, np.concatenate([np.zeros((difference.size, 0)), *slopes], 1))
+def fit(given: Scene, white: Sequence[Block], difference: np.ndarray, names: Sequence[str]) -> list[Part]:
+    """Effects together fitted to the mean difference (F,), channel by channel, from every start.
 
-
-def _ended(p: Parameter, value: float) -> bool:
-    """Whether a coordinate ran to the end of its range: a filter of half a second stands for a course that
-    differs in another way, and is none of this channel's."""
-    change = EFFECTS[p.effect]
-    end = change.low if value < 0 else change.high
-    return bool(abs(value) > NEUTRAL and abs(value - end) < AT_END * abs(end))
-
-
-def _start(mine: Sequence[Parameter], which: int) -> np.ndarray:
-    starts = [EFFECTS[p.effect].starts for p in mine]
-    return np.array([
-        s[which % len(s)][EFFECTS[p.effect].keys.index(p.key)] for p, s in zip(mine, starts, strict=True)
-    ])  # fmt: skip
-
-
-def _descended(given, block, there, target, mine, u):
-    """Levenberg-Marquardt within bounds, priors normal: cost, coordinates, shift and derivatives."""
-    low, high = (np.array([getattr(EFFECTS[p.effect], end) for p in mine]) for end in ("low", "high"))
-    u, damping, now = np.clip(u, low, high), 1e-3, None
-    for _ in range(STEPS):
-        if now is None:
-            moved = shift_at(given, block, mine, u)
-            left = target - moved
-            now = 0.5 * float(left @ there @ left + u @ u)
-            push = np.stack([(shift_at(given, block, mine, u + step) - moved) / STEP
-                             for step in STEP * np.eye(u.size)], 1)  # fmt: skip
-        bend = push.T @ there @ push + np.eye(u.size)
-        pull = push.T @ there @ left - u
-        step, _ = least(bend + damping * np.diag(np.diag(bend)), pull, low - u, high - u)
-        other = np.clip(u + step, low, high)
-        rest = target - shift_at(given, block, mine, other)
-        cost = 0.5 * float(rest @ there @ rest + other @ other)
-        if cost < now:
-            gain, u, damping, now = now - cost, other, damping / 5, None
-            if gain < CLOSE:
-                break
-        else:
-            damping *= 8
-            if damping > 1e3:
-                break
-    moved = shift_at(given, block, mine, u)
-    push = np.stack([(shift_at(given, block, mine, u + step) - moved) / STEP
-                     for step in STEP * np.eye(u.size)], 1)  # fmt: skip
-    left = target - moved
-    return 0.5 * float(left @ there @ left + u @ u), u, moved, push
-
-
-def _candidates(white: Sequence[Block], found: Fit, count: int) -> list[Candidate]:
-    """One effect in all channels (or subtasks, of durations), and in that alone in which it explains most."""
-    if not found.parameters:
-        return []
-    every = np.ones(found.u.size, bool)
-    parts = [np.array([(p.channel, p.place * (p.channel < 0)) == one for p in found.parameters])
-             for one in {(p.channel, p.place * (p.channel < 0)) for p in found.parameters}]  # fmt: skip
-    own = [_own(white, found, part) for part in parts]
-    gains = [sum(float(s[b.index] @ np.linalg.solve(b.covariance, s[b.index])) for b in white) for s in own]
-    best = int(np.argmax(gains))
-    forms = [(every, found.shift)] + [(parts[best], own[best])] * (len(parts) > 1)
-    return [
-        _candidate(white, [p for p, there in zip(found.parameters, part, strict=True) if there],
-                   found.u[part], shift, found.slopes[:, part], count)
-        for part, shift in forms
-    ]  # fmt: skip
-
-
-def _own(white: Sequence[Block], found: Fit, part: np.ndarray) -> np.ndarray:
-    """The shift (F,) by some of an effect's parameters (k,): those of a channel, or of a duration."""
-    where = found.slopes[:, part].any(1)
-    if found.parameters[int(np.argmax(part))].channel >= 0:
-        (c,) = {p.channel for p, there in zip(found.parameters, part, strict=True) if there}
-        where = np.isin(np.arange(where.size), next(b.index for b in white if b.channel == c))
-    return np.where(where, found.shift, 0.0)
-
-
-def _joint(given: Scene, white: Sequence[Block], found: Fit, count: int) -> list[Candidate]:
-    """The effects of a joint fit as candidates where they are together; what they do only together is parted
-    evenly."""
-    names = list(dict.fromkeys(p.effect for p in found.parameters))
-    alone = {}
-    for name in names:
-        rest = np.array(
-            [0.0 if p.effect == name else v for p, v in zip(found.parameters, found.u, strict=True)]
-        )
-        alone[name] = found.shift.copy()
-        for block in white:
-            at = [k for k, p in enumerate(found.parameters) if p.channel == block.channel]
-            if at:
-                mine = [found.parameters[k] for k in at]
-                alone[name][block.index] -= shift_at(given, block, mine, rest[at])
-    left = (found.shift - sum(alone.values())) / len(names)
+    What runs to the end of its range is left out: a filter of half a second stands for a course that differs
+    in another way, and is none of this channel's.
+    """
     out = []
-    for name in names:
-        own = np.array([p.effect == name for p in found.parameters])
-        mine = [p for p in found.parameters if p.effect == name]
-        out.append(_candidate(white, mine, found.u[own], alone[name] + left, found.slopes[:, own], count))
+    for block in white:
+        mine = [s for name in names for s in slots(given, name, block.channel)]
+        found = None
+        while mine and found is None:
+            found = _fitted(given, block, difference[block.index], mine)
+            inside = [not _ended(s.parameter, v) for s, v in zip(mine, found[0], strict=True)]
+            if not all(inside):
+                mine, found = [s for s, kept in zip(mine, inside, strict=True) if kept], None
+        if found is None:
+            continue
+        u, moved, push = found
+        together = [range(len(mine))] if block.channel >= 0 else [[k] for k in range(len(mine))]
+        for part in map(list, together):
+            shift, slopes = np.zeros(difference.size), np.zeros((difference.size, len(part)))
+            slopes[block.index] = push[:, part]
+            shift[block.index] = moved if block.channel >= 0 else push[:, part] @ u[part]
+            out.append(Part(tuple(mine[k] for k in part), u[part], shift, slopes))
     return out
 
 
-def _candidate(
-    white: Sequence[Block], mine: Sequence[Parameter], u: np.ndarray, shift: np.ndarray, slopes: np.ndarray,
-    count: int,
-) -> Candidate:  # fmt: skip
-    change = EFFECTS[mine[0].effect]
-    low, high = (np.full(u.size, end) for end in (change.low, change.high))
-    labels = tuple(f"{p.channel}/{p.place}/{p.key}" for p in mine)
-    return Candidate(change.name, labels, u, np.zeros(u.size), np.ones(u.size),
+def _ended(p: Parameter, value: float) -> bool:
+    end = p.limits[int(value > 0)]
+    return bool(abs(value) > NEUTRAL and abs(value - end) < AT_END * abs(end))
+
+
+def _fitted(
+    given: Scene, block: Block, target: np.ndarray, mine: Sequence[Slot]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates, shift and derivatives of the best of all starts, by least squares within bounds and with
+    normal priors."""
+    root, size = block.root * np.sqrt(block.trials), len(mine)
+    priors, ends = np.eye(size), np.array([s.parameter.limits for s in mine]).T
+
+    seen = dict[bytes, np.ndarray]()
+
+    def at(u: np.ndarray) -> np.ndarray:
+        if u.tobytes() not in seen:
+            seen[u.tobytes()] = shift_at(given, block, mine, u)
+        return seen[u.tobytes()]
+
+    def push(u: np.ndarray) -> np.ndarray:
+        return np.stack([(at(u + step) - at(u)) / STEP for step in STEP * priors], 1)
+
+    def left(u: np.ndarray) -> np.ndarray:
+        return np.concatenate([root @ (target - at(u)), u])
+
+    def slopes(u: np.ndarray) -> np.ndarray:
+        return np.concatenate([-root @ push(u), priors])
+
+    starts = [[s.parameter.coordinate(v) for v in s.parameter.starts or (0.0,)] for s in mine]
+    every = [[s[j % len(s)] for s in starts] for j in range(max(map(len, starts)))]
+    descents = [
+        least_squares(left, np.clip(u, *ends), slopes, ends, ftol=CLOSE, max_nfev=STEPS) for u in every
+    ]
+    u = min(descents, key=lambda d: d.cost).x
+    return u, at(u), push(u)
+
+
+def _candidates(white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
+    """One effect in all channels (or subtasks, of durations), and in that alone in which it explains most."""
+    if not found:
+        return []
+    gains = [float(np.square(_whitened(white, p.shift)).sum()) for p in found]
+    forms = [list(found)] + [[found[int(np.argmax(gains))]]] * (len(found) > 1)
+    return [_candidate(white, parts, np.sum([p.shift for p in parts], 0), count) for parts in forms]
+
+
+def _joint(given: Scene, white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
+    """The effects of a joint fit as candidates where they are together; what they do only together is parted
+    evenly."""
+    whole = np.sum([p.shift for p in found], 0)
+    names, blocks = (
+        list(dict.fromkeys(s.effect for p in found for s in p.slots)),
+        {b.channel: b for b in white},
+    )
+    alone, own = {}, dict[str, list[Part]]()
+    for name in names:
+        alone[name] = np.zeros_like(whole)
+        for p in found:
+            mine, block = np.array([s.effect == name for s in p.slots]), blocks[p.slots[0].channel]
+            if mine.all():
+                alone[name] += p.shift
+            elif mine.any():
+                rest = shift_at(given, block, p.slots, np.where(mine, 0.0, p.u))
+                alone[name][block.index] += p.shift[block.index] - rest
+            if mine.any():
+                kept = tuple(s for s in p.slots if s.effect == name)
+                own.setdefault(name, []).append(Part(kept, p.u[mine], p.shift, p.slopes[:, mine]))
+    more = (whole - np.sum(list(alone.values()), 0)) / len(names)
+    return [_candidate(white, own[name], alone[name] + more, count) for name in names]
+
+
+def _candidate(white: Sequence[Block], parts: Sequence[Part], shift: np.ndarray, count: int) -> Candidate:
+    mine, u = [s for p in parts for s in p.slots], np.concatenate([p.u for p in parts])
+    slopes = np.concatenate([p.slopes for p in parts], 1)
+    low, high = np.array([s.parameter.limits for s in mine]).T
+    return Candidate(mine[0].effect, tuple(s.label for s in mine), u, np.zeros(u.size), np.ones(u.size),
                      np.tile(_whitened(white, shift), count), np.tile(_whitened(white, slopes), (count, 1)),
                      low, high)  # fmt: skip
 
@@ -499,7 +465,7 @@ def _document(
         for block in white:
             shift[block.index] += np.linalg.solve(block.root, moved[block.index])
     for block in white:
-        variance[block.index] = np.diag(block.covariance) * len(real)
+        variance[block.index] = block.variance
     return GenericDiagnosis(body, given, verdict, real, sim, variance, shift, leading, tuple(warnings))
 
 
@@ -529,28 +495,25 @@ def _described(given: Scene, verdict: Attribution, names: Sequence[str]) -> dict
 
 def _parameters(given: Scene, name: str, found: Mapping[str, Any]) -> dict[str, Any]:
     """An effect's parameters in units, by channel or subtask; of a vibration frequency, damping and size."""
-    change, lay, out = EFFECTS[name], given.layout, dict[str, Any]()
-    rung = dict[tuple[int, str], list[tuple[float, float]]]()
-    of = {f"{p.channel}/{p.place}/{p.key}": p
-          for c in (*range(len(lay.ensembles.channels)), -1) for p in parameters(given, name, c)}  # fmt: skip
+    lay, out = given.layout, dict[str, Any]()
+    rung = dict[tuple[int, int], list[tuple[float, float]]]()
+    of = {s.label: s for c in (*range(len(lay.ensembles.channels)), -1) for s in slots(given, name, c)}
     for label, value in found.items():
-        p = of[label]
-        mean, sd = p.usual * value.mean, p.usual * value.sd
-        low, high = (p.usual * v for v in value.interval_90)
-        if change.each == "event":
-            rung.setdefault((p.channel, str(p.place)), []).append((mean, sd))
-        elif change.each == "subtask":
+        slot, p = of[label], of[label].parameter
+        mean, sd = p.value(value.mean), p.sd * value.sd
+        low, high = (p.value(v) for v in value.interval_90)
+        if slot.channel < 0:
             ratio = float(np.exp(mean))
-            out[lay.ensembles.subtasks[p.place]] = _entry(ratio, ratio * sd, np.exp([low, high]), "1")
+            out[lay.ensembles.subtasks[slot.place]] = _entry(ratio, ratio * sd, np.exp([low, high]), "1")
+        elif slot.place >= 0:
+            rung.setdefault((slot.channel, slot.place), []).append((mean, sd))
         else:
-            channel = lay.ensembles.channels[p.channel]
-            unit = change.unit if change.unit in ("1", "s") else f"unit of {channel}"
-            out[channel] = _entry(mean, sd, (low, high), unit + (" per s" if change.unit == "/s" else ""))
-    if rung:
-        assert given.ring is not None
-        size, sd, c = max((float(np.hypot(*np.array(v)[:, 0])), float(np.hypot(*np.array(v)[:, 1])), c)
-                          for (c, _), v in rung.items())  # fmt: skip
-        ring: Ring = given.ring
+            channel = lay.ensembles.channels[slot.channel]
+            key = channel if len(effects()[name].parameters) == 1 else f"{channel}.{p.name}"
+            out[key] = _entry(mean, sd, (low, high), p.unit)
+    if rung and given.ring is not None:
+        ring = given.ring
+        size, sd, c = max((*map(float, np.hypot(*np.reshape(v, (-1, 2)))), c) for (c, _), v in rung.items())
         out |= {
             "frequency": _entry(ring.frequency, ring.frequency_sd, ring.frequency_90, "Hz"),
             "damping": _entry(ring.damping, ring.damping_sd, ring.damping_90, "1"),

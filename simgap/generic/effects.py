@@ -1,95 +1,96 @@
 """What effects that need no contact model do to simulated trials, and a ring found in recorded ones.
 
-Each acts in one channel on the mean simulated course, on the spectra of the simulated trials, or on
-durations. Recorded = what is simulated + effect, in this order: shifted in time, smoothed, scaled,
-then offset and drift, then vibration and noise added. Names are the catalogue's where it has the effect.
+Each acts in one channel on the mean simulated course and on the simulated trials, whose spectra are then
+taken anew, or on durations. A channel has the effects of `simgap.channels`, from the true value outwards;
+vibration and noise are added to what they give.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 
+from simgap.channels import ChannelEffect, Theta, at_rest, channel_effects
+from simgap.effect import Parameter
 from simgap.generic.trials import Layout, bin_edges, log_power, means, resampled, transformed, windowed
 
 FINE = 2048  # numerics: points of the mean course
-SMALLEST = 1e-6  # numerics: s; a shorter time constant is none
 SMOOTH = 9  # numerics: coefficients over which a spectrum is smoothed
+LINE = 1e-12  # numerics: of a channel: a straight line bends less from step to step
 LEAST = 4  # numerics: coefficients that a mean power is taken of
+COARSE = 10.0  # prior: what a given simulation is off by, of what a calibrated robot's sensors are
+NOISE, LATE = "noise_level", "force_lag"
 
 
 @dataclass(frozen=True)
-class Change:
-    """An effect on given trials: `keys` of its parameters in a channel, each with its usual size (times the
-    channel's scale, or that over the task's duration, as `per` says), bounds and starts in usual sizes.
+class EnsembleEffect(ChannelEffect):
+    """An effect on given trials. `each`: one in each channel, one a channel and event (an oscillation's sine
+    and cosine), or one a subtask (durations)."""
 
-    `each`: one of each a channel, one a channel and event (an oscillation's sine and cosine), or one a
-    subtask (durations).
-    """
-
-    name: str
-    says: str
-    shows: str
-    keys: tuple[str, ...]
-    usual: float
-    per: str = ""  # "", "scale" or "rate"
-    unit: str = ""  # of the channel's unit: "", "/s"; or one of its own
-    starts: tuple[tuple[float, ...], ...] = ((0.0,),)
-    low: float = -8.0
-    high: float = 8.0
     each: str = "channel"
 
 
-EFFECTS = {
-    c.name: c
-    for c in (
-        Change("force_bias", "recorded = simulated + b", "the slow course of every subtask alike", ("bias",),
-               0.5, "scale"),
-        Change("force_gain", "recorded = (1 + g) simulated", "course and fluctuation, in proportion",
-               ("gain",), 0.3, unit="1", low=-1.6, high=3.3),
-        Change("force_drift", "recorded = simulated + c t", "a ramp over the whole task", ("slope",), 0.5,
-               "rate", "/s"),
-        Change("force_lag", "recorded = simulated(t - delay)", "every change of the course, late", ("delay",),
-               0.1, unit="s", starts=((0.3,), (1.0,), (3.0,)), low=0.0, high=5.0),
-        Change("force_lowpass", "tau recorded' + recorded = simulated", "rounded changes, fast power gone",
-               ("time_constant",), 0.1, unit="s", starts=((0.1,), (0.5,), (2.0,)), low=0.0, high=5.0),
-        Change("structural_vibration", "a damped mode rung at the start of a subtask",
-               "power about one frequency", ("sin", "cos"), 0.2, "scale", each="event",
-               starts=((0.3, 0.0), (0.0, 0.3), (-0.3, 0.0), (0.0, -0.3))),
-        Change("noise_level", "white noise added (less, if negative)", "power at all frequencies alike",
-               ("sd",), 0.05, "scale", starts=((0.05,), (0.5,), (-0.05,))),
-        Change("timing", "durations of subtasks multiplied", "durations alone", ("log_ratio",), 0.5, unit="1",
-               each="subtask"),
-    )
-}  # fmt: skip
+@cache
+def effects() -> dict[str, ChannelEffect]:
+    """All effects on given trials, those of any channel by the names that they have in a hand's forces."""
+    own = (
+        EnsembleEffect(
+            "structural_vibration", "a damped mode rung at the start of a subtask",
+            {"sin": Parameter(0.0, 0.02, "", starts=(0.06, 0.0, -0.06, 0.0)),
+             "cos": Parameter(0.0, 0.02, "", starts=(0.0, 0.06, 0.0, -0.06))},
+            "power about one frequency", each="event",
+        ),
+        EnsembleEffect(
+            NOISE, "white noise added (less, if negative)",
+            {"sd": Parameter(0.0, 0.005, "", starts=(0.0025, 0.025, -0.0025))},
+            "power at all frequencies alike",
+        ),
+        EnsembleEffect(
+            "timing", "durations of subtasks multiplied", {"log_ratio": Parameter(0.0, 0.05)},
+            "durations alone", each="subtask",
+        ),
+    )  # fmt: skip
+    of_any = (replace(e, name=f"force_{e.name}") for e in channel_effects().values())
+    return {e.name: e for e in (*of_any, *own)}
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect in a channel (-1: durations); `place`: its event or subtask, else -1."""
+class Slot:
+    """A parameter of an effect in a channel (-1: durations); `place`: its event or subtask, else -1."""
 
     effect: str
-    key: str
+    parameter: Parameter
     channel: int
     place: int
-    usual: float
+
+    @property
+    def label(self) -> str:
+        """A name of its own."""
+        return f"{self.channel}/{self.place}/{self.parameter.name}"
 
 
-def parameters(given: Scene, effect: str, channel: int) -> list[Parameter]:
-    """The parameters that an effect has in a channel, or of durations (-1)."""
-    change, count = EFFECTS[effect], len(given.layout.ensembles.subtasks)
-    if (change.each == "subtask") != (channel < 0):
+def slots(given: Scene, effect: str, channel: int) -> list[Slot]:
+    """Parameters of an effect in a channel (-1: durations); none where it does not act there."""
+    acting, lay = effects()[effect], given.layout
+    each = getattr(acting, "each", "channel")
+    if (each == "subtask") != (channel < 0) or (each == "event" and given.ring is None):
         return []
-    usual = change.usual * (float(given.layout.scale[channel]) if change.per else 1.0)
-    usual /= float(given.edges[-1]) if change.per == "rate" else 1.0
-    places = {"channel": [-1], "event": range(1, count), "subtask": range(count)}[change.each]
-    return [Parameter(effect, key, channel, k, usual) for k in places for key in change.keys]
+    size, unit = (
+        (1.0, "") if channel < 0 else (lay.scale[channel], f"unit of {lay.ensembles.channels[channel]}")
+    )
+    sized = acting.sized(float(size), unit, float(given.edges[-1]), COARSE)
+    count = len(lay.ensembles.subtasks)
+    places = {"channel": [-1], "event": range(1, count), "subtask": range(count)}[each]
+    return [Slot(effect, p, channel, k) for k in places for p in sized.values()]
+
+
+Acting = Mapping[str, Theta]  # values by effect
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Scene:
     """What predictions start from: the layout, mean real boundaries and the mean simulated course on them.
 
     `t` (FINE,) [s] and `course` (C, FINE); `floor` (C,): power of the simulated noise; `ring`: the
-    oscillation looked for. `cache`: spectra computed so far.
+    oscillation looked for. `plain_waves`: spectra as simulated by channel; `cache`: powers computed so far.
     """
 
     layout: Layout
@@ -106,6 +107,7 @@ class Scene:
     course: np.ndarray
     floor: np.ndarray
     ring: Ring | None = None
+    plain_waves: dict[int, list[np.ndarray]] = field(default_factory=dict, repr=False)
     cache: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -123,8 +125,7 @@ class Scene:
     @cached_property
     def plain(self) -> list[np.ndarray]:
         """Features of every channel without any effect."""
-        none = np.zeros((len(self.layout.window), 2))
-        return [predicted(self, c, {}, none) for c in range(len(self.course))]
+        return [predicted(self, c, {}) for c in range(len(self.course))]
 
 
 def scene(layout: Layout, ring: Ring | None = None) -> Scene:
@@ -154,83 +155,98 @@ def _floor(layout: Layout) -> np.ndarray:
     return out
 
 
-def predicted(given: Scene, channel: int, values: Mapping[str, float], rung: np.ndarray) -> np.ndarray:
+def predicted(given: Scene, channel: int, acting: Acting, rung: np.ndarray | None = None) -> np.ndarray:
     """Predicted features of a channel in the order of `Layout.of_channel`.
 
     `rung` (K, 2): sine and cosine amplitudes of a vibration from each subtask's start on.
     """
-    x, layout = given.course[channel], given.layout
-    delay, tau = values.get("delay", 0.0), values.get("time_constant", 0.0)
-    if delay:
-        x = np.interp(given.t - delay, given.t, x)
-    if tau > SMALLEST:
-        x = smoothed(x, tau / (given.t[1] - given.t[0]))
-    x = (1 + values.get("gain", 0.0)) * x + values.get("bias", 0.0) + values.get("slope", 0.0) * given.t
+    x, rate = read(given.t, given.course[channel], acting), given.layout.rate
+    rung = np.zeros((len(given.layout.window), 2)) if rung is None else rung
     for k in np.flatnonzero(rung.any(1)):
         x = x + rung[k] @ given.waves[k]
-    out = [means(given.t, x, given.bins)]
-    whole, part = divmod(delay * layout.rate, 1.0)
-    louder = tuple(values.get(key, 0.0) for key in ("gain", "time_constant", "sd"))
-    for k in range(len(layout.window)):
+    whole, part = divmod(acting.get(LATE, {}).get("delay", 0.0) * rate, 1.0)
+    fast = 0.0
+    # Between samples noise would be smoothed: a lag by parts of one has a share of both neighbours' powers.
+    for shift, share in ((whole, 1 - part), (whole + 1, part)):
+        if share > 1e-9:
+            late = {LATE: {"delay": shift / rate}} if LATE in acting else {}
+            fast = fast + share * _log_powers(given, channel, {**acting, **late}, rung)
+    return np.concatenate([means(given.t, x, given.bins), np.atleast_1d(fast)])
+
+
+def _log_powers(given: Scene, channel: int, acting: Acting, rung: np.ndarray) -> np.ndarray:
+    """Mean log powers of the simulated trials' sub-bands in all subtasks, as they are read."""
+    key = channel, tuple((n, *sorted(v.items())) for n, v in sorted(acting.items())), rung.tobytes()
+    if key in given.cache:
+        return given.cache[key]
+    layout, out, more = given.layout, [np.zeros(0)], acting.get(NOISE, {}).get("sd", 0.0)
+    added = max(more * abs(more), -given.floor[channel])  # no more noise can be missing than there is
+    for k, wave in enumerate(_waves(given, channel, acting)):
         if layout.coefficients[k]:
-            now = _log_power(given, channel, k, int(whole), louder, tuple(rung[k]))
-            if part > 1e-9:  # between two neighbouring samples' shifts
-                later = _log_power(given, channel, k, int(whole) + 1, louder, tuple(rung[k]))
-                now = (1 - part) * now + part * later
-            out.append(now)
-    return np.concatenate(out)
-
-
-def _log_power(
-    given: Scene, channel: int, subtask: int, shift: int, louder: tuple[float, ...], rung: tuple[float, ...]
-) -> np.ndarray:
-    """Mean log powers (B,) of the simulated trials, `shift` samples late, with a gain, low-pass and noise
-    (`louder`) and a ring."""
-    key = channel, subtask, shift, louder, rung
-    if key not in given.cache:
-        given.cache[key] = _computed_power(given, *key)
+            if rung[k].any():
+                t = (np.arange(wave.shape[1]) + 0.5) / layout.rate
+                wave = wave + transformed(rung[k] @ ring_waves(given, t))
+            out.append(log_power(layout, np.maximum(wave**2 + added, 0.0), channel, k).mean(0))
+    given.cache[key] = np.concatenate(out)
     return given.cache[key]
 
 
-def _computed_power(given, channel, subtask, shift, louder, rung) -> np.ndarray:
-    layout, n = given.layout, int(given.layout.window[subtask])
-    gain, tau, sd = louder
-    wave = _simulated(given, channel, subtask, shift, tau)
-    quiet, noise = _simulated(given, channel, subtask, shift, 0.0), given.floor[channel]
-    kept = 1 / (1 + (2 * np.pi * np.arange(n) * layout.rate / (2 * n) * tau) ** 2)
-    # What lies at the noise floor is the sensor's own noise: neither filter nor gain changes it.
-    near = np.maximum(uniform_filter1d((quiet**2).mean(0), SMOOTH, mode="nearest"), 1e-300)
-    share = np.clip(noise / near, 0.0, 1.0)
-    wave = np.sqrt(share + (1 - share) * (1 + gain) ** 2) * wave
-    if any(rung):
-        wave = wave + transformed(np.array(rung) @ ring_waves(given, (np.arange(n) + 0.5) / layout.rate))
-    added = max(sd * abs(sd), -noise)  # no more noise can be missing than there is
-    spectra = np.maximum(wave**2 + noise * (1 - kept) + added, 0.0)
-    return log_power(layout, spectra, channel, subtask).mean(0)
+def read(t: np.ndarray, values: np.ndarray, acting: Acting) -> np.ndarray:
+    """Values (n,) as they are read where these effects act."""
+    for effect in reversed(channel_effects().values()):
+        theta = acting.get(f"force_{effect.name}")
+        if theta is not None:
+            values = at_rest(effect.read, t, values, theta)
+    return values
 
 
-def _simulated(given: Scene, channel: int, subtask: int, shift: int, tau: float) -> np.ndarray:
-    """DCT coefficients (S, window) of the simulated trials, smoothed with time constant `tau` [s]."""
-    key = channel, subtask, shift, 0.0 if tau <= SMALLEST else tau
-    if key not in given.cache:
-        name, windows = given.layout.ensembles.channels[channel], []
-        for cut in given.layout.ensembles.sim:
-            values = cut.trial.channels[name]
-            if tau > SMALLEST:
-                known = np.isfinite(values)
-                filled = np.interp(cut.trial.t, cut.trial.t[known], values[known])
-                values = smoothed(filled, tau * cut.trial.rate)
-            windows.append(windowed(given.layout, cut, channel, subtask, shift, values))
-        given.cache[key] = transformed(np.array(windows))
-    return given.cache[key]
+def _waves(given: Scene, channel: int, acting: Acting) -> list[np.ndarray]:
+    """DCT coefficients (S, window) of the simulated trials in each subtask, as they are read.
+
+    What lies at the noise floor is the sensor's own noise, which is added behind what it is read through: its
+    power there is put back to what it was.
+    """
+    lay, name = given.layout, given.layout.ensembles.channels[channel]
+    noise, x = given.floor[channel], given.course[channel]
+    straight = np.ptp(np.diff(read(given.t, x, acting) - x)) < LINE * (1 + np.abs(x).max())  # in no spectrum
+    if straight and channel in given.plain_waves:
+        return given.plain_waves[channel]
+    rows: list[list[np.ndarray]] = [[] for _ in lay.window]
+    for cut in lay.ensembles.sim:
+        t, values = cut.trial.t, cut.trial.channels[name]
+        there = np.isfinite(values)
+        values = values if there.all() else np.interp(t, t[there], values[there])
+        if not straight:  # a second before the start as the first one, mirrored: what is held has no noise
+            m = min(t.size - 1, int(cut.trial.rate))
+            before, early = 2 * t[0] - t[m:0:-1], values[m:0:-1]
+            every = np.concatenate([before, t]) - cut.edges[0]
+            values = read(every, np.concatenate([early, values]), acting)[m:]
+        for k, mine in enumerate(rows):
+            mine.append(windowed(lay, cut, channel, k, values))
+    out = [transformed(np.array(mine)) for mine in rows]
+    if straight:
+        given.plain_waves[channel] = out
+        return out
+    for k, plain in enumerate(_waves(given, channel, {})):
+        now, floor = _smooth(out[k]), np.minimum(noise, _smooth(plain))
+        lost = 1 - _response(lay.rate, plain.shape[1], acting)
+        out[k] = out[k] * np.sqrt(np.maximum(now + floor * lost, 0.0) / now)
+    return out
 
 
-def smoothed(x: np.ndarray, tau: float) -> np.ndarray:
-    """A first-order low pass with its time constant in samples, settled at the start."""
-    from scipy.signal import lfilter  # slow to import
+def _response(rate: float, window: int, acting: Acting) -> np.ndarray:
+    """By how much the power of white noise is multiplied at the frequencies (window,) of a DCT."""
+    t, click = np.arange(FINE) / rate, np.zeros(FINE)
+    click[FINE // 8] = 1.0
+    heard = read(t, click, acting) - read(t, np.zeros(FINE), acting)
+    power = np.square(np.abs(np.fft.rfft(heard)))
+    return np.interp(np.arange(window) * rate / (2 * window), np.fft.rfftfreq(FINE, 1 / rate), power)
 
-    keep = np.exp(-1 / tau)
-    return np.asarray(lfilter([1 - keep], [1, -keep], x, zi=[keep * x[0]])[0])
+
+def _smooth(waves: np.ndarray) -> np.ndarray:
+    """Power (window,) of coefficients (..., window), smoothed."""
+    power = np.square(np.atleast_2d(waves)).mean(0)
+    return np.maximum(uniform_filter1d(power, SMOOTH, mode="nearest"), 1e-300)
 
 
 def ring_waves(given: Scene, t: np.ndarray) -> np.ndarray:
@@ -248,10 +264,7 @@ def ring_waves(given: Scene, t: np.ndarray) -> np.ndarray:
 # grid and refined. Intervals from the scatter between trials (jackknife), which needs no noise model.
 
 DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
-LIGHTEST, HEAVIEST = (
-    1e-3,
-    0.25,
-)  # chosen: damping below which it is no ring, and beyond which a course is none
+LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: damping below or beyond which it is no ring
 FREQUENCIES = 80  # numerics: where searches start
 SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
 SHORTEST = 12  # numerics: samples of a window in which an oscillation is looked for

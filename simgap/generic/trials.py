@@ -264,20 +264,17 @@ def transformed(values: np.ndarray) -> np.ndarray:
 
 
 def windowed(
-    given: Layout, cut: Cut, channel: int, subtask: int, delay: int = 0, values: np.ndarray | None = None
+    given: Layout, cut: Cut, channel: int, subtask: int, values: np.ndarray | None = None
 ) -> np.ndarray:
-    """Samples (window,) of a channel from a subtask's start less `delay` samples on, or of `values` in its
-    stead. They never begin before the trial does."""
+    """Samples (window,) of a channel from a subtask's start on, or of `values` in its stead."""
     n, t = int(given.window[subtask]), cut.trial.t
     if values is None:
         values = cut.trial.channels[given.ensembles.channels[channel]]
     first = int(np.searchsorted(t, cut.edges[subtask] - 0.5 / given.rate))
-    delay = min(delay, first)
-    first -= delay
     inside = slice(first, first + n)
-    times = cut.edges[subtask] + (np.arange(n) - delay + 0.5) / given.rate
+    times = cut.edges[subtask] + (np.arange(n) + 0.5) / given.rate
     # Recorded samples as they are where they serve: between them noise would be smoothed.
-    if 0 <= first <= t.size - n and np.isfinite(values[inside]).all():
+    if first <= t.size - n and np.isfinite(values[inside]).all():
         off = (t[inside] - t[first]) * given.rate - np.arange(n)
         if np.abs(off).max() < 0.75:
             return values[inside]

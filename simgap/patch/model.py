@@ -1,25 +1,21 @@
-"""The virtual model of a corrected rig: trials, replays, and whether it predicts better."""
+"""The virtual model of a corrected rig: trials and replays."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.align import segment
 from simgap.effects import effect_named
 from simgap.effects.base import KINEMATICS, Performance
 from simgap.gap.twins import carried, recorded, scene_of
 from simgap.gap.twins import performed as perform
 from simgap.world.operator import OperatorSettings
-from simgap.world.properties import Blocks, read_properties
+from simgap.world.properties import Blocks
 from simgap.world.replay import Replay, replay
 from simgap.world.simulate import SimulatedTrial
 
@@ -49,7 +45,7 @@ def replayed(
     found = replay(moved, task, hand, blocks, boundaries=boundaries, surroundings=around)
     n, force = len(found.t), found.motion.force
     truth = Performance(
-        found.t, found.tips, np.gradient(found.tips, found.t, axis=0), force.reshape(n, 2, 2),
+        found.t, found.motion.position, found.motion.velocity, force.reshape(n, 2, 2),
         np.asarray(boundaries, float), rig, *carried(found.t, boundaries, task, blocks),
     )  # fmt: skip
     rng = np.random.default_rng(0)
@@ -62,36 +58,3 @@ def replayed(
         if effect.finish is not None:
             force = effect.finish(force, dict(rig.effects[effect.name]))
     return replace(found, force=force.reshape(-1, 2, 2))
-
-
-def reproduced(
-    written: Mapping[str, str], body: Mapping[str, Any], trials: Sequence[Trial], task: BlockTask, rig: Rig
-) -> tuple[float, float]:
-    """Root mean square [N] of recorded minus predicted forces, by the nominal and by the corrected model.
-
-    Both are driven by the trials' motions; `written` are the files of `simgap.patch.files` for the diagnosis
-    `body`, `rig` the nominal one. Trials that do not fit their task are left out; nan where none is left.
-    """
-    with tempfile.TemporaryDirectory(prefix="hmmseg-") as place:
-        for name, text in written.items():
-            (Path(place) / name).write_text(text, encoding="utf-8")
-        patched = read_rig(Path(place) / "rig.toml")
-        after = read_properties(Path(place) / "actual.toml", task)
-    shift = body["effects"]["+".join(body["causes"])]["property_shift"]
-    before = {n: replace(b, **_before(n, shift)) for n, b in after.items()}
-    squares: list[tuple[float, float]] = []
-    for trial, spans in zip(trials, segment(trials, task, rig), strict=True):
-        if spans.failed is None:
-            ends = [s.start for s in spans.spans[1:]]
-            both = (replayed(trial, task, *model, ends) for model in ((rig, before), (patched, after)))
-            nominal, corrected = (float(np.nanmean(r.residual**2)) for r in both)
-            squares.append((nominal, corrected))
-    if not squares:
-        return float("nan"), float("nan")
-    nominal, corrected = np.sqrt(np.mean(squares, axis=0))
-    return float(nominal), float(corrected)
-
-
-def _before(name: str, shift: Mapping[str, Any]) -> dict[str, float]:
-    """A block's properties as they were without the causes."""
-    return {k.partition(".")[2]: v["before"] for k, v in shift.items() if k.startswith(f"{name}.")}

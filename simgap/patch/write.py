@@ -74,7 +74,7 @@ def _correct(document: tomlkit.TOMLDocument, effect: str, found: Mapping[str, An
     places = known.patched(document, found) if known is not None and known.patched is not None else None
     if places is not None:
         return places
-    if known is None or not (known.apply or known.scene or known.finish):
+    if known is None or not known.simulated:
         document.add(tomlkit.comment(f"{effect}: found, but nothing that `hmmseg simulate` can put in"))
         return {}
     effects = table(document, "effects")
@@ -113,8 +113,8 @@ def checked(effects: Mapping[str, Mapping[str, float]], where: str) -> None:
     """InputError where [effects] of a rig names what the virtual model cannot apply."""
     for name, values in effects.items():
         known = catalogue().get(name)
-        if known is None or not (known.apply or known.scene or known.finish):
-            can = sorted(n for n, e in catalogue().items() if e.apply or e.scene or e.finish)
+        if known is None or not known.simulated:
+            can = sorted(n for n, e in catalogue().items() if e.simulated)
             raise InputError(
                 f"{where}: key effects.{name}", "no effect that can be simulated", ", ".join(can)
             )

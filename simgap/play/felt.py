@@ -10,14 +10,14 @@ import numpy as np
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
 from simgap.effects import catalogue
-from simgap.effects.base import Effect, Performance
+from simgap.effects.base import HandEffect, Performance
 from simgap.world.properties import Block, Blocks
 from simgap.world.virtual_model import Surroundings, finite_stiffness
 
 OFTEN = 3.0  # look: prior standard deviations of a sensor's effect: strong enough to be seen
 
 
-def felt_effects() -> dict[str, Effect]:
+def felt_effects() -> dict[str, HandEffect]:
     """Effects that a played world can have."""
     return {
         name: effect for name, effect in catalogue().items()
@@ -35,9 +35,9 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
     if name not in known:
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
     parameters, forms = known[name].parameters, known[name].forms
-    nothing = {p.name: p.neutral if p.log or p.shape else 0.0 for p in parameters}
+    nothing = {n: p.nominal if p.log or p.shape else 0.0 for n, p in parameters.items()}
     first = forms[0] if forms else tuple(nothing)  # forms overlap: a gain of a finger and that of both
-    strong = {p.name: OFTEN * p.sd for p in parameters if p.name in first and not (p.log or p.shape)}
+    strong = {n: OFTEN * p.sd for n, p in parameters.items() if n in first and not (p.log or p.shape)}
     usual = known[name].played or nothing | ({} if given else strong)
     return dict(usual) | {key: float(value) for key, value in (given or {}).items() if np.isfinite(value)}
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
 
 if TYPE_CHECKING:
-    from simgap.effects.base import Effect
+    from simgap.effects.base import HandEffect
 
 
 def plain_name(
@@ -54,6 +54,7 @@ PARTS = {
     "actuator.gain": ("strength", "Command a known torque of {0}, or hold a known weight, and measure."),
     "actuator.damping": ("velocity gain", "Look up the velocity gain in the drive of {0}."),
     "actuator.limit": ("largest force", "Look up the current limit in the drive of {0}."),
+    "actuator.fade": ("a drive that falls behind", "Load {0} up to its most and measure its torque."),
     "gravity.direction": ("a base that is tilted", "Put a level on the robot's base."),
 }
 
@@ -71,7 +72,7 @@ def _part(name: str) -> tuple[str, str] | None:
     return f"{where}: {called}", check.format(where)
 
 
-def _words(name: str) -> tuple[str, str, Effect | None]:
+def _words(name: str) -> tuple[str, str, HandEffect | None]:
     """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
     from simgap.robot_effects import words
 
@@ -146,7 +147,8 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
         if len(own) == 1 and _part(cause) is not None and own[0]["unit"] not in ("", "1"):
             shown, nominal = shown_as(own[0]["unit"]), own[0]["nominal"]
             value = estimate(own[0]["mean"], 0.0, shown)
-            text += f" {value} (model: {plain(shown[0] * nominal) if nominal else 0})"
+            before = "before" if "changes" in body else "model"
+            text += f" {value} ({before}: {plain(shown[0] * nominal) if nominal else 0})"
         texts.append(text)
     return " and ".join(texts)
 
@@ -154,6 +156,8 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The verdict in a line."""
     verdict = body["verdict"]
+    if "changes" in body and verdict in ("none", "unknown"):
+        return "Nothing changed" if verdict == "none" else "A change that no known cause explains"
     if verdict == "none":
         return "No gap that matters" if body.get("small_gap") else "No gap"
     if verdict == "unknown":
@@ -168,6 +172,8 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 def sentences(body: Body) -> list[str]:
     """What was found, how sure, and how far it goes, for an engineer who must act."""
     verdict, p, small = body["verdict"], p_text(body["detection"]["p_value"]), body.get("small_gap")
+    if "changes" in body:
+        return changed(body)
     if verdict == "none" and small:
         size = ""
         if small.get("size") is not None:
@@ -176,9 +182,7 @@ def sentences(body: Body) -> list[str]:
     if verdict == "none":
         return [f"The model reproduces the recording to within the sensors' noise ({p})."]
     if verdict == "unknown":
-        text = (
-            f"Recording and model differ beyond noise ({p}); no known cause explains the larger part of it."
-        )
+        text = f"Recording and model differ beyond noise ({p}); no known cause explains the larger part."
         return [text, *doubted(body), *moving(body)]
     chance = probability(body)
     out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
@@ -191,6 +195,22 @@ def sentences(body: Body) -> list[str]:
             for cause, others in instead.items()
         ]
     out += [t for t in (explained(body), shrunk(body)) if t]
+    return out
+
+
+def changed(body: Body) -> list[str]:
+    """What two sets of logs tell of a robot that may have changed between them."""
+    if body["verdict"] == "none":
+        return ["Nothing that these logs can tell: the new ones are met as the old ones are."]
+    if body["verdict"] == "unknown":
+        over = body["remainder"]["rms_over_noise"]
+        best = [f"The best that is known, {text}, leaves too much." for text in body["changes"]]
+        return [f"New logs are missed by {over:.2g} times what old ones are.", *best]
+    p = p_text(body["detection"]["p_value"])
+    out = [f"Changed: {'; '.join(body['changes'])} ({p} that nothing did)."]
+    if body["verdict"] == "set":
+        others = ", ".join(body["indistinguishable"]) or "the same in other parts"
+        out.append(f"These logs cannot tell it from a change of {others}.")
     return out
 
 
@@ -226,9 +246,8 @@ def explained(body: Body) -> str:
     if len(known) == 1:
         own = known[0][1]
         ends = between(*(own.get("interval_90") or (None, None)))
-        return f"It explains {percent(own['share'])} of the gap" + (
-            f" (90 % interval {ends})." if ends else "."
-        )
+        sure = f" (90 % interval {ends})" if ends else ""
+        return f"It explains {percent(own['share'])} of the gap{sure}."
     shares = ", ".join(f"{plain_name(n)} explains {percent(a['share'])}" for n, a in known)
     return f"Of the gap, {shares}."
 
@@ -247,14 +266,12 @@ def shrunk(body: Body) -> str:
 def remains(body: Body) -> list[str]:
     """What no cause explains, in words."""
     rest = body.get("remainder")
-    if not rest or rest.get("share") is None or body["verdict"] == "none":
+    if not rest or rest.get("share") is None or body["verdict"] == "none" or "changes" in body:
         return []
     noise = rest.get("rms_over_noise")
     size = f" All that is left is {plain(noise)} times the noise." if noise else ""
     if body["verdict"] == "unknown":
-        return [
-            f"{percent(rest['share'])} of the gap is left when every likely cause has had its part.{size}"
-        ]
+        return [f"{percent(rest['share'])} of the gap is left after every likely cause.{size}"]
     p = rest.get("p_value")
     sure = "" if p is None else f" ({p_text(p)})"
     if rest["share"] < 0.01 and not _noise(rest):
@@ -385,13 +402,7 @@ def tables(body: Mapping[str, Any]) -> list[Table]:
             cells.add_column(head, no_wrap=True)
         for row in body["where"][:8]:
             low, high = row["band"]
-            cells.add_row(
-                row["trial"],
-                row["channel"],
-                row["subtask"],
-                f"{low:g}-{high:g}",
-                f"{100 * row['share']:.0f} %",
-                f"{row['z']:.1f}",
-            )
+            numbers = f"{low:g}-{high:g}", f"{100 * row['share']:.0f} %", f"{row['z']:.1f}"
+            cells.add_row(row["trial"], row["channel"], row["subtask"], *numbers)
         out.append(cells)
     return out

@@ -54,10 +54,13 @@ def of_the_model(setting: Setting) -> list[RobotEffect]:
 WIDE = 30.0
 # prior: by unit, factors on what a model states that no robot is off by: beyond is no value at all
 MOST = {"kg": 3.0, "kg m^2": 10.0}
-UNMEASURED = (  # of a model, whatever it states of them
+# What models state and nobody measured, and what they lack, which is fitted where the former leaves a gap.
+STATED = (
     "joint:*.damping", "joint:*.frictionloss", "joint:*.armature", "actuator:*.gain", "actuator:*.damping",
     "geom:*.stiffness", "command.delay",
 )  # fmt: skip
+LACKING = ("joint:*.load_friction", "actuator:*.fade")
+UNMEASURED = (*STATED, *LACKING)
 
 
 def effects_of(
@@ -101,9 +104,11 @@ def doubted(
     for name, effect in effects.items():
         if any(fnmatchcase(name, p) for p in patterns) and not effect.fitted:
             wide = WIDE if effect.model else 1.0
-            effect = replace(effect, fitted=True, parameters=_sized(effect, wide, None))
+            effect = replace(effect, fitted=True, widened=wide, parameters=_sized(effect, wide, None))
         stated = sds.get(name)
-        out[name] = effect if stated is None else replace(effect, parameters=_sized(effect, 1.0, stated))
+        out[name] = (
+            effect if stated is None else replace(effect, widened=0.0, parameters=_sized(effect, 1.0, stated))
+        )
     return out
 
 

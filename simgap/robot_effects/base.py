@@ -11,37 +11,36 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from simgap.simulators.protocol import Channels, Parameter, Simulator
+from simgap.channels import Act, ChannelEffect, Theta
+from simgap.effect import Effect, Parameter
+from simgap.simulators.protocol import Channels, Simulator
 from simgap.simulators.recording import Recording
 
-Theta = Mapping[str, float]  # an effect's own parameters by short name
-Read = Callable[[np.ndarray, np.ndarray, Theta], np.ndarray]  # (times since the log's start, values, theta)
 Command = Callable[[Recording, Theta], Recording]
 Alter = Callable[[Recording, Channels, Theta], Channels]  # (window, channels as read so far, theta)
 
 
 @dataclass(frozen=True)
-class RobotEffect:
+class RobotEffect(Effect):
     """One candidate. `parameters` by short name, neutral at their nominal; it reads, commands or models.
 
     `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
     `alter` gives several channels or such as depend on others, `restore` undoes it on a whole log. `command`
     maps a whole recording to one whose commands are as the drives took them. `model` maps short names to the
-    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself; `by_log`:
-    each log has its own parameters, which no other log tells.
+    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself; `widened`:
+    how many usual sizes its parameters' sd are, where that is of what a model states and nobody measured;
+    `by_log`: each log has its own parameters, which no other log tells.
     """
 
-    name: str
-    says: str
-    parameters: Mapping[str, Parameter]
     channel: str = ""
-    read: Read | None = None
-    undo: Read | None = None
+    read: Act | None = None
+    undo: Act | None = None
     alter: Alter | None = None
     restore: Command | None = None
     command: Command | None = None
     model: Mapping[str, str] = field(default_factory=dict)
     fitted: bool = False
+    widened: float = 0.0
     by_log: bool = False
 
     @property
@@ -53,10 +52,6 @@ class RobotEffect:
     def reads(self) -> bool:
         """Whether it acts on read-outs alone and needs no rollout."""
         return self.read is not None or self.alter is not None
-
-    def neutral(self) -> dict[str, float]:
-        """Values at which nothing is changed."""
-        return {name: p.nominal for name, p in self.parameters.items()}
 
 
 @dataclass(frozen=True)
@@ -89,9 +84,10 @@ class Setting:
         posed = {c for columns in self.poses().values() for c in columns.values()}
         return [n for n in self.compared() if n not in posed]
 
-    def usual(self, channel: str, share: float, low: float = -np.inf) -> Parameter:
-        """A parameter in a channel's unit: nominally 0, usually this share of the channel's `sd`."""
-        return Parameter(0.0, share * self.sd(channel), self.simulator.channels[channel].unit, low=low)
+    def sized(self, effect: ChannelEffect, channel: str) -> dict[str, Parameter]:
+        """An effect's parameters in a channel's unit, shares taken of the channel's `sd`."""
+        longest = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
+        return effect.sized(self.sd(channel), self.simulator.channels[channel].unit, longest)
 
     def sd(self, channel: str) -> float:
         """Standard deviation of a channel over all recordings [its unit]; 1 where it is constant."""

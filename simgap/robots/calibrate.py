@@ -2,20 +2,23 @@
 
 Windows that are begun anew lead near, from wherever a data sheet starts; logs run from their first state to
 their last, as people judge a model, settle it. Squares are of each channel in units of what is left of it, by
-Levenberg and Marquardt within bounds. Which parameters the logs tell, and which only together, is read off
-the sensitivities there.
+Levenberg and Marquardt within bounds. What a model states is moved first; where that leaves a gap, so is what
+it lacks: friction by load, drives that fade. Which parameters the logs tell, and which only together, is read
+off the sensitivities there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
 from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
+from simgap.robot_effects import LACKING
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import FINEST, Whiten, moved_to
 from simgap.robots.heldout import folds_of
@@ -31,6 +34,7 @@ STAGES = 4  # look: what a progress bar counts
 LONGEST = 20.0  # numerics: s that a log is run freely
 STEPS, AGAIN = 30, 4  # numerics: of the fit, and of one that begins where it ended
 ROUNDS = 2  # numerics: fits, each in units of what the last one left
+LEAVES = 4.0  # numerics: squares over the noise's, from which laws that a model lacks are fitted too
 UNTOLD = 0.5  # chosen: of a prior's sd; a parameter of which logs leave more is not told by them
 NOTHING = 0.05  # numerics: a correlation that is none
 COUPLED = 0.05  # numerics: of a direction that is not told, what a parameter must have in it to be of it
@@ -190,17 +194,21 @@ def calibrate(
     tell("windows")
     windows = Composed.of(simulator, recordings, mine, noise, LENGTH if length is None else length)
     linear = linearise(windows, point, [])
-    near = moved_to(windows, linear, covariances(windows, linear).whitener(), point, steps=STEPS).point
+    stated = [n for n in mine if not any(fnmatchcase(n, p) for p in LACKING)]
+    whiten = covariances(windows, linear).whitener()
+    near = moved_to(windows, linear, whiten, point, stated, STEPS).point
     tell("whole logs")
     whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
     begin = min((near, point), key=lambda p: _cost(whole, p))
     if not np.isfinite(_cost(whole, begin)):  # nothing follows a whole log freely: windows are all there is
         whole, begin = windows, near
-    found, linear, whiten = _least_squares(whole.moved(begin), begin, STEPS)
+    found, linear, whiten = _least_squares(whole.moved(begin), {n: begin[n] for n in stated}, STEPS)
+    if _over_noise(linear) > LEAVES and len(stated) < len(mine):
+        found, linear, whiten = _least_squares(whole.moved(found), {**point, **found}, STEPS)
     tell("what the logs tell")
     names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten)
     tell("held-out logs")
-    before, after = _held_out(whole.moved(found), point, found) if judged else ({}, {})
+    before, after = _held_out(whole.moved(found), found) if judged else ({}, {})
     return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
 
 
@@ -239,6 +247,11 @@ def _repeated(parts: Sequence[np.ndarray]) -> float:
             break
         out += 2 * rho
     return out
+
+
+def _over_noise(linear: Linear) -> float:
+    """Mean square of what is left, over the noise's."""
+    return float(np.mean(np.nan_to_num(linear.residual) ** 2 / linear.rows.variance))
 
 
 def _cost(composed: Composed, point: Point) -> float:
@@ -307,9 +320,9 @@ def _told(
     return names, sd, information, np.linalg.inv(information + np.eye(sd.size)) * np.outer(sd, sd)
 
 
-def _held_out(composed: Composed, nominal: Point, found: Point) -> tuple[dict[str, float], dict[str, float]]:
-    """Root mean squares by channel of free runs along logs that a fit did not see."""
-    rows = composed.rows
+def _held_out(composed: Composed, found: Point) -> tuple[dict[str, float], dict[str, float]]:
+    """Root mean squares by channel of free runs along logs that a fit did not see, before and after."""
+    rows, nominal = composed.rows, {n: composed.effects[n].neutral() for n in found}
     before = rows.observed - base_at(composed, nominal).rows
     after, fold = np.full(rows.log.size, np.nan), folds_of_logs(composed)
     for number in np.unique(fold):

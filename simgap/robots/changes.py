@@ -9,9 +9,15 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
 * *How large*: delta's variance is what leaving out OLD's motions one by one makes of it, and NEW's (the
   delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
   degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
-  how little theta is known.
-* *Whether*: a change is one where delta is that far from nothing, by Bonferroni over all candidates, and
-  where it predicts motions of NEW that took no part better than nothing does, by a paired t.
+  how little they tell of theta. Where the prior decides, motions agree and yet nothing is known: to it comes
+  what delta moves by when the prior's mean, one more observation, moves by its sd. And what a model gets
+  wrong alike in all motions shows in what a second small change would do to the first: to it comes how far
+  such pairs scatter, as Bayesian model averaging has it.
+* *Whether*: a change is one where delta is that far from nothing and which predicts motions of NEW that took
+  no part better than nothing does, by a share that matters. Where OLD made the same motions, what the model
+  gets wrong in them is known, and the nats gained must outweigh the number of candidates; a row counts as
+  many times less as rows depend on each other. Of other motions, and of a second change beyond a first, only
+  how gains scatter from motion to motion says what they are worth: a paired t.
 * *Which*: every explanation predicts each motion of NEW from OLD and NEW's others; one is ruled out where
   another predicts better from motion to motion, by a paired t.
 * *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
@@ -23,8 +29,8 @@ A change of what is positive is of its logarithm (a gain doubled: log 2), of all
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,8 +64,11 @@ from simgap.simulators.recording import Recording
 STAGES = 8  # look: what a progress bar counts
 LADDER = (-1.2, -0.6, -0.25, 0.25, 0.6, 1.2)  # numerics: changes to rank candidates by
 RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: from which one is fitted; a free swing has narrow valleys
-TRIED, PAIRED = 5, 2  # numerics: of single changes fitted exactly, and of those joined in pairs
+TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted exactly, of those joined in pairs, and with them
 CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
+MATTERS = (
+    0.1  # chosen: of what is missed of new logs, what a change must take to be more than a day's difference
+)
 RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
 UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
 
@@ -67,7 +76,8 @@ UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called 
 @dataclass(frozen=True)
 class Change:
     """One explanation: coordinates `x` (k,) of changed `effects`, by how much they change, standard
-    deviations `sd` (k,) with `freedom` (k,) degrees, `p_value` of no change, `left` (M,): how motions of NEW
+    deviations `sd` (k,) with `freedom` (k,) degrees, `p_value` of no change,
+    `left` (M,): how motions of NEW
     that took no part are missed [nats a row], and `theta` (p,): OLD's coordinates as NEW's logs have moved
     them."""
 
@@ -172,13 +182,16 @@ class Comparison:
             step = np.linalg.lstsq(total - before[number], rest - tug[number], rcond=None)[0]
             without = np.arange(len(self.old.units)) == number
             moved[1][number] = (self._without(z, of, mine, -1, step, without) - z)[p:]
-        sd, freedom = jackknife(moved)
+        pushed = np.sqrt(self.old.dependence * np.diag(self.old.prior))  # by a prior's mean one sd away
+        by_prior = np.linalg.solve(total, np.eye(p + k, p) * pushed)[p:] if k else np.zeros((0, p))
+        sd, freedom = jackknife(moved, np.sum(by_prior**2, 1))
         x = z[p:]
         p_value = 1.0
         if k:  # of an effect with several parameters the surest, of two effects the less sure
             each = 2 * student.sf(np.abs(x) / np.maximum(sd, 1e-12), freedom)
             own = [[of.names[m][0] == e for m in mine] for e in effects]
-            p_value = min(1.0, len(self.candidates) * float(max(each[m].min() * sum(m) for m in own)))
+            others = 1 if self.paired else len(self.candidates)
+            p_value = min(1.0, others * float(max(each[m].min() * sum(m) for m in own)))
         return Change(effects, x, sd, freedom, p_value, left, z[:p])
 
     def scanned(self, about: Change | None = None) -> dict[str, tuple[float, np.ndarray]]:
@@ -201,9 +214,27 @@ class Comparison:
 
     def excess(self, change: Change) -> np.ndarray:
         """By how much more each motion of NEW is missed (M,) than OLD's, the same one where OLD made all."""
-        same = np.isin(self.runs.units, self.old.units)
         mine = np.searchsorted(self.old.units, self.runs.units)
-        return change.left - (self.old.missed[mine] if same.all() else self.old.missed.mean())
+        return change.left - (self.old.missed[mine] if self.paired else self.old.missed.mean())
+
+    @property
+    def paired(self) -> bool:
+        """Whether OLD made all motions of NEW."""
+        return bool(np.isin(self.runs.units, self.old.units).all())
+
+    def nats(self, gains: np.ndarray) -> np.ndarray:
+        """What gains (M,) [nats a row] by motion are together (M,), as rows depend on each other."""
+        return gains * np.bincount(np.searchsorted(self.runs.units, self.runs.unit)) / self.old.dependence
+
+    def needed(self, change: Change, beyond: Change) -> bool:
+        """Whether an explanation is one that a simpler one cannot do without (see above)."""
+        gains = beyond.left - change.left
+        shares = gains / np.maximum(beyond.left, 1e-12)
+        if change.p_value >= CHANGED or shares.mean() < MATTERS:
+            return False
+        if self.paired and not beyond.effects:
+            return bool(self.nats(gains).sum() > np.log(len(self.candidates) / CHANGED))
+        return by_chance(shares) < CHANGED
 
     def searched(self) -> list[Change]:
         """Nothing, the most promising single changes, and pairs about the best of them."""
@@ -212,26 +243,45 @@ class Comparison:
         scan = self.scanned()
         names = sorted(scan, key=lambda n: scan[n][0])[:TRIED]
         singles = [self.fit((n,), [scan[n][1], *self._rungs(scan[n][1])]) for n in names]
-        best = sorted(singles, key=lambda c: c.left.mean())[:PAIRED]
-        if not best or not self.excess(best[0]).mean() > 0:  # no more is left than of old logs
+        fit = sorted(singles, key=lambda c: c.left.mean())
+        best = [c for c in fit if self.needed(c, nothing)][:PAIRED]
+        if not best:
             return [nothing, *singles]
         self.runs.scaled(WIDER[0] * self.old.scale)
         scan = self.scanned(best[0])
         pairs = {}
-        for name in sorted(scan, key=lambda n: scan[n][0])[:PAIRED]:
+        for name in sorted(scan, key=lambda n: scan[n][0])[:SECOND]:
             pairs[frozenset((best[0].effects[0], name))] = (best[0], name, scan[name][1])
         for one, two in itertools.combinations(best, 2):
             pairs.setdefault(frozenset((*one.effects, *two.effects)), (one, two.effects[0], two.x))
+        more = self.excess(best[0]).mean() > 0  # else no second change is sought, only what it would do
         both = [
-            self.fit((*one.effects, name), [np.concatenate([one.x, r]) for r in (x, *self._rungs(x))])
+            self.fit(
+                (*one.effects, name),
+                [np.concatenate([one.x, r]) for r in (x, *(self._rungs(x) if more else ()))],
+            )
             for one, name, x in pairs.values()
         ]
-        return [nothing, *singles, *both]
+        rivals = {n for c in singles if beaten(c, best[0]) > RIVAL for n in c.effects}
+        return [nothing, *(widened(c, both, rivals) for c in singles), *both]
 
 
-def jackknife(strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def widened(change: Change, pairs: Sequence[Change], rivals: Collection[str]) -> Change:
+    """With the variance by what else may be a little otherwise: a second effect, no rival of the first, moves
+    it, and counts as much as it cannot be ruled out."""
+    own, k = {*change.effects}, change.x.size
+    both = [c for c in pairs if own < {*c.effects} and not ({*c.effects} - own) & {*rivals}]
+    if not both:
+        return change
+    moved = np.array([(c.x[:k] if c.effects[0] in own else c.x[-k:]) - change.x for c in both])
+    weight = np.array([beaten(c, change) for c in both])
+    return replace(change, sd=np.sqrt(change.sd**2 + weight @ moved**2 / (1 + weight.sum())))
+
+
+def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviations (k,) and Welch's degrees of freedom of what was computed with one unit left out, by
-    stratum (M, k); nothing is known where a stratum of one is left without."""
+    stratum (M, k), and has a `known` variance (k,) besides; nothing is known where a stratum of one is left
+    without."""
     k = strata[0].shape[1]
     parts, freedom = [], []
     for left in strata:
@@ -239,7 +289,7 @@ def jackknife(strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         parts.append(np.full(k, np.inf) if m < 2 else (m - 1) / m * np.sum((left - left.mean(0)) ** 2, 0))
         freedom.append(max(m - 1, 1))
     each = np.maximum(np.array(parts), 1e-300)
-    total = each.sum(0)
+    total = each.sum(0) + known
     share = np.divide(each, total, out=np.ones_like(each), where=np.isfinite(total))
     return np.sqrt(total), 1 / np.sum(share**2 / np.array(freedom)[:, None], 0)
 
@@ -286,14 +336,16 @@ class Changes:
         gone = float(np.clip((before - after) / max(before - floor, 1e-9), 0, 1))
         fraction = gone if names else None
         explanations = {"+".join(sorted(c.effects)): c for c in (best, *self.others) if c.effects}
-        chances = self.probabilities
+        parts = [(n, c, sorted(c.effects)) for n, c in explanations.items()]
+        parts += [(n, best, [n]) for n in (names if len(names) > 1 else ()) if n not in explanations]
         effects = {
             name: {
-                "parameters": {n: v | {"nominal": v["old"]} for n, v in self.sizes(c).items()},
-                "log_evidence": float(np.sum(nothing.left - c.left)), "property_shift": {},
+                "parameters": self._parameters(c, of), "property_shift": {},
+                "log_evidence": float(np.sum(nothing.left - c.left)),
                 "heldout_score": float(np.mean(nothing.left - c.left)),
-            } for name, c in explanations.items()
+            } for name, c, of in parts
         }  # fmt: skip
+        chances = self.probabilities
         calibrated = {} if self.calibration is None else self.calibration.body()
         acting = {n: sum(p for e, p in chances.items() if n in e.split("+")) for n in (*names, *others)}
         p_none = min((c.p_value for c in (best, *self.others) if c.effects), default=1.0)
@@ -314,9 +366,35 @@ class Changes:
                 "evaluated_on": "held-out new motions", "before": before, "after": after,
                 "noise_floor": floor, "fraction": fraction, "interval_90": None, "flexible_ceiling": None},
             "stands_in": {n: others for n in names} if self.verdict == "set" else {},
-            "calibrated": calibrated.get("parameters", {}), "numerics": calibrated.get("numerics", {}),
-            "next_experiment": None,
+            "calibrated": calibrated or None,
+            "numerics": {n: {"before": v["nominal"], "after": v["mean"], "unit": v["unit"]}
+                         for n, v in calibrated.get("numerics", {}).items()},
+            "next_experiment": self._next_experiment([*names, *others]),
         }  # fmt: skip
+
+    def _parameters(self, change: Change, effects: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """Sizes by short name, or by effect and short name where there are several effects."""
+        known, out = self.sizes(change), {}
+        for name in effects:
+            shorts = self.composed.effects[name].parameters
+            for short in shorts:
+                size = known[name if len(shorts) == 1 else f"{name}.{short}"]
+                out[short if len(effects) == 1 else f"{name}.{short}"] = size | {"nominal": size["old"]}
+        return out
+
+    def _next_experiment(self, separates: Sequence[str]) -> dict[str, Any] | None:
+        """Of the motions run, the one by whose losses the best explanation and the closest other differ most;
+        None where that is less than a nat."""
+        if self.verdict != "set":
+            return None
+        count = np.bincount(np.searchsorted(self.runs.units, self.runs.unit)) / self.old.dependence
+        apart = min((np.abs(c.left - self.best.left) * count for c in self.others), key=np.sum)
+        unit = self.runs.units[int(apart.argmax())]
+        log = self.composed.recordings[int(self.runs.log[self.runs.unit == unit][0])].name
+        return {
+            "do": f"repeat the motion of {log}", "log": log, "separates": list(separates),
+            "expected_gain_nats": float(apart.max()),
+        } if apart.max() > 1 else None  # fmt: skip
 
     @property
     def over(self) -> float:
@@ -442,20 +520,16 @@ def _concluded(
     nothing, old = tried[0], found.old
     every = sorted(tried[1:], key=lambda c: c.left.mean())
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
-    changed = min((c.p_value for c in singles), default=1.0) < CHANGED
-    changed = changed and beaten(nothing, singles[0]) < CHANGED
-    best = singles[0] if changed else nothing
-    both = min((c.p_value for c in pairs), default=1.0) < CHANGED
-    if changed and both and beaten(best, pairs[0]) * len(pairs) < RIVAL:
-        best = pairs[0]
+    best = next((c for c in singles if found.needed(c, nothing)), nothing)
+    if best.effects and found.excess(best).mean() > 0:  # more is left than of old logs
+        best = next((c for c in pairs if found.needed(c, best)), best)
     others = [
         c
         for c in (singles if len(best.effects) == 1 else pairs)
         if c is not best and best.effects and beaten(c, best) > RIVAL
     ]
     excess = found.excess(best)
-    paired = np.isin(found.runs.units, old.units).all()
-    worse = by_chance(excess) if paired else _unlike(best.left, old.missed)
+    worse = by_chance(excess) if found.paired else _unlike(best.left, old.missed)
     verdict = "none" if not best.effects else "set" if others else "named"
     if worse < UNKNOWN and excess.mean() > (nothing.left - best.left).mean():
         verdict = "unknown"
@@ -466,23 +540,25 @@ def _concluded(
 
 
 def _unlike(new: np.ndarray, old: np.ndarray) -> float:
-    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t."""
+    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t of their
+    logarithms, as some motions are missed by far more than others."""
     if old.size < 2:
         return 0.5
-    sd = max(float(old.std(ddof=1)), 1e-12) * np.sqrt(1 / old.size + 1 / new.size)
-    return float(student.sf((new.mean() - old.mean()) / sd, old.size - 1))
+    a, b = np.log(np.maximum(new, 1e-12)), np.log(np.maximum(old, 1e-12))
+    sd = max(float(b.std(ddof=1)), 1e-12) * np.sqrt(1 / b.size + 1 / a.size)
+    return float(student.sf((a.mean() - b.mean()) / sd, b.size - 1))
 
 
 def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, float]:
     """A probability of nothing, of the unknown, and of every explanation. Of a p-value the odds of nothing
-    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations share
-    what is left as the paired tests have it."""
+    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations as simple
+    as the best share what is left as the paired tests have it."""
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)
         return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
 
-    changed = [c for c in tried if c.effects]
+    changed = [c for c in tried if c.effects and len(c.effects) == max(len(best.effects), 1)]
     none, unknown = odds(best.p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
     weight = {"+".join(sorted(c.effects)): beaten(c, best) for c in changed if c is not best}
     weight |= {"+".join(sorted(best.effects)): 1.0} if best.effects else {}

@@ -37,6 +37,7 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
         if found.next_log is None
         else {
             "do": f"repeat the motion of {found.next_log.log}",
+            "log": found.next_log.log,
             "separates": list(found.next_log.separates),
             "expected_gain_nats": found.next_log.gain,
         },

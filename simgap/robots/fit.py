@@ -9,12 +9,14 @@ import numpy as np
 
 from simgap.bounded import least
 from simgap.progress import say
+from simgap.robot_effects.base import RobotEffect
 from simgap.robots.linear import STEP, Base, Linear, base_at, vary
 from simgap.robots.model import Composed, Point
 
 Whiten = Callable[[np.ndarray], np.ndarray]  # rows (N,) or columns (N, k)
 STEPS = 8  # numerics: of a least-squares fit, at most
 HALVINGS = 5  # numerics: of a step that straight lines took too far
+FLAT = 1e-12  # numerics: of the usual bend, so that one that is none in some direction has a least
 SHORTEN, SHORTER = (
     0.1,
     10.0,
@@ -63,7 +65,7 @@ def moved_to(
         usual = np.diag(np.maximum(np.diag(bend), 1.0))
         for _ in range(HALVINGS):
             # About x, so that what is held at a bound stays exactly there.
-            move, _ = least(bend + damping * usual, pull, squares.low - x, squares.high - x)
+            move, _ = least(bend + (damping + FLAT) * usual, pull, squares.low - x, squares.high - x)
             there = squares.cost(x + move)
             if there < cost:
                 break
@@ -100,7 +102,7 @@ class _Squares:
         self.sd, self.nominal = np.array([p.sd for p in known]), np.array([p.nominal for p in known])
         self.low = (np.array([p.low for p in known]) - self.nominal) / self.sd
         self.high = (np.array([p.high for p in known]) - self.nominal) / self.sd
-        self.loose = np.array([effects[e].fitted for e, _ in self.names])
+        self.tails = np.array([_tails(effects[e]) for e, _ in self.names])
         for effect in self.free:
             if effect in self.linear.moved:
                 self._learn(effect, self.whiten(_finite(self.linear.moved[effect].jacobian)))
@@ -144,7 +146,7 @@ class _Squares:
         mine = np.isfinite(self.linear.residual)
         found = np.where(mine, self.linear.rows.observed - self.base(x).rows, 0.0)
         white = self.whiten(found) if np.isfinite(found).all() else np.full(found.size, np.inf)
-        return np.concatenate([white, _prior(x, self.loose)])
+        return np.concatenate([white, _prior(x, self.tails)])
 
     def cost(self, x: np.ndarray) -> float:
         """Half the squares [nats]."""
@@ -162,7 +164,7 @@ class _Squares:
                 white = self.whiten(_finite(moved.jacobian))
                 self._learn(effect, white)
             columns.append(white)
-        slope = np.where(self.loose, 1.0, _slope(x))
+        slope = _slope(x, self.tails)
         return np.concatenate([-np.concatenate(columns, 1) * self.sd, np.diag(slope)])
 
     def _learn(self, effect: str, white: np.ndarray) -> None:
@@ -183,20 +185,28 @@ def prior_cost(composed: Composed, point: Point) -> float:
     for effect, theta in point.items():
         known = composed.effects[effect]
         x = np.array([(v - known.parameters[p].nominal) / known.parameters[p].sd for p, v in theta.items()])
-        out += 0.5 * float(np.sum(_prior(x, np.full(x.size, known.fitted)) ** 2))
+        out += 0.5 * float(np.sum(_prior(x, np.full(x.size, _tails(known))) ** 2))
     return out
+
+
+def _tails(effect: RobotEffect) -> float:
+    """Over how many of its usual sizes an effect's `sd` reaches, if what is far from nominal is hardly less
+    likely the farther it is; 0 of a normal prior."""
+    return effect.widened if effect.widened else float(not effect.fitted)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, 0.0)
 
 
-def _prior(x: np.ndarray, loose: np.ndarray) -> np.ndarray:
-    """Half their squares are minus the log priors: Gauss, or log(1 + x^2)."""
-    return np.where(loose, x, np.sign(x) * np.sqrt(2 * np.log1p(x**2)))
+def _prior(x: np.ndarray, tails: np.ndarray) -> np.ndarray:
+    """Half their squares are minus the log priors: Gauss (of tails 0), or log(1 + (tails x)^2)."""
+    return np.where(tails > 0, np.sign(x) * np.sqrt(2 * np.log1p((tails * x) ** 2)), x)
 
 
-def _slope(x: np.ndarray) -> np.ndarray:
-    """Derivative of sign(x) sqrt(2 log(1 + x^2)), which is sqrt(2) at 0."""
-    root = np.sqrt(2 * np.log1p(x**2))
-    return np.where(root > 1e-6, 2 * np.abs(x) / (1 + x**2) / np.maximum(root, 1e-6), np.sqrt(2.0))
+def _slope(x: np.ndarray, tails: np.ndarray) -> np.ndarray:
+    """Derivative of `_prior`, of which that of sign(y) sqrt(2 log(1 + y^2)) is sqrt(2) at 0."""
+    y = tails * x
+    root = np.sqrt(2 * np.log1p(y**2))
+    heavy = np.where(root > 1e-6, 2 * np.abs(y) / (1 + y**2) / np.maximum(root, 1e-6), np.sqrt(2.0))
+    return np.where(tails > 0, tails * heavy, 1.0)

@@ -50,8 +50,7 @@ MANY = 80  # numerics: candidates of which all pairs are tried
 @dataclass(frozen=True)
 class Settled:
     """A set where it fits best: its point, the gap linear about it in its own effects, the discrepancy that
-    it leaves, its log evidence, and the log density (folds,) of each fold given the others; `composed`: with
-    what the simulator's own numbers do as it is there."""
+    it leaves, its log evidence; `composed`: with what the simulator's own numbers do as it is there."""
 
     composed: Composed
     names: Names
@@ -63,11 +62,6 @@ class Settled:
     whiten: Whitener
     sets: Sets
     score: float
-
-    @cached_property
-    def held_out(self) -> np.ndarray:
-        """Log density (folds,) of each fold given the others."""
-        return self.sets.held_out(self.names, 0)
 
     @cached_property
     def squares(self) -> np.ndarray:
@@ -90,6 +84,7 @@ class Search:
     columns: dict[str, Moved | None] = field(default_factory=dict)  # of candidates where a search began
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
+    _densities: dict = field(default_factory=dict, repr=False)
 
     @cached_property
     def along(self) -> Names:
@@ -352,13 +347,28 @@ class Search:
         good = [s for s in found if self._is_better(s, best)]
         return max(good, key=lambda s: s.score, default=None)
 
-    @staticmethod
-    def _is_better(one: Settled, best: Settled) -> bool:
+    def gains(self, one: Settled, other: Settled, by: Settled) -> np.ndarray:
+        """Log densities (folds,) of each fold given the others, of one set over those of another, both by the
+        noise and the discrepancy `by` which rows are whitened: how large the discrepancy is differs between
+        motions, so that a set which leaves a smaller one in some of them predicts the others no worse for
+        it."""
+        mine, theirs = (self._held_out(s, by.whiten) for s in (one, other))
+        return mine - theirs
+
+    def _held_out(self, one: Settled, whiten: Whitener) -> np.ndarray:
+        key = frozenset(one.names), id(one), id(whiten)
+        if key not in self._densities:
+            names = [n for n in one.names if n in one.linear.moved]
+            given = one.composed.effects, one.linear, [whiten], names, self.fold, self.log_odds
+            self._densities[key] = Sets.of(*given).held_out(one.names, 0)
+        return self._densities[key]
+
+    def _is_better(self, one: Settled, best: Settled) -> bool:
         """Whether to go on from a set: likelier, and so by logs that took no part, unless it only does
         without."""
         if one.score <= best.score + BETTER:
             return False
-        return {*one.names} < {*best.names} or chance(one.held_out - best.held_out) < BORNE_OUT
+        return {*one.names} < {*best.names} or chance(self.gains(one, best, best)) < BORNE_OUT
 
     def _apart(self, names: Names, point: dict) -> Names:
         """The set with pairs taken apart, and its point likewise, in place."""

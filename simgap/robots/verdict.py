@@ -144,7 +144,7 @@ def _alternatives(search: Search, best: Settled) -> list[Settled]:
             continue
         alike = one.score > best.score - np.log(RULED_OUT)
         if best.discrepancy and one.names and one.squares.sum() < most:
-            alike = alike or chance(best.held_out - one.held_out) >= BORNE_OUT
+            alike = alike or chance(search.gains(best, one, best)) >= BORNE_OUT
         if alike:
             out.append(one)
     return out

@@ -13,6 +13,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from simgap.effect import Parameter
 from simgap.simulators.recording import Recording
 
 KINDS = ("position", "velocity", "force", "torque", "command")
@@ -20,29 +21,6 @@ RATE = "_rate"  # a position channel's rate in `start` is its name with this beh
 
 Values = Mapping[str, float]  # parameter or state name -> value
 Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter: `nominal` value, prior standard deviation `sd` about it, `unit`, bounds `low`, `high`.
-
-    Parameters of the same `effect` act as one candidate cause; without one, a parameter is its own. What is
-    `fitted` was never measured (a friction, say): it is fitted along with every cause and is none itself.
-    """
-
-    nominal: float
-    sd: float
-    unit: str = "1"
-    low: float = -math.inf
-    high: float = math.inf
-    effect: str | None = None
-    fitted: bool = False
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.nominal) and math.isfinite(self.sd) and self.sd > 0):
-            raise ValueError(f"nominal {self.nominal} and sd {self.sd}: expected finite, sd above 0")
-        if not self.low <= self.nominal <= self.high:
-            raise ValueError(f"nominal {self.nominal} lies outside of its bounds {self.low} to {self.high}")
 
 
 @dataclass(frozen=True)

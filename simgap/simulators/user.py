@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from simgap.simulators.protocol import Channel, Channels, Job, Parameter, Simulator, Values, finite
+from simgap.effect import STATED, Parameter
+from simgap.simulators.protocol import Channel, Channels, Job, Simulator, Values, finite
 from simgap.simulators.recording import Recording
 
 PATIENCE = 300.0  # limit: s that one call may take, unless the simulator states a `timeout` of its own
@@ -289,7 +290,7 @@ def _made(kind: type, value: Any, where: str) -> Any:
         return value
     if not isinstance(value, Mapping):
         raise InputError(where, f"is {type(value).__name__}", f"a {kind.__name__} or a dict")
-    known = [f.name for f in fields(kind)]
+    known = STATED if kind is Parameter else [f.name for f in fields(kind)]
     for key in value:
         if key not in known:
             raise InputError(f"{where}: {key}", "unknown key", nearest(str(key), known))

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.animation import FFMpegWriter, PillowWriter
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from PIL import Image
 
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import inverse
@@ -24,7 +21,7 @@ from simgap.world.properties import Block
 FRAMES = 15.0  # look: a second, in real time
 SIZE, DPI = (9.0, 3.8), 90  # look: in
 PAD = (0.003, 0.008)  # numerics: m, drawn width and height of a fingertip
-SUFFIXES = (".gif", ".mp4")
+WRITERS = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
 
 @dataclass(frozen=True)
@@ -48,63 +45,39 @@ class Scene:
 
 def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
     """Write the animation to `path`, in real time; InputError for another suffix or a lacking ffmpeg."""
-    frames = _frames(scene, traces)
-    if path.suffix == ".gif":
-        first, *rest = (Image.fromarray(frame).quantize(64) for frame in frames)
-        first.save(path, save_all=True, append_images=rest, duration=round(1000 / FRAMES), loop=0)
-    elif path.suffix == ".mp4":
-        _write_mp4(path, frames)
-    else:
-        raise InputError(str(path), f"unknown kind of animation {path.suffix!r}", " or ".join(SUFFIXES))
-
-
-def require_encoder(suffix: str) -> None:
-    """InputError where an animation of this suffix cannot be written here."""
-    if suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise InputError("--animation mp4", "the program ffmpeg is not installed", "gif, or ffmpeg")
-
-
-def _write_mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
-    require_encoder(".mp4")
-    first = next(frames)
-    height, width = (n // 2 * 2 for n in first.shape[:2])  # the codec wants even numbers
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(FRAMES), "-i", "-"]
-    command = ["ffmpeg", "-y", "-loglevel", "error", *source, "-pix_fmt", "yuv420p", str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as encoder:
-        assert encoder.stdin is not None
-        for frame in (first, *frames):
-            encoder.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
-    if encoder.returncode:
-        raise OSError(f"ffmpeg ended with exit code {encoder.returncode}")
-
-
-def _frames(scene: Scene, traces: Sequence[Trace]) -> Iterator[np.ndarray]:
-    """Pictures (height, width, 3) in bytes, FRAMES a second."""
+    if path.suffix not in WRITERS:
+        raise InputError(str(path), f"unknown kind of animation {path.suffix!r}", " or ".join(WRITERS))
+    require_encoder(path.suffix)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
+        figure = Figure(figsize=SIZE, layout="constrained")
         stage, *panels = figure.subplot_mosaic(
             [["scene", str(k)] for k in range(len(traces))], width_ratios=(1.0, 1.0)
         ).values()
         bodies, pads, links = _draw_scene(stage, scene)
         clock = stage.text(0.02, 0.97, "", transform=stage.transAxes, va="top")
         cursors = _draw_traces(panels, scene, traces)
-        joints = _joints(scene)
-        for k in _chosen(scene.t):
-            for body, centre in zip(bodies, scene.centres[k], strict=True):
-                body.set_xy((100 * centre[0] - body.get_width() / 2, 100 * centre[1] - body.get_height() / 2))
-            for finger, pad in enumerate(pads):
-                x, y = 100 * scene.tips[k, finger]
-                pad.set_xy((x - (100 * PAD[0] if finger == 0 else 0.0), y - 50 * PAD[1]))
-            for line, chain in zip(links, joints, strict=True):
-                line.set_data(*(100 * chain[k].T))
-            clock.set_text(f"{scene.t[k]:.1f} s")
-            for cursor in cursors:
-                cursor.set_xdata([scene.t[k]] * 2)
-            canvas.draw()
-            if figure.get_layout_engine() is not None:
-                figure.set_layout_engine("none")  # laid out once; the rest only moves
-            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        joints, writer = _joints(scene), WRITERS[path.suffix](fps=FRAMES)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once; the rest only moves
+        with writer.saving(figure, str(path), DPI):
+            for k in _chosen(scene.t):
+                for body, (x, y) in zip(bodies, 100 * scene.centres[k], strict=True):
+                    body.set_xy((x - body.get_width() / 2, y - body.get_height() / 2))
+                for finger, pad in enumerate(pads):
+                    x, y = 100 * scene.tips[k, finger]
+                    pad.set_xy((x - (100 * PAD[0] if finger == 0 else 0.0), y - 50 * PAD[1]))
+                for line, chain in zip(links, joints, strict=True):
+                    line.set_data(*(100 * chain[k].T))
+                clock.set_text(f"{scene.t[k]:.1f} s")
+                for cursor in cursors:
+                    cursor.set_xdata([scene.t[k]] * 2)
+                writer.grab_frame()
+
+
+def require_encoder(suffix: str) -> None:
+    """InputError where an animation of this suffix cannot be written here."""
+    if suffix == ".mp4" and not FFMpegWriter.isAvailable():
+        raise InputError("--animation mp4", "the program ffmpeg is not installed", "gif, or ffmpeg")
 
 
 def _chosen(t: np.ndarray) -> np.ndarray:

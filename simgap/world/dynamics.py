@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -123,6 +123,50 @@ class Loads(NamedTuple):
     support: Scalars
 
 
+Values = Any  # a jax Array in compiled code, a NumPy array after it
+
+
+class Record(NamedTuple):
+    """What happened, one row per control period; F fingers (2), B blocks.
+
+    Tips: `position`, `velocity`, `force` (T, F, 2) [m, m/s, N] with x and y last. `blocks` and
+    `block_velocity` (T, B, 2) [m, m/s]. `pads` (T, F, B): normal forces [N]. `support` (T, B):
+    force from beneath [N].
+    """
+
+    position: Values
+    velocity: Values
+    force: Values
+    blocks: Values
+    block_velocity: Values
+    pads: Values
+    support: Values
+
+
+def tips_of(row: Array) -> Tips:
+    """Tips from a row of x1, y1, x2, y2 and their velocities."""
+    x1, y1, x2, y2, vx1, vy1, vx2, vy2 = (row[k] for k in range(8))
+    return Tips((x1, x2), (y1, y2), (vx1, vx2), (vy1, vy2))
+
+
+def row_of(state: State, tips: Tips, loads: Loads) -> Array:
+    """Everything recorded, in the order in which `record_of` takes it apart."""
+    parts = [tips.x, tips.y, tips.vx, tips.vy, loads.fx, loads.fy, state.x, state.y, state.vx, state.vy,
+             *loads.pads, loads.support]  # fmt: skip
+    return jnp.stack([value for part in parts for value in part])
+
+
+def record_of(rows: Array, num_blocks: int) -> Record:
+    """Rows of `row_of` taken apart."""
+
+    def pair(start: int, width: int) -> Array:
+        return jnp.stack([rows[:, start : start + width], rows[:, start + width : start + 2 * width]], -1)
+
+    n, b = num_blocks, 12
+    return Record(pair(0, 2), pair(4, 2), pair(8, 2), pair(b, n), pair(b + 2 * n, n),
+                  rows[:, b + 4 * n : b + 6 * n].reshape(-1, 2, n), rows[:, b + 6 * n :])  # fmt: skip
+
+
 def pairs(num_blocks: int) -> tuple[tuple[int, int], ...]:
     """All pairs of blocks, in the order of `State.pairs`."""
     return tuple(itertools.combinations(range(num_blocks), 2))
@@ -177,10 +221,16 @@ def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
                          (tuple(normals[0]), tuple(normals[1])), tuple(support))  # fmt: skip
 
 
-def drift(state: State, h: Scalar) -> State:
+Moving = TypeVar("Moving", State, Tips)
+
+
+def drift(moving: Moving, h: Scalar) -> Moving:
     """Positions moved on by h [s] at constant velocity."""
-    return state._replace(x=tuple(a + h * v for a, v in zip(state.x, state.vx, strict=True)),
-                          y=tuple(a + h * v for a, v in zip(state.y, state.vy, strict=True)))  # fmt: skip
+    x, y = (
+        tuple(a + h * v for a, v in zip(at, speed, strict=True))
+        for at, speed in ((moving.x, moving.vx), (moving.y, moving.vy))
+    )
+    return moving._replace(x=x, y=y)
 
 
 def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
@@ -311,7 +361,6 @@ def _damping(physics: Physics, weight: Scalar) -> Scalar:
 # control: Hogan, J. Dyn. Sys. Meas. Control 107, 1985) and held back by the contact forces, so
 # that grip and pressing come from commanding positions beyond the contact.
 
-Values = Any  # a jax Array in compiled code, a NumPy array after it
 CONTROL_PERIOD = 1e-3  # numerics: s; commands and records are this far apart
 BUCKET = 4000  # numerics: control periods; commands are padded to multiples, so that few programs are made
 
@@ -324,23 +373,6 @@ class Impedance(NamedTuple):
     damping: Scalar
 
 
-class Record(NamedTuple):
-    """What happened, one row per control period; F fingers (2), B blocks.
-
-    Tips: `position`, `velocity`, `force` (T, F, 2) [m, m/s, N] with x and y last. `blocks` and
-    `block_velocity` (T, B, 2) [m, m/s]. `pads` (T, F, B): normal forces [N]. `support` (T, B):
-    force from beneath [N].
-    """
-
-    position: Values
-    velocity: Values
-    force: Values
-    blocks: Values
-    block_velocity: Values
-    pads: Values
-    support: Values
-
-
 @partial(jax.jit, static_argnames=("substeps",))
 def perform(physics: Physics, hand: Impedance, command: Array, state: State, substeps: int) -> Record:
     """Record of a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period.
@@ -349,36 +381,25 @@ def perform(physics: Physics, hand: Impedance, command: Array, state: State, sub
     """
     h = CONTROL_PERIOD / substeps
     slope = jnp.diff(command, axis=0, append=command[-1:]) / CONTROL_PERIOD
-    start = _tips(command[0], jnp.zeros(4))
+    start = tips_of(jnp.concatenate([command[0], jnp.zeros(4)]))
 
     def period(carry: tuple[State, Tips], row: Array) -> tuple[tuple[State, Tips], Array]:
         state, tips = carry
         _, loads = interact(physics, state, tips)
-        out = _row(state, tips, loads)
+        out = row_of(state, tips, loads)
 
         def one(k: Array, carry: tuple[State, Tips]) -> tuple[State, Tips]:
             state, tips = carry
-            target = _tips(row[:4] + row[4:] * ((k + 0.5) * h), row[4:])
-            tips = _move(tips, h / 2)
+            target = tips_of(jnp.concatenate([row[:4] + row[4:] * ((k + 0.5) * h), row[4:]]))
+            tips = drift(tips, h / 2)
             state, loads = interact(physics, drift(state, h / 2), tips)
-            tips = _move(_pull(hand, tips, target, loads, h), h / 2)
+            tips = drift(_pull(hand, tips, target, loads, h), h / 2)
             return drift(kick(physics, state, loads, h), h / 2), tips
 
         return jax.lax.fori_loop(0, substeps, one, carry), out
 
     _, rows = jax.lax.scan(period, (state, start), jnp.concatenate([command, slope], axis=1))
-    return _record(rows, len(state.x))
-
-
-def _tips(positions: Array, velocities: Array) -> Tips:
-    x1, y1, x2, y2 = (positions[k] for k in range(4))
-    vx1, vy1, vx2, vy2 = (velocities[k] for k in range(4))
-    return Tips((x1, x2), (y1, y2), (vx1, vx2), (vy1, vy2))
-
-
-def _move(tips: Tips, h: Scalar) -> Tips:
-    return tips._replace(x=tuple(a + h * v for a, v in zip(tips.x, tips.vx, strict=True)),
-                         y=tuple(a + h * v for a, v in zip(tips.y, tips.vy, strict=True)))  # fmt: skip
+    return record_of(rows, len(state.x))
 
 
 def _pull(hand: Impedance, tips: Tips, target: Tips, loads: Loads, h: Scalar) -> Tips:
@@ -390,21 +411,3 @@ def _pull(hand: Impedance, tips: Tips, target: Tips, loads: Loads, h: Scalar) ->
 
     return tips._replace(vx=tuple(map(speed, tips.x, tips.vx, target.x, target.vx, loads.fx)),
                          vy=tuple(map(speed, tips.y, tips.vy, target.y, target.vy, loads.fy)))  # fmt: skip
-
-
-def _row(state: State, tips: Tips, loads: Loads) -> Array:
-    """Everything recorded, in the order `_record` takes it apart."""
-    parts = [tips.x, tips.y, tips.vx, tips.vy, loads.fx, loads.fy, state.x, state.y, state.vx, state.vy,
-             *loads.pads, loads.support]  # fmt: skip
-    return jnp.stack([value for part in parts for value in part])
-
-
-def _record(rows: Array, num_blocks: int) -> Record:
-    """Rows of `_row` taken apart."""
-
-    def pair(start: int, width: int) -> Array:
-        return jnp.stack([rows[:, start : start + width], rows[:, start + width : start + 2 * width]], -1)
-
-    n, b = num_blocks, 12
-    return Record(pair(0, 2), pair(4, 2), pair(8, 2), pair(b, n), pair(b + 2 * n, n),
-                  rows[:, b + 4 * n : b + 6 * n].reshape(-1, 2, n), rows[:, b + 6 * n :])  # fmt: skip

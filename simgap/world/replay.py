@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import gammaincinv
 
@@ -17,10 +18,10 @@ from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
-from simgap.world.dynamics import BUCKET, CONTROL_PERIOD
+from simgap.world.dynamics import BUCKET, CONTROL_PERIOD, Record
 from simgap.world.operator import Plan, Window
 from simgap.world.properties import Blocks, standing_heights
-from simgap.world.virtual_model import Rollout, Surroundings, physics, rollout, standing, substeps_for
+from simgap.world.virtual_model import Surroundings, physics, rollout, standing, substeps_for
 
 # Smooth finger motions from noisy samples of position and velocity.
 #
@@ -52,15 +53,8 @@ class Motion:
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (len(times), axes): cubic between samples, at rest beyond them."""
         inside = np.clip(times, self.t[0], self.t[-1])
-        k = np.clip(np.searchsorted(self.t, inside, side="right") - 1, 0, len(self.t) - 2)
-        length = (self.t[k + 1] - self.t[k])[:, None]
-        s = (inside - self.t[k])[:, None] / length
-        way = self.position[k + 1] - self.position[k]
-        v0, v1 = length * self.velocity[k], length * self.velocity[k + 1]
-        square, cube = 3 * way - 2 * v0 - v1, v0 + v1 - 2 * way
-        position = self.position[k] + s * (v0 + s * (square + s * cube))
-        velocity = (v0 + s * (2 * square + 3 * s * cube)) / length
-        return position, np.where((times == inside)[:, None], velocity, 0.0)
+        path = CubicHermiteSpline(self.t, self.position, self.velocity)
+        return path(inside), np.where((times == inside)[:, None], path(inside, 1), 0.0)
 
 
 def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_position: np.ndarray,
@@ -114,11 +108,13 @@ def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray]
     for design, values, weight in zip(designs, samples, weights, strict=True):
         w = (weight[rows] * inside[..., None]) ** 2  # (T, window, axes)
         y = values[rows] - (samples[0][:, None] if design is designs[0] else 0.0)
-        normal = normal + np.einsum("twa,twi,twj->taij", w, design, design)
-        right = right + np.einsum("twa,twi,twa->tai", w, design, y)
+        squares = (design[..., :, None] * design[..., None, :]).reshape(*s.shape, 9)
+        normal = normal + (np.swapaxes(w, 1, 2) @ squares).reshape(normal.shape)
+        right = right + np.swapaxes(w * y, 1, 2) @ design
         square = square + (w * y**2).sum(1)
         count = count + (w > 0).sum(1)
-    proper = np.isfinite(np.linalg.cond(normal)) & (np.linalg.cond(normal) < 1e12) & (count >= 3)
+    with np.errstate(invalid="ignore"):
+        proper = (np.linalg.cond(normal) < 1e12) & (count >= 3)
     normal = np.where(proper[..., None, None], normal, np.eye(3))
     solution = np.linalg.solve(normal, right[..., None])[..., 0]
     left = np.maximum(square - (solution * right).sum(-1), 0.0)
@@ -141,16 +137,15 @@ TO_TIPS = np.linalg.inv(TO_MEAN)
 class Replay:
     """Predictions for one recording; T samples, 2 fingers, axes x and y last.
 
-    `force` (T, 2, 2) [N] predicted at the samples, `measured` (T, 2, 2) [N] as recorded.
-    `t` [s], `tips` (steps, 2, 2) [m] and `motion` hold the whole replay at 1 kHz.
+    `force` (T, 2, 2) [N] predicted at the samples, `measured` (T, 2, 2) [N] as recorded; `motion` is the
+    whole replay at 1 kHz, at times `t` [s].
     """
 
     signals: Signals
     force: np.ndarray
     measured: np.ndarray
     t: np.ndarray
-    tips: np.ndarray
-    motion: Rollout
+    motion: Record
 
     @property
     def predicted(self) -> dict[str, np.ndarray]:
@@ -182,13 +177,12 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     position, velocity = (z @ TO_TIPS.T for z in path.at(t))
     constants = physics(rig, [blocks[name] for name in task.objects], surroundings)
     start = standing(constants, task, places(signals, path, task, np.asarray(boundaries)))
-    tips = _padded(position).reshape(-1, 2, 2)
-    motion = rollout(constants, start, jnp.asarray(tips), jnp.asarray(_padded(velocity).reshape(-1, 2, 2)),
-                     CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))  # fmt: skip
+    moved = [jnp.asarray(_padded(z).reshape(-1, 2, 2)) for z in (position, velocity)]
+    motion = rollout(constants, start, *moved, CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))
     motion = jax.tree.map(lambda a: np.asarray(a)[: t.size], motion)
     force = np.stack([np.interp(signals.t, t, column) for column in motion.force.reshape(-1, 4).T], -1)
     measured = np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], -1)
-    return Replay(signals, force.reshape(-1, 2, 2), measured.reshape(-1, 2, 2), t, tips[: t.size], motion)
+    return Replay(signals, force.reshape(-1, 2, 2), measured.reshape(-1, 2, 2), t, motion)
 
 
 def finger_motion(signals: Signals) -> Motion:

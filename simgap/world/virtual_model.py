@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +24,17 @@ from hmmseg.jaxconfig import double_precision
 from simgap.world.dynamics import (
     Loads,
     Physics,
+    Record,
     Scalar,
     State,
     Tips,
-    Values,
     energy,
     interact,
+    record_of,
     resting_state,
+    row_of,
     substep,
+    tips_of,
 )
 from simgap.world.properties import Block, Blocks, standing_heights
 
@@ -101,20 +103,6 @@ def substeps_for(constants: Physics, period: float) -> int:
     return 2 ** max(0, math.ceil(math.log2(period / step) - 1e-9))
 
 
-class Rollout(NamedTuple):
-    """Prediction at every given time; T times, 2 fingers, B blocks, axes x and y last.
-
-    `force` (T, 2, 2) [N] that the fingers exert, `blocks`, `block_velocity` (T, B, 2) [m, m/s],
-    `pads` (T, 2, B) normal forces and `support` (T, B) force from beneath [N].
-    """
-
-    force: Values
-    blocks: Values
-    block_velocity: Values
-    pads: Values
-    support: Values
-
-
 def advance(constants: Physics, state: State, before: Tips, after: Tips, dt: Scalar,
             substeps: int) -> tuple[State, Loads]:  # fmt: skip
     """State and loads after dt [s] in which the tips go straight from one place to the next."""
@@ -130,21 +118,19 @@ def advance(constants: Physics, state: State, before: Tips, after: Tips, dt: Sca
 
 @partial(jax.jit, static_argnames=("substeps",))
 def rollout(constants: Physics, state: State, positions: Array, velocities: Array, dt: Scalar,
-            substeps: int) -> Rollout:  # fmt: skip
-    """Prediction from finger positions and velocities (T, 2, 2) [m, m/s] every dt [s], from `state` on."""
+            substeps: int) -> Record:  # fmt: skip
+    """What happens from `state` on as fingers move through positions and velocities (T, 2, 2) [m, m/s] every
+    dt [s]."""
 
     def one(carry: tuple[State, Tips], row: Array) -> tuple[tuple[State, Tips], Array]:
         state, before = carry
-        after = _tips(row)
+        after = tips_of(row)
         state, loads = advance(constants, state, before, after, dt, substeps)
-        return (state, after), _row(state, loads)
+        return (state, after), row_of(state, after, loads)
 
     rows = jnp.concatenate([positions.reshape(-1, 4), velocities.reshape(-1, 4)], axis=1)
-    _, out = jax.lax.scan(one, (state, _tips(rows[0])), rows)
-    n = len(state.x)
-    force, rest = out[:, :4].reshape(-1, 2, 2), out[:, 4:]
-    blocks, speeds = rest[:, : 2 * n].reshape(-1, n, 2), rest[:, 2 * n : 4 * n].reshape(-1, n, 2)
-    return Rollout(force, blocks, speeds, rest[:, 4 * n : 6 * n].reshape(-1, 2, n), rest[:, 6 * n :])
+    _, out = jax.lax.scan(one, (state, tips_of(rows[0])), rows)
+    return record_of(out, len(state.x))
 
 
 def standing(constants: Physics, task: BlockTask, x: Mapping[str, float]) -> State:
@@ -231,26 +217,13 @@ def _program(num_blocks: int, substeps: int) -> Callable:
     )
 
     def program(constants: Array, flat: Array, before: Array, after: Array, dt: Array) -> tuple[Array, Array]:
-        scene, tips = constants_of(constants), _tips(after)
-        state, loads = advance(scene, state_of(flat), _tips(before), tips, dt, substeps)
+        scene, tips = constants_of(constants), tips_of(after)
+        state, loads = advance(scene, state_of(flat), tips_of(before), tips, dt, substeps)
         held = energy(scene, state, tips)
         out = [loads.fx[0], loads.fy[0], loads.fx[1], loads.fy[1], held]
         return ravel_pytree(state)[0], jnp.stack(out)
 
     return jax.jit(program)
-
-
-def _tips(row: Array) -> Tips:
-    x1, y1, x2, y2, vx1, vy1, vx2, vy2 = (row[k] for k in range(8))
-    return Tips((x1, x2), (y1, y2), (vx1, vx2), (vy1, vy2))
-
-
-def _row(state: State, loads: Loads) -> Array:
-    """Everything predicted, in the order in which `rollout` takes it apart."""
-    pairs = [zip(loads.fx, loads.fy, strict=True), zip(state.x, state.y, strict=True),
-             zip(state.vx, state.vy, strict=True)]  # fmt: skip
-    values = [value for part in pairs for pair in part for value in pair]
-    return jnp.stack([*values, *loads.pads[0], *loads.pads[1], *loads.support])
 
 
 # Passivity of a haptic loop: an observer of the port's energy and a controller that damps.

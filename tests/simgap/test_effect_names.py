@@ -10,7 +10,7 @@ from simgap.effects import fitted
 
 ROOT = Path(simgap.__file__).parent
 # The comparison with given trials and robots have effects of their own, some of the same names.
-CATALOGUES = {ROOT / "generic/effects.py", ROOT / "robot_effects/commands.py"}
+CATALOGUES = {ROOT / "generic/effects.py", ROOT / "channels/drives.py"}
 
 
 def named_in(path: Path, names: set[str]) -> set[str]:
@@ -25,7 +25,7 @@ def test_no_file_but_those_that_define_effects_names_one():
     names, listed = set(fitted()), {}
     for path in sorted(ROOT.rglob("*.py")):
         # What an effect is taken for, and its own keys, are said where it is defined.
-        own = path.parent == ROOT / "effects" and " = Effect(\n" in path.read_text(encoding="utf-8")
+        own = path.parent == ROOT / "effects" and " = HandEffect(\n" in path.read_text(encoding="utf-8")
         others = set() if own or path in CATALOGUES else named_in(path, names)
         if others:
             listed[str(path.relative_to(ROOT))] = others

@@ -8,7 +8,8 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
-from simgap.effects.geometry import play, within
+from simgap.channels import play
+from simgap.effects.geometry import within
 from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, driven, sensed
 from tests.simgap.test_gap_effects import as_jax, performance, world_of
 
@@ -60,7 +61,7 @@ def test_a_joint_lies_where_it_was_pushed_to():
     rng = np.random.default_rng(0)
     t, width = np.arange(200) / 20, 4e-3
     true = 0.05 * np.sin(2 * np.pi * 0.2 * t)[:, None] * np.ones(4)
-    played = play(true, width)
+    played = np.stack([play(each, width) for each in true.T], 1)
     recorded = played + 1e-4 * rng.standard_normal(true.shape)
     half, inner = width / 2, slice(10, -10)
 

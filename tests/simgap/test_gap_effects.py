@@ -140,13 +140,13 @@ def test_slopes_are_finite_at_every_start(name):
     effect, world = fitted()[name], as_jax(world_of(performance()))
 
     def corrected(u):
-        values = {p.name: p.value(u[k]) for k, p in enumerate(effect.parameters)}
+        values = {p.name: p.value(u[k]) for k, p in enumerate(effect.parameters.values())}
         return effect.correct(world, values, 1.0)
 
     for which in (0, -1):
         start = np.array([
-            p.coordinate(p.starts[which]) if p.starts != (0.0,) else p.coordinate(p.neutral)
-            for p in effect.parameters
+            p.coordinate(p.starts[which]) if p.starts else p.coordinate(p.nominal)
+            for p in effect.parameters.values()
         ])  # fmt: skip
         steps = np.vstack([start, start + STEP * np.eye(start.size)])
         first, *others = (jax.tree.leaves(corrected(jnp.asarray(u))) for u in steps)
@@ -159,7 +159,7 @@ def test_slopes_are_finite_at_every_start(name):
 @pytest.mark.parametrize("name", DETERMINISTIC)
 def test_an_effect_that_is_off_changes_nothing(name):
     effect, world = fitted()[name], as_jax(world_of(performance()))
-    out = effect.correct(world, {p.name: jnp.asarray(p.neutral) for p in effect.parameters}, 0.0)
+    out = effect.correct(world, {p.name: jnp.asarray(p.nominal) for p in effect.parameters.values()}, 0.0)
     for before, after, field in zip(world, out, World._fields, strict=True):
         if field not in ("creep_time", "ring"):  # without a share that creeps or rings they say nothing
             np.testing.assert_allclose(after, before, atol=1e-12, err_msg=field)
@@ -180,7 +180,9 @@ PLANTED = {
     "force_mixing": {
         f"{to}_from_{of}": 0.02 * (k - 1) for to in FORCE_CHANNELS for k, of in enumerate(FORCE_CHANNELS)
     },
-    "motion_load": {p.name: 0.04 * (-1) ** k for k, p in enumerate(fitted()["motion_load"].parameters)},
+    "motion_load": {
+        p.name: 0.04 * (-1) ** k for k, p in enumerate(fitted()["motion_load"].parameters.values())
+    },
 }
 
 

@@ -29,7 +29,9 @@ def read(folder, count=2):
 
 def own(given, found, name):
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name)
-    values = {p.name: float(p.value(found.u[slot.start + j])) for j, p in enumerate(slot.effect.parameters)}
+    values = {
+        p.name: float(p.value(found.u[slot.start + j])) for j, p in enumerate(slot.effect.parameters.values())
+    }
     return values
 
 

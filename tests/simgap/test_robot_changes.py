@@ -13,7 +13,7 @@ from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Changes, by_chance, changes, jackknife
+from simgap.robots.changes import Change, Changes, _unlike, by_chance, changes, jackknife, widened
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -81,7 +81,28 @@ def test_a_gain_doubled_is_named_with_its_ratio():
     size = found.sizes()["gain"]
     low, high = size["ratio_90"]
     assert low <= 2.0 <= high and size["ratio"] == pytest.approx(2.0, rel=0.03)
-    assert found.body()["changes"][0].startswith("gain +")
+    body = found.body()
+    assert body["changes"][0].startswith("gain +") and body["effects"]["gain"]["parameters"].keys() == {
+        "gain"
+    }
+    pair = replace(found.best, effects=("gain", "mass"), **{n: np.repeat(getattr(found.best, n), 2) for n in
+                   ("x", "sd", "freedom")})  # fmt: skip
+    both = replace(found, best=pair).body()["effects"]
+    assert {n: {*e["parameters"]} for n, e in both.items()} == {
+        "gain+mass": {"gain.gain", "mass.mass"}, "gain": {"gain"}, "mass": {"mass"},
+    }  # fmt: skip
+
+
+def test_the_next_experiment_is_the_motion_by_which_a_set_differs_most():
+    found = compared(gain=5.2)
+    apart = 0.1 * np.arange(found.best.left.size)
+    other = replace(found.best, effects=("mass",), left=found.best.left + apart)
+    asked = replace(found, verdict="set", others=(other,)).body()["next_experiment"]
+    unit = found.runs.units[-1]
+    rows = found.runs.unit == unit
+    assert asked["log"] == found.composed.recordings[int(found.runs.log[rows][0])].name
+    assert asked["expected_gain_nats"] == pytest.approx(apart[-1] * rows.sum() / found.old.dependence)
+    assert asked["separates"] == ["gain", "mass"]
 
 
 @pytest.mark.slow
@@ -92,6 +113,17 @@ def test_a_mass_is_named_or_in_a_set_with_length_and_its_interval_holds():
     mass = next(c for c in (found.best, *found.others) if c.effects == ("mass",))
     low, high = found.sizes(mass)["mass"]["interval_90"]
     assert low <= 0.7 <= high
+
+
+def test_logs_of_a_robot_as_it_was_tell_nothing_of_its_arm():
+    nominal = {n: p.nominal for n, p in SIMULATOR.parameters.items()} | TRUE
+    log, start = recorded("fast", 0, {}), {"position": 0.0, "position_rate": 0.0}
+
+    def angles(**changed: float) -> np.ndarray:
+        return SIMULATOR.simulate(nominal | {"mass": 0.5} | changed, log, start)["position"]
+
+    np.testing.assert_allclose(angles(arm=2.0), angles(), atol=1e-9)
+    assert np.abs(angles(arm=2.0, mass=0.9) - angles(mass=0.9)).max() > 1e-3
 
 
 @pytest.mark.slow
@@ -132,9 +164,37 @@ def test_leaving_one_out_of_means_is_welchs_test():
     assert freedom[0] == pytest.approx(welch.df)
 
 
+def test_what_a_prior_leaves_open_adds_to_what_motions_say():
+    rng = np.random.default_rng(0)
+    parts = [rng.normal(size=(5, 1)) for _ in range(2)]
+    (alone, few), (more, many) = jackknife(parts), jackknife(parts, np.array([4.0]))
+    assert more[0] == pytest.approx(np.hypot(alone[0], 2.0)) and many[0] > few[0]
+
+
+def test_a_size_takes_in_what_a_second_small_change_would_do_to_it():
+    left = np.array([1.0, 1.0, 1.1, 0.9])
+
+    def change(effects: tuple[str, ...], *x: float) -> Change:
+        x_ = np.array(x)
+        return Change(effects, x_, np.full(x_.size, 0.01), np.full(x_.size, 8.0), 0.0, left, np.zeros(0))
+
+    one = change(("gain",), 0.7)
+    pairs = [change(("gain", "lag"), 0.73, 1.0), change(("mass", "gain"), 0.4, 0.1)]
+    found = widened(one, pairs, {"mass"})  # what could stand in its place says nothing of its size
+    weight = 0.5  # as good from motion to motion: by chance in half of cases
+    assert found.sd[0] == pytest.approx(np.sqrt(0.01**2 + weight * 0.03**2 / (1 + weight)))
+    assert widened(one, pairs[1:], {"mass"}) is one
+
+
 def test_gains_from_motion_to_motion_are_judged_by_student():
     gains = np.array([0.3, 0.1, 0.5, -0.1])
     assert by_chance(gains) == pytest.approx(ttest_1samp(gains, 0, alternative="greater").pvalue)
+
+
+def test_motions_missed_by_factors_are_called_unlike_as_often_as_stated():
+    rng = np.random.default_rng(0)
+    found = np.array([_unlike(np.exp(rng.normal(size=2)), np.exp(rng.normal(size=3))) for _ in range(2000)])
+    assert np.mean(found < 0.1) == pytest.approx(0.1, abs=0.02)
 
 
 def test_of_one_unit_nothing_is_sure():

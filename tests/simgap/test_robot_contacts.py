@@ -136,13 +136,13 @@ def test_flight_and_contact_are_told_apart(dropped):
 
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     """Windows that admit that each impact differs by a usual size: their weight on the scale is small."""
-    from simgap.robot_effects.readouts import scale as candidates
     from simgap.robots.linear import linearise, wobbling
     from simgap.robots.model import Composed
     from simgap.robots.whiten import CONTACTS, Discrepancy, covariances
 
     simulator, log = dropped
-    (scale,) = candidates(Setting(simulator, [log]))
+    every = readouts.candidates(Setting(simulator, [log]))
+    (scale,) = [e for e in every if e.name == "readout.scale"]
     noise = dict.fromkeys(POSE, 1e-4)
     composed = Composed.of(simulator, [log], {scale.name: scale}, noise, 0.2)
     composed = wobbling(composed, linearise(composed, {}, [scale.name]))

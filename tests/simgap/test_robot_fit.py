@@ -112,12 +112,12 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     assert "angle_b" in left[0] and "angle_b" not in left[1] and not left[2]
 
 
-def test_priors_are_cauchy_and_of_what_was_calibrated_normal():
+def test_priors_are_cauchy_and_of_what_is_fitted_along_normal():
     x = np.array([-30.0, -2.0, -1e-7, 0.0, 0.5, 4.0, 200.0])
-    for calibrated, density in ((False, stats.cauchy), (True, stats.norm)):
-        root = _prior(x, np.full(x.size, calibrated))
+    for tails, density in ((1.0, stats.cauchy()), (30.0, stats.cauchy(scale=1 / 30)), (0.0, stats.norm())):
+        root = _prior(x, np.full(x.size, tails))
         np.testing.assert_allclose(-0.5 * root**2, density.logpdf(x) - density.logpdf(0.0), atol=1e-12)
-    for at in (-30.0, -2.0, 0.5, 4.0):
-        step, loose = 1e-5, np.zeros(2, bool)
-        low, high = _prior(np.array([at - step, at + step]), loose)
-        assert _slope(np.array([at]))[0] == pytest.approx((high - low) / (2 * step), rel=1e-6)
+        for at in (-30.0, -2.0, 0.5, 4.0):
+            step, both = 1e-5, np.full(2, tails)
+            low, high = _prior(np.array([at - step, at + step]), both)
+            assert _slope(np.array([at]), both[:1])[0] == pytest.approx((high - low) / (2 * step), rel=1e-6)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from simgap_swing import Swing, log
 
+from simgap.channels import delayed, lowpass
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
-from simgap.robot_effects.readouts import delayed, lowpass
 from simgap.robots.identifiable import identifiability
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed

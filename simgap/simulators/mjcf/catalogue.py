@@ -13,6 +13,7 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.laws import FADE, joint_law, most_of
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.motion import Motion, motion_of
 from simgap.simulators.mjcf.play import played
@@ -20,13 +21,7 @@ from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
 from simgap.simulators.mjcf.settable import setting_of
 from simgap.simulators.mjcf.settable_parts import body_setting, payload_place
 from simgap.simulators.mjcf.setting import Setting, name_of, names_of, object_id
-from simgap.simulators.mjcf.state_friction import (
-    SHARE,
-    elasticity,
-    gravity_compensation,
-    sizes_of,
-    state_friction,
-)  # fmt: skip
+from simgap.simulators.mjcf.transmission import SHARE, elasticity, gravity_compensation, sizes_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
@@ -61,7 +56,7 @@ def offered(
     catalogue.add_play(joints, motions, {log.name: log for log in recordings})
     simulator.__post_init__()
     simulator.prepare(recordings)
-    beyond = (state_friction, gravity_compensation, elasticity)
+    beyond = (gravity_compensation, elasticity)
     return [effect for family in beyond for effect in family(simulator, recordings, motions, joints)]
 
 
@@ -75,9 +70,9 @@ class _Catalogue:
         self.says: dict[str, str] = {}
 
     def add(self, name: str, sd: float, says: str = "", low: float = -np.inf, high: float = np.inf,
-            effect: str | None = None) -> None:  # fmt: skip
+            effect: str | None = None, setting: Setting | None = None) -> None:  # fmt: skip
         """A parameter about the model's own value, unless it has no size; an effect may have several."""
-        setting = setting_of(self.model, name)
+        setting = setting_of(self.model, name) if setting is None else setting
         nominal = setting.get(self.model)
         if not sd > 0 or not np.isfinite(sd):
             return
@@ -104,6 +99,21 @@ class _Catalogue:
                 setting = setting_of(self.model, f"joint:{name}.{attribute}")
                 sd = max(SHARE * scale, SIZE * abs(setting.get(self.model)))
                 self.add(setting.name, sd, f"{SAYS[attribute]} of {name}", low=0.0)
+            self._add_laws(name, SHARE * size.torque, size.rate)
+
+    def _add_laws(self, joint: str, torque: float, rate: float) -> None:
+        """Friction by load, speed or direction, and drag, by a joint's usual lack of torque and its rate."""
+        head = f"joint:{joint}"
+        says = f"friction of {joint} in proportion to the torque transmitted"
+        self.add(f"{head}.load_friction", SHARE, says, low=0.0)
+        self.add(f"{head}.direction_friction", torque, f"friction of {joint} larger one way than the other")
+        says = f"drag on {joint} in proportion to the rate's square"
+        self.add(f"{head}.quadratic_drag", torque / rate**2, says, low=0.0)
+        says = f"friction of {joint} larger near standstill, by extra exp(-(rate / speed)^2)"
+        self.add(f"{head}.stribeck_extra", torque, says, low=0.0, effect=f"{head}.stribeck")
+        speed = joint_law(self.model, joint, "stribeck_speed", 0.3 * rate)
+        low = 0.03 * rate
+        self.add(f"{head}.stribeck_speed", 0.1 * rate, says, low, effect=f"{head}.stribeck", setting=speed)
 
     def add_actuators(self) -> None:
         """Gains, velocity gains and saturation of actuators that a log drives."""
@@ -117,6 +127,9 @@ class _Catalogue:
                 self.add(f"actuator:{name}.gain", SIZE, says, low=-0.9)
                 sd = SIZE * abs(float(m.actuator_biasprm[a, 2]))
                 self.add(f"actuator:{name}.damping", sd, f"velocity gain of {name}", low=0.0)
+            if most_of(m, a) and int(m.actuator_trntype[a]) == JOINT:
+                says = f"{name} falls behind in proportion to its force, by this share at its most"
+                self.add(f"actuator:{name}.{FADE}", SIZE, says, low=-0.9, high=0.9)
             if m.actuator_forcelimited[a]:
                 sd = SIZE * float(m.actuator_forcerange[a, 1])
                 self.add(f"actuator:{name}.limit", sd, f"saturation of {name}", low=1e-9)

@@ -17,6 +17,7 @@ import numpy as np
 from simgap.latest import latest
 from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.laws import MOTOR
 from simgap.simulators.mjcf.runs import Runs
 from simgap.simulators.mjcf.settable import setting_of
 from simgap.simulators.mjcf.setting import Setting
@@ -26,7 +27,6 @@ from simgap.simulators.recording import Recording
 
 WIDTH = ".width"  # the end of a setting's name: of the play of a joint [rad or m]
 KEPT = 64  # numerics: free runs that are kept
-MOTOR = ":motor"
 MOVES = ("damping", "frictionloss", "armature")  # what goes to the motor
 LIGHT = 1e-6  # numerics: kg and kg m^2: the motor's body, whose rotor is its joint's armature
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.laws import Laws
+from simgap.simulators.mjcf.laws import run as run_with
 from simgap.simulators.mjcf.signals import Held, Side, aligned
 from simgap.simulators.protocol import Channel, Channels
 from simgap.simulators.recording import Recording
@@ -94,7 +96,11 @@ class Runs:
         if width > self.model.nu:
             spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
+        laws = Laws.of(self.model, changed)
+
         def run() -> np.ndarray:
+            if laws:
+                return run_with(self.model, self.data[0], laws, first, control)
             return rollout.rollout(
                 self.model, self.data, first, control if width else None,
                 control_spec=spec, nstep=steps, persistent_pool=True,

@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
+from simgap.simulators.mjcf.laws import FADE, OF_JOINTS
 from simgap.simulators.mjcf.runs import HOLD, LATE
 from simgap.simulators.mjcf.settable_parts import actuator_setting, body_setting, geom_setting, joint_setting
 from simgap.simulators.mjcf.setting import Setting, names_of
 
 KNOWN = {
-    "joint": ("damping", "frictionloss", "armature", "stiffness", "springref"),
+    "joint": ("damping", "frictionloss", "armature", "stiffness", "springref", *OF_JOINTS),
     "body": ("mass", "com_x", "com_y", "com_z", "payload", "length"),
     "geom": ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size"),
-    "actuator": ("gain", "damping", "limit"),
+    "actuator": ("gain", "damping", "limit", FADE),
     "tendon": (),
     "site": (),
     "equality": (),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.laws import FADE, joint_law, law_setting, most_of
 from simgap.simulators.mjcf.setting import Setting, array_setting, object_id
 
 
@@ -19,7 +20,7 @@ def _dofs(model: Any, joint: int) -> slice:
 
 
 def joint_setting(model: Any, name: str, attribute: str) -> Setting | None:
-    """damping, frictionloss, armature, stiffness, springref of a joint."""
+    """damping, frictionloss, armature, stiffness, springref of a joint, and its laws."""
     j = object_id(model, "joint", name)
     turning = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)
     dof = _dofs(model, j)
@@ -31,7 +32,7 @@ def joint_setting(model: Any, name: str, attribute: str) -> Setting | None:
         "springref": ("qpos_spring", int(model.jnt_qposadr[j]), "rad" if turning else "m"),
     }
     if attribute not in fields:
-        return None
+        return joint_law(model, name, attribute)
     array, at, unit = fields[attribute]
     return array_setting(
         f"joint:{name}.{attribute}",
@@ -144,7 +145,7 @@ def geom_setting(model: Any, name: str, attribute: str) -> Setting | None:
 
 
 def actuator_setting(model: Any, name: str, attribute: str) -> Setting | None:
-    """gain (relative, of a position servo its stiffness), damping (kv), limit (of the force)."""
+    """gain (relative, of a position servo its stiffness), damping (kv), limit (of the force), fade."""
     a = object_id(model, "actuator", name)
     gain, bias = np.array(model.actuator_gainprm[a]), np.array(model.actuator_biasprm[a])
 
@@ -175,6 +176,8 @@ def actuator_setting(model: Any, name: str, attribute: str) -> Setting | None:
             False,
             ("actuator", name, "kv", None),
         )
+    if attribute == FADE and most_of(model, a):
+        return law_setting(f"actuator:{name}.{FADE}", "1")
     if attribute == "limit" and model.actuator_forcelimited[a]:
 
         def limit(m: Any, value: float) -> None:

@@ -1,5 +1,5 @@
-"""What MuJoCo's models lack and the recorded motion tells: friction by load, speed or direction, a drive that
-carries the arm's weight, gears that give under load."""
+"""What MuJoCo's models lack and the recorded motion tells: a drive that carries the arm's weight, gears that
+give under load."""
 
 from __future__ import annotations
 
@@ -20,72 +20,6 @@ from simgap.simulators.recording import Recording
 LIGHT = 1e-6  # numerics: N m, m N m: what is less is nothing
 GIVES = 0.01  # prior: of a joint's reach: by how much its gears usually give
 SHARE = 0.03  # prior: of the torques that a joint shows: the usual size of what a model lacks there
-
-
-def state_friction(
-    simulator: MjcfSimulator,
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion],
-    joints: Sequence[int],
-) -> list[RobotEffect]:
-    """Friction that depends on load, speed or direction, as torques along the recorded motion."""
-    by_log = {log.name: motion for log, motion in zip(recordings, motions, strict=True)}
-    model, out = simulator.model, []
-    for j in joints:
-        name, size = name_of(model, "joint", j), sizes_of(motions, j)
-        turning = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-        unit = "N m" if turning else "N"
-        usual = SHARE * size.torque
-        still = 0.02 * size.rate  # below this the direction of motion is not told
-
-        def way(log: Recording, joint: int = j, still: float = still) -> np.ndarray:
-            return np.tanh(by_log[log.name].rate[joint] / still)
-
-        def load(log: Recording, theta: Mapping[str, float], joint: int = j, way=way) -> np.ndarray:
-            return -theta["share"] * np.abs(by_log[log.name].torque[joint]) * way(log)
-
-        def skew(log: Recording, theta: Mapping[str, float], joint: int = j, way=way) -> np.ndarray:
-            return -theta["skew"] * np.abs(way(log))
-
-        def stribeck(log: Recording, theta: Mapping[str, float], joint: int = j, way=way) -> np.ndarray:
-            rate = by_log[log.name].rate[joint]
-            return -theta["extra"] * np.exp(-((rate / theta["speed"]) ** 2)) * way(log)
-
-        def drag(log: Recording, theta: Mapping[str, float], joint: int = j) -> np.ndarray:
-            rate = by_log[log.name].rate[joint]
-            return -theta["coefficient"] * rate * np.abs(rate)
-
-        share = {"share": Parameter(0.0, SHARE, "1", low=0.0)}
-        out += [
-            _applied(name, "load_friction", "friction in proportion to the torque transmitted", share, load),
-            _applied(
-                name,
-                "direction_friction",
-                "friction larger one way than the other",
-                {"skew": Parameter(0.0, usual, unit)},
-                skew,
-            ),
-            _applied(
-                name,
-                "stribeck",
-                "friction larger near standstill, by extra exp(-(rate / speed)^2)",
-                {
-                    "extra": Parameter(0.0, usual, unit, low=0.0),
-                    "speed": Parameter(
-                        0.3 * size.rate, 0.1 * size.rate, "rad/s" if turning else "m/s", low=0.03 * size.rate
-                    ),
-                },
-                stribeck,
-            ),
-            _applied(
-                name,
-                "quadratic_drag",
-                "drag in proportion to the rate's square",
-                {"coefficient": Parameter(0.0, usual / size.rate**2, f"{unit} s^2/rad^2", low=0.0)},
-                drag,
-            ),
-        ]
-    return out
 
 
 def gravity_compensation(
@@ -173,16 +107,6 @@ def _of_motor(model: Any, motion: Motion, joint: int, row: int) -> float:
     dof = int(model.jnt_dofadr[joint])
     rotor, damping = float(model.dof_armature[dof]), float(model.dof_damping[dof])
     return rotor * float(motion.acceleration[joint][row]) + damping * float(motion.rate[joint][row])
-
-
-def _applied(joint: str, what: str, says: str, parameters: dict[str, Parameter], torque) -> RobotEffect:
-    column = f"{APPLIED}{joint}"
-
-    def act(log: Recording, theta: Mapping[str, float]) -> Recording:
-        before = log.columns.get(column, np.zeros(len(log)))
-        return log.with_columns({column: before + torque(log, theta)})
-
-    return RobotEffect(f"joint:{joint}.{what}", says, parameters, command=act)
 
 
 class Sizes:

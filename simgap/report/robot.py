@@ -1,0 +1,193 @@
+"""What a diagnosis of a robot leaves besides its document: courses, a history, the motion to run next."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import norm
+
+from hmmseg.errors import InputError
+from simgap.robots.changes import Changes
+from simgap.robots.diagnose import RobotDiagnosis
+from simgap.robots.linear import base_at
+from simgap.simulators.recording import Recording
+
+if TYPE_CHECKING:
+    from simgap.simulators.mjcf.load import Loaded
+
+MOVED = 0.01  # chosen: of histories in which nothing moved, those of which a parameter is said to have
+NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
+
+
+@dataclass(frozen=True)
+class Own:
+    """How a log's column says a quantity: `offset` + `factor` x it is in the unit `si`, and it in `unit`."""
+
+    si: str
+    factor: float
+    offset: float
+    unit: str
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Values in SI as the column has them."""
+        return (values - self.offset) / self.factor
+
+
+def own_units(loaded: Loaded | None) -> dict[str, Own]:
+    """Of columns whose unit is not SI, by column and by what they are of (joint:elbow)."""
+    out = {}
+    for name, m in ({} if loaded is None else loaded.map.columns).items():
+        if isinstance(m.unit, str) and m.factor != 1.0:
+            own = Own(loaded.simulator.channels[name].unit, m.factor, m.offset, m.unit)
+            out |= {name: own, f"{m.thing}:{m.name}": own}
+    return out
+
+
+@dataclass(frozen=True)
+class Course:
+    """One channel of one log, (n,) at times `t` [s], in its column's own unit: recorded, simulated as the
+    model came and with what was found; NaN where a simulation is begun anew."""
+
+    log: str
+    channel: str
+    unit: str
+    t: np.ndarray
+    recorded: np.ndarray
+    simulated: np.ndarray
+    corrected: np.ndarray
+    over: float  # mean square that the model as it came leaves, in variances of the noise
+
+
+def courses(found: RobotDiagnosis | Changes, own: Mapping[str, Own]) -> list[Course]:
+    """Of every log and channel. A diagnosis' logs are predicted from the others where that was done; of what
+    changed they are run freely from their first sample."""
+    rows = found.composed.rows
+    if isinstance(found, Changes):
+        simulated, corrected = (base_at(found.composed, p).rows for p in (found.old.point, found.point()))
+    else:
+        far = found.shrinkage
+        left = (found.plain, found.linear) if far is None else None
+        before, after = (far.plain, far.residual) if left is None else [x.residual for x in left]
+        simulated, corrected = rows.observed - before, rows.observed - after
+    out = []
+    for log in np.unique(rows.log):
+        for c, channel in enumerate(rows.channels):
+            mine = (rows.log == log) & (rows.channel == c)
+            if not mine.any():
+                continue
+            si = found.composed.simulator.channels[channel].unit
+            says = own.get(channel, Own(si, 1.0, 0.0, si))
+            gaps = np.flatnonzero(np.diff(rows.window[mine])) + 1
+            square = (rows.observed - simulated)[mine] ** 2 / rows.variance[mine]
+            columns = [np.insert(values[mine], gaps, np.nan) for values in (rows.time, simulated, corrected)]
+            recorded = np.insert(rows.observed[mine], gaps, np.nan)
+            t, *runs = columns
+            out.append(Course(
+                found.composed.recordings[log].name, channel, says.unit, t, says.of(recorded),
+                *map(says.of, runs), float(np.nanmean(square)),
+            ))  # fmt: skip
+    return out
+
+
+def next_motion(document: Mapping[str, Any], logs: Iterable[Recording]) -> Recording | None:
+    """The log whose motion the next experiment repeats."""
+    asked = (document.get("next_experiment") or {}).get("log")
+    return next((log for log in logs if log.name == asked), None)
+
+
+def motion_csv(
+    log: Recording, commands: Sequence[str], own: Mapping[str, Own], time: tuple[str, float]
+) -> str:
+    """The commands of a motion as a CSV in the columns' own units, to be run again; `time`: the name of the
+    times' column and its unit [s]. They have been run before, so that they lie within the joints' limits."""
+    columns = [(log.t - log.t[0]) / time[1]]
+    columns += [own[n].of(log[n]) if n in own else log[n] for n in commands]
+    lines = [",".join((time[0], *commands))]
+    lines += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Every parameter that a diagnosis tells, by name: what was calibrated, over it what was named; of the
+    members of a set nothing is told."""
+    keys = ("mean", "sd", "interval_90", "unit")
+    known = (document.get("calibrated") or {}).get("parameters") or {}
+    out = {name: {k: p.get(k) for k in keys} for name, p in known.items()}
+    for name in (*document["causes"], *document["indistinguishable"]):
+        found = document["effects"].get(name, {"parameters": {}})["parameters"]
+        for short, p in found.items():
+            told = {k: p.get(k) if document["verdict"] == "named" or k == "unit" else None for k in keys}
+            out[name if len(found) == 1 else f"{name}.{short}"] = told
+    return out
+
+
+def history(path: Path) -> list[dict[str, Any]]:
+    """The runs that a file keeps, a line of JSON each; none where there is no file.
+
+    Raises:
+        InputError: a line is none of a history.
+    """
+    if not path.exists():
+        return []
+    out = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            entry = json.loads(line)
+            assert isinstance(entry["date"], str) and isinstance(entry["parameters"], dict)
+        except (ValueError, KeyError, TypeError, AssertionError):
+            where = f"--history {path}: line {number}"
+            raise InputError(where, "is no run of a history", '{"date": .., "parameters": ..}') from None
+        out.append(entry)
+    return out
+
+
+def compared(
+    past: Sequence[Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Of each parameter of a run whether it moved since it was known last: `moved` where the two differ by
+    more than both intervals allow, Bonferroni over all of them; `within` where it lies in the interval of
+    then; else `cannot tell`, as where logs tell nothing of it. What was never known before is left out."""
+    out = {}
+    reach = norm.isf(MOVED / 2 / max(len(now), 1))
+    for name, p in now.items():
+        known = ((e["date"], e["parameters"].get(name)) for e in reversed(past))
+        date, then = next(((d, q) for d, q in known if q and q["mean"] is not None), (None, None))
+        if then is None:
+            continue
+        answer = "cannot tell"
+        if p["mean"] is not None and p["interval_90"] and then["interval_90"]:
+            sds = [(q["interval_90"][1] - q["interval_90"][0]) / 2 / NORMAL_90 for q in (p, then)]
+            low, high = then["interval_90"]
+            if abs(p["mean"] - then["mean"]) > reach * np.hypot(*sds):
+                answer = "moved"
+            elif low <= p["mean"] <= high:
+                answer = "within"
+        out[name] = {"since": date, "then": then["mean"], "now": p["mean"], "unit": p["unit"], "says": answer}
+    return out
+
+
+def write_rerun(path: Path, found: Sequence[Course]) -> None:
+    """Recorded, simulated and corrected courses of all logs and channels, for Rerun's viewer.
+
+    Raises:
+        InputError: rerun-sdk is not installed.
+    """
+    try:
+        rerun: Any = importlib.import_module("rerun")
+    except ImportError:
+        raise InputError("--rerun", "needs rerun-sdk", "pip install rerun-sdk") from None
+    stream = rerun.RecordingStream("hmmseg")
+    stream.save(str(path))
+    for one in found:
+        index = [rerun.TimeColumn("time", duration=one.t[np.isfinite(one.t)])]
+        for name in ("recorded", "simulated", "corrected"):
+            values = getattr(one, name)[np.isfinite(one.t)]
+            columns = rerun.Scalars.columns(scalars=values)
+            stream.send_columns(f"{one.log}/{one.channel}/{name}", indexes=index, columns=columns)
+    stream.flush()

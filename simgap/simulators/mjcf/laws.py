@@ -1,0 +1,150 @@
+"""Laws that MuJoCo's models lack and that go by the state: friction by load, speed or direction, drag, drives
+that fade.
+
+Friction is a constraint that holds a joint at rest: its limit is set before each step,
+
+    limit = frictionloss + share |m + b| / 2 + extra exp(-(w / speed)^2) + skew sign(w),
+
+w the joint's rate, m the torque of its motors and b what gravity and the other joints' motion take: what the
+gears press on from either side, in balance the torque that they transmit (model M4 of Duclusaud et al.,
+Extended friction models for the physics simulation of servo actuators, 2024). A drive that fades gives
+f (1 - fade |f| / most), most what it can give at all. A step takes what the one before it had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import exp
+from typing import Any
+
+import numpy as np
+
+from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.setting import Setting, object_id
+
+OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
+FADE = "fade"  # of an actuator
+MOTOR = ":motor"  # behind a joint's name: of the motor, where it is a body of its own
+
+
+def law_setting(name: str, unit: str, nominal: float = 0.0) -> Setting:
+    """The setting of a law's parameter, which is none of the compiled model's own."""
+    return Setting(name, unit, lambda model: nominal, lambda model, value: None, False, None)
+
+
+def joint_law(model: Any, name: str, attribute: str, nominal: float = 0.0) -> Setting | None:
+    """The setting of a law of a joint; None where there is no such law."""
+    turning = int(model.jnt_type[object_id(model, "joint", name)]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    force, rate = ("N m", "rad/s") if turning else ("N", "m/s")
+    units = dict(zip(OF_JOINTS, ("1", force, force, rate, f"{force} {rate}^-2"), strict=True))
+    units["quadratic_drag"] = "N m s^2/rad^2" if turning else "N s^2/m^2"
+    return (
+        None
+        if attribute not in units
+        else law_setting(f"joint:{name}.{attribute}", units[attribute], nominal)
+    )
+
+
+def most_of(model: Any, actuator: int) -> float:
+    """The largest force that an actuator can give, 0 where the model states none."""
+    if model.actuator_forcelimited[actuator]:
+        return float(np.abs(model.actuator_forcerange[actuator]).max())
+    if model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator, 1]:
+        return abs(float(model.actuator_gainprm[actuator, 0])) * float(
+            np.abs(model.actuator_ctrlrange[actuator]).max()
+        )
+    return 0.0
+
+
+@dataclass(frozen=True)
+class _Friction:
+    dof: int
+    share: float
+    skew: float
+    extra: float
+    speed: float
+    drag: float
+
+
+@dataclass(frozen=True)
+class Laws:
+    """Laws that act in a model: `friction` of joints, and by drive that fades its actuator, the fade over the
+    most that it can give, and the part of a joint's torque (nv,) that its force makes."""
+
+    friction: tuple[_Friction, ...]
+    fading: tuple[tuple[int, float, np.ndarray], ...]
+
+    def __bool__(self) -> bool:
+        return bool(self.friction or self.fading)
+
+    @classmethod
+    def of(cls, model: Any, changed: Sequence[tuple[str, float]]) -> Laws:
+        """Those that settings name which are changed, in this model."""
+        joints: dict[str, dict[str, float]] = {}
+        fading = []
+        for name, value in changed:
+            head, _, attribute = name.rpartition(".")
+            kind, _, thing = head.partition(":")
+            if kind == "joint" and attribute in OF_JOINTS:
+                joints.setdefault(thing, {})[attribute] = value
+            elif kind == "actuator" and attribute == FADE:
+                a = object_id(model, "actuator", thing)
+                arm = np.zeros(model.nv)
+                arm[int(model.jnt_dofadr[int(model.actuator_trnid[a, 0])])] = float(model.actuator_gear[a, 0])
+                fading.append((a, value / max(most_of(model, a), 1e-9), arm))
+        friction = tuple(
+            _friction(model, n, own) for n, own in joints.items() if {*own} != {"stribeck_speed"}
+        )
+        return cls(friction, tuple(fading))
+
+
+def _friction(model: Any, joint: str, own: Mapping[str, float]) -> _Friction:
+    j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{joint}{MOTOR}")
+    dof = int(model.jnt_dofadr[object_id(model, "joint", joint) if j < 0 else j])
+    return _Friction(dof, own.get("load_friction", 0.0), own.get("direction_friction", 0.0),
+                     own.get("stribeck_extra", 0.0), max(own.get("stribeck_speed", 1.0), 1e-9),
+                     own.get("quadratic_drag", 0.0))  # fmt: skip
+
+
+def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
+    """Sensors (B, steps, sensors) of runs from full states (B, size) with controls, and behind these applied
+    torques, (B, steps, width): as `mujoco.rollout` gives them, with laws that act."""
+    out = np.empty((*control.shape[:2], model.nsensordata))
+    spec, nu = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), model.nu
+    plain, applied = np.array(model.dof_frictionloss), control.shape[2] > nu
+    step, limit, rate = mujoco.mj_step, model.dof_frictionloss, data.qvel
+    motor, bias, force, pushed = data.qfrc_actuator, data.qfrc_bias, data.actuator_force, data.qfrc_applied
+    extra = applied or bool(laws.fading) or any(f.drag for f in laws.friction)
+    try:
+        for b in range(len(first)):
+            limit[:] = plain
+            mujoco.mj_resetData(model, data)
+            mujoco.mj_setState(model, data, first[b], spec)
+            data.ctrl[:] = control[b, 0, :nu]
+            mujoco.mj_forward(model, data)
+            data.qacc_warmstart[:] = 0.0
+            for k in range(control.shape[1]):
+                if extra:
+                    pushed[:] = control[b, k, nu:] if applied else 0.0
+                for f in laws.friction:
+                    d, w = f.dof, float(rate[f.dof])
+                    most = plain[d]
+                    if f.share:
+                        most += 0.5 * f.share * abs(float(motor[d]) + float(bias[d]))
+                    if f.extra:
+                        most += f.extra * exp(-((w / f.speed) ** 2))
+                    if f.skew:
+                        most += f.skew * ((w > 0) - (w < 0))
+                    limit[d] = most if most > 0 else 0.0
+                    if f.drag:
+                        pushed[d] -= f.drag * w * abs(w)
+                for a, by, arm in laws.fading:
+                    now = float(force[a])
+                    pushed -= by * abs(now) * now * arm
+                data.ctrl[:] = control[b, k, :nu]
+                step(model, data)
+                out[b, k] = data.sensordata
+    finally:
+        limit[:] = plain
+    return out
