@@ -132,6 +132,7 @@ real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECOR
 	$(BIN)/python -m experiments.real.kth_handover $(REAL)/kth_handover
 	$(BIN)/python -m experiments.real.way_eeg_gal $(REAL)/way_eeg_gal_p1
 	$(BIN)/python -m experiments.real.robot_gap xl330 $(REAL)/xl330_pendulum --figures docs/figures
+	$(BIN)/python -m experiments.real.xl330_sheet $(REAL)/xl330_pendulum --diagnose --output experiments/results/xl330_sheet.json
 	$(BIN)/python -m experiments.real.robot_gap so101 $(REAL)/so101 --seconds 10 --figures docs/figures
 	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
 	$(BIN)/python -m experiments.real.collins $(REAL)/collins

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from math import gcd, lcm
+from operator import itemgetter
 
 import numpy as np
 
@@ -387,9 +388,11 @@ def pad_doubt(
             apart = shared_error(one[2], one[1])
             if one[0].size:
                 middle, error = middle_share(one[0], one[1], 0.0)
-                surest[channel] = min(surest[channel], (middle, float(np.hypot(error, apart))), key=sd_of)
+                surest[channel] = min(
+                    surest[channel], (middle, float(np.hypot(error, apart))), key=itemgetter(1)
+                )
             said = misstated(one[0], one[1], stated, admitted if stated else 0.0, apart)
-            found[channel] = max(found[channel], said, key=lambda share_and_odds: share_and_odds[1])
+            found[channel] = max(found[channel], said, key=itemgetter(1))
         if not stated:
             possible[channel] = possible_share(mine[0], mine[1])
     normal, shear = (
@@ -401,11 +404,6 @@ def pad_doubt(
         (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
         seen=((-surest[DISTANCE][0], surest[DISTANCE][1]), surest[RISE]),
     )  # fmt: skip
-
-
-def sd_of(found: tuple[float, float]) -> float:
-    """The second of a value and its standard deviation."""
-    return found[1]
 
 
 def _usual(weighed: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:

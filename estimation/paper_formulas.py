@@ -112,8 +112,17 @@ def estimate_plugin(
 ) -> PluginEstimates:
     """The paper's estimates of every object of a task from its segmented trials.
 
-    `states` are the contact states of each trial's samples (by default those of the paper's
-    thresholds). ValueError if the sequences differ in length.
+    Args:
+        trials_signals: one a trial.
+        segmentations: one a trial.
+        task: of all trials.
+        states: contact states of each trial's samples; by default those of the paper's thresholds.
+
+    Returns:
+        Mean and standard deviation of every property, or why it has none.
+
+    Raises:
+        ValueError: the sequences differ in length.
     """
     labels = [label_states(s) for s in trials_signals] if states is None else list(states)
     task = _as_performed(task, segmentations)

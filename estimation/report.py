@@ -34,10 +34,19 @@ LIMITS = {"weight": (1e-4, 1e4), "width": (1e-5, 10.0), "height": (1e-5, 10.0), 
 
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
-    """Measured (value, standard deviation) of every property given, by object and property.
+    """Properties measured apart from the trials.
 
-    N for a weight, m for width and height, "1" for friction. InputError for an object that is
-    not among `objects` (a task's), an unknown key, a wrong unit or a number that cannot be.
+    Args:
+        path: a TOML file with tables [OBJECT.PROPERTY] of unit, value and sd.
+        objects: names of the task's objects.
+
+    Returns:
+        (value, standard deviation) by object and property: N for a weight, m for width and height, 1 for
+        friction.
+
+    Raises:
+        InputError: an object that is not among `objects`, an unknown key, a wrong unit or a number that
+            cannot be.
     """
     return parse_actual(read_toml(path), objects, str(path))
 
@@ -59,11 +68,18 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
 
 
 def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
-    """Identified `properties` (as in identify's JSON) beside measured values, by object and property.
+    """Identified properties compared with measured values.
 
-    Each with `relative_deviation`, `z` (in sds of both together), `inside_95` and `disagrees`: beyond
-    CONTRADICTS sds and beyond `smallest`, the relative deviation that matters. Of a friction that has a
-    lower bound alone it can only be said that the measured one lies below. Null where not identified.
+    Args:
+        properties: as in identify's JSON.
+        measured: value and standard deviation by object and property.
+        smallest: relative deviation that matters.
+
+    Returns:
+        By object and property: `value`, `sd`, and where the property was identified `relative_deviation`, `z`
+        (in sds of both together), `inside_95` and `disagrees`, which is beyond CONTRADICTS sds and beyond
+        `smallest`. Of a friction with a lower bound alone it can only be said that the measured one lies
+        below.
     """
     out: dict[str, Any] = {}
     for obj, entries in measured.items():

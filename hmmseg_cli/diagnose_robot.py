@@ -188,7 +188,7 @@ def diagnose_robot(
     phases = None
     if task is not None:
         from hmmseg.io.task import read_task
-        from simgap.robots.task_phases import phases_by_task
+        from simgap.robots.phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with _stages(out, "diagnosing", STAGES) as tell:
@@ -205,8 +205,9 @@ def diagnose_robot(
         )
     document = body(found)
     _warn_of_engine(out, own)
-    left = document["remainder"]["rms_over_noise"]
-    out.print(sentence(document), f"What is left is {left:.3g} times the noise.", *tables(document, found))
+    said, left = sentence(document), document["remainder"]["rms_over_noise"]
+    size = [] if "times the noise" in said else [f"What is left is {left:.3g} times the noise."]
+    out.print(said, *size, *tables(document, found))
     _deliver(out, own, found, document, loaded, recordings, found.composed.effects)
     if own.patch is not None:
         given = found.composed, found.linear.point, document, document["causes"]

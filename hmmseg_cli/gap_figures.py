@@ -187,6 +187,8 @@ def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
             axes.bar(at + place, each, 0.4, color=colour, label=name)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
         axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)

@@ -341,9 +341,14 @@ def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
     """For each performed move, how far its object's bottom rises, as a sum of object heights.
 
-    Entries are (0-based index of the move, {object: coefficient}): bottom height at place minus
-    bottom height at pickup; the paper's height of the block beneath (its Table 3) is the case of
-    a single coefficient. A slide rises by nothing: {}.
+    The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
+
+    Args:
+        task: of blocks.
+
+    Returns:
+        (0-based index of the move, {object: coefficient}) a move: bottom height at place minus bottom
+        height at pickup. A slide rises by nothing: {}.
     """
     states = list(contact_states(task))
     equations = []

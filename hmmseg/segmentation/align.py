@@ -348,11 +348,19 @@ def align(
 
     A trial that does not fit its task is kept out of the pool and aligned with the order that it
     shows instead: its subtasks before `failed` are the task's, boundaries after it are not. Its
-    log evidence is that of the order it shows. `all_fit`: all are taken to fit, whatever they show.
+    log evidence is that of the order it shows. Of a repeated task every round is such a trial: one
+    that fails leaves the others as they are.
 
-    Of a repeated task every round is such a trial: one that fails leaves the others as they are. `task`
-    of the result has its number of rounds (of several recordings with an unknown number, the most).
-    `signals`: to be read instead of the trials' own.
+    Args:
+        trials: recordings of one hand, at least one.
+        task: whose order they follow.
+        rig: the nominal hand.
+        all_fit: all are taken to fit, whatever they show.
+        signals: one a trial, to be read instead of its own.
+
+    Returns:
+        The trials with their alignments; `task` has its number of rounds (of several recordings with
+        an unknown number, the most).
     """
     if signals is None:
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]

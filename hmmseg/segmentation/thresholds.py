@@ -192,9 +192,21 @@ def segment_qualitative(
 
     A boundary lies anywhere between the last sample of one subtask and the first of the next:
     its median is the midpoint, its deviation and interval those of a uniform. There is no
-    evidence. A subtask without samples fails the trial; the others keep their spans. A task
-    with `repeat = "unknown"` is repeated as often as agrees best. Thresholds in N and m/s.
-    InputError for a plain ordered task and for thresholds that are not > 0.
+    evidence. A subtask without samples fails the trial; the others keep their spans.
+
+    Args:
+        trial: the recording.
+        signals: its signals in task space.
+        task: a task of blocks; one with `repeat = "unknown"` is repeated as often as agrees best.
+        force_threshold: below which a force counts as none [N].
+        velocity_threshold: below which a velocity counts as none [m/s].
+        order: how the states of samples become subtasks in order.
+
+    Returns:
+        The trial's segmentation.
+
+    Raises:
+        InputError: a plain ordered task, or thresholds that are not > 0.
     """
     if not isinstance(task, BlockTask):
         raise InputError("task", "a plain ordered task has no contact states to threshold",

@@ -42,7 +42,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
-from simgap.robots.noise import noises
+from simgap.robots.rows import noises
 from simgap.robots.unchanged import (
     WIDER,
     Broken,

@@ -20,7 +20,7 @@ from hmmseg.robust import robust_sd
 from simgap.robots.calibrate import Calibration
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point
-from simgap.robots.noise import resolution
+from simgap.robots.rows import resolution
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 

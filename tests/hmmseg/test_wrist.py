@@ -185,20 +185,6 @@ def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):
         read_trial(columns, wrist_rig(setup, reaction=True))
 
 
-def test_the_line_for_a_flipped_opening_mends_it(performed):
-    columns = wrist_recording(performed[0], PLAIN)
-    columns["gap"] = 0.085 - columns["gap"]
-    with pytest.raises(InputError) as told:
-        read_trial(columns, wrist_rig(PLAIN))
-    import tomllib
-
-    entry = str(told.value).split("expected ")[1].split(" under [columns]")[0]
-    table = wrist_rig(PLAIN).model_dump(exclude_none=True, exclude_defaults=True)
-    mended = parse_rig(table | {"columns": tomllib.loads(entry)})
-    trial = read_trial(columns, mended)
-    assert len(trial.touches) == 4
-
-
 def test_a_touch_in_free_motion_is_told(performed):
     columns = wrist_recording(performed[0], PLAIN)
     pressed = (columns["t"] > 1.2) & (columns["t"] < 1.5)
