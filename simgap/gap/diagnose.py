@@ -384,16 +384,14 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    models: list[Model] | None = sought(forms(gap), 1)
+    models: list[Model] | None = sought(forms(gap))
     leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
-    if models[0].effects and not forced:
-        models = None  # to be sought more widely
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(
             found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
         )
-        gap = together(found.problem, gap, found.healthy, joint, left, found.redrawn)
+        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import (
-    Evaluated,
     Fitted,
     Problem,
     Start,
@@ -82,30 +80,18 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     what swings with it has no size.
     """
     every, usual = starts(given, key, healthy.u), healthy.push
-    ranked = sorted((_ranked(given, start, usual) for start in every), key=lambda r: r.cost)
-    first = ranked[0]
-    there = first.there if first.now is None else first.start
-    if healthy.cost - first.cost < PROMISING:
-        return fit(given, there, 0, usual, first.now)
-    if len(ranked) > 1:
-        screened = sorted(
-            (fit(given, r.there, SCREEN, usual) for r in ranked[:LEADERS]), key=lambda f: f.cost
-        )
-        there = Start((key,), screened[0].u)
-    return fit(given, there, usual=usual, there=first.now)
+    ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
+    if healthy.cost - ranked[0][0] < PROMISING:
+        return fit(given, ranked[0][2], 0, usual)
+    leading = [start for _, start, _ in ranked[:LEADERS]]
+    if len(leading) > 1:
+        screened = sorted((fit(given, s, SCREEN, usual) for s in leading), key=lambda f: f.cost)
+        leading = [Start((key,), screened[0].u)]
+    return fit(given, leading[0], usual=usual)
 
 
-class _Ranked(NamedTuple):
-    """A start, its `cost` after a linear step of all but its gridded parameters, and the start `there`; what
-    was evaluated `now`, at the start itself, where no parameter is gridded."""
-
-    cost: float
-    start: Start
-    there: Start
-    now: Evaluated | None
-
-
-def _ranked(given: Problem, start: Start, usual: np.ndarray) -> _Ranked:
+def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Start]:
+    """A start's cost after a linear step of all but its gridded parameters, and the start there."""
     (key,) = start.effects
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     fixed = [
@@ -117,8 +103,7 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> _Ranked:
     columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
     u = start.u.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    own = np.arange(given.num_properties, columns.size)
-    now = evaluated(given, start.effects, u, columns, [own], usual)
+    now = evaluated(given, start.effects, u, columns, [], usual)
     bend = given.product(now.push, now.push) + np.eye(columns.size)
     pull = -given.product(now.push, now.residual) - u[columns]
     step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
@@ -127,7 +112,7 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> _Ranked:
     left = now.residual + now.push @ (there[columns] - u[columns])
     own = there[: given.num_properties]
     cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
-    return _Ranked(cost, Start(start.effects, u), Start(start.effects, there), None if fixed else now)
+    return cost, Start(start.effects, there)
 
 
 # Align again with an effect taken out: late or softened forces displace the boundaries themselves.
