@@ -164,13 +164,14 @@ def _explanations(
 
 
 def _absurd(effects: Mapping[str, RobotEffect], best: Settled, causes: Sequence[str]) -> tuple[str, ...]:
-    """Values at a bound, which no robot has."""
+    """Values at a bound, which no robot has; but it may have nothing of a kind of friction, say."""
     out = []
     for name in causes:
         for short, value in best.point[name].items():
             p = effects[name].parameters[short]
             at_bound = any(
-                np.isfinite(b) and b != p.nominal and abs(value - b) < 1e-3 * p.sd for b in (p.low, p.high)
+                np.isfinite(b) and b not in (p.nominal, 0.0) and abs(value - b) < 1e-3 * p.sd
+                for b in (p.low, p.high)
             )
             if at_bound:
                 out.append(

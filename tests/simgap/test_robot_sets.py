@@ -107,3 +107,19 @@ def test_noise_leaves_the_floor():
     noise = np.sqrt(one.variance)[:, None] * rng.standard_normal((80, 2000))
     left = np.sum(sensor(noise + one.start @ rng.standard_normal((2, 2000)) / 3) ** 2, 0)
     assert cov.floor() == pytest.approx(np.mean(left), rel=0.02)
+
+
+def test_a_value_at_a_bound_is_doubted_but_for_nothing_at_all():
+    from types import SimpleNamespace
+
+    from simgap.robot_effects.base import RobotEffect
+    from simgap.robots.verdict import _absurd
+    from simgap.simulators.protocol import Parameter
+
+    known = {
+        "rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
+        "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)}),
+    }
+    best = SimpleNamespace(point={"rubs": {"loss": 0.0}, "weighs": {"mass": 0.3}})
+    assert _absurd(known, best, ["rubs"]) == ()  # type: ignore[arg-type]
+    assert _absurd(known, best, ["rubs", "weighs"]) == ("weighs mass 0.3 kg is no value of a robot's",)  # type: ignore[arg-type]
