@@ -157,13 +157,13 @@ def properties_table(body: dict[str, Any], measured=None) -> Table:
             elif entry is not None:
                 cells[2:] = (
                     estimate(entry["mean"], entry["sd"], shown),
-                    interval(*entry["interval_95"], shown, 2 * 1.96),
+                    interval(entry["interval_95"][0], entry["interval_95"][1], shown, 2 * 1.96),
                 )
             if measured:
                 value = measured.get(obj, {}).get(prop)
                 against = body.get("actual", {}).get(obj, {}).get(prop, {})
                 mark = "  disagrees" if against.get("disagrees") else ""
-                cells.append("" if value is None else f"{estimate(*value, shown)}{mark}")
+                cells.append("" if value is None else f"{estimate(value[0], value[1], shown)}{mark}")
             table.add_row(*cells)
     return table
 

@@ -289,7 +289,7 @@ def _values(
     if p["mean"] is None:
         return model, "not told by these logs", ""
     low, high = p["interval_90"] or (None, None)
-    ends = "" if None in (low, high) else told(lambda u: interval(low, high, u))
+    ends = "" if low is None or high is None else told(lambda u: interval(low, high, u))
     return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
 
 

@@ -186,7 +186,8 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
     given = set(known)
     rows = ({key: value for key, value in row.items() if key not in given} for row in equations)
     return {pivot: {key: -value for key, value in row.items() if isinstance(key, Source)}
-            for pivot, row in reduced(rows, lead).items() if len(unknown(row)) == 1}  # fmt: skip
+            for pivot, row in reduced(rows, lead).items()
+            if len(unknown(row)) == 1 and not isinstance(pivot, Source)}  # fmt: skip
 
 
 def labelled(subtask: str, obj: str | None) -> str:

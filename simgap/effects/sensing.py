@@ -138,7 +138,8 @@ def _crosstalk(values, xp):
 
 def _turned(values, xp):
     c, s = ([f(values[n]) for n in ("angle1", "angle2")] for f in (xp.cos, xp.sin))
-    return both_fingers(*(((c[k], -s[k]), (s[k], c[k])) for k in (0, 1)), xp)
+    one, two = (((c[k], -s[k]), (s[k], c[k])) for k in (0, 1))
+    return both_fingers(one, two, xp)
 
 
 FORCE_CROSSTALK = mixing(

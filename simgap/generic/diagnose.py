@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -389,7 +389,8 @@ def _fitted(
     starts = [[s.parameter.coordinate(v) for v in s.parameter.starts or (0.0,)] for s in mine]
     every = [[s[j % len(s)] for s in starts] for j in range(max(map(len, starts)))]
     descents = [
-        least_squares(left, np.clip(u, *ends), slopes, ends, ftol=CLOSE, max_nfev=STEPS) for u in every
+        least_squares(left, np.clip(u, *ends), jac=cast(Any, slopes), bounds=ends, ftol=CLOSE, max_nfev=STEPS)
+        for u in every
     ]
     u = min(descents, key=lambda d: d.cost).x
     return u, at(u), push(u)

@@ -41,8 +41,10 @@ class Own:
 
 def own_units(loaded: Loaded | None) -> dict[str, Own]:
     """Of columns whose unit is not SI, by column and by what they are of (joint:elbow)."""
-    out = {}
-    for name, m in ({} if loaded is None else loaded.map.columns).items():
+    out: dict[str, Own] = {}
+    if loaded is None:
+        return {}
+    for name, m in loaded.map.columns.items():
         if isinstance(m.unit, str) and m.factor != 1.0:
             own = Own(loaded.simulator.channels[name].unit, m.factor, m.offset, m.unit)
             out |= {name: own, f"{m.thing}:{m.name}": own}
@@ -72,8 +74,10 @@ def courses(found: RobotDiagnosis | Changes, own: Mapping[str, Own]) -> list[Cou
         simulated, corrected = (base_at(found.composed, p).rows for p in (found.old.point, found.point()))
     else:
         far = found.shrinkage
-        left = (found.plain, found.linear) if far is None else None
-        before, after = (far.plain, far.residual) if left is None else [x.residual for x in left]
+        if far is None:
+            before, after = found.plain.residual, found.linear.residual
+        else:
+            before, after = far.plain, far.residual
         simulated, corrected = rows.observed - before, rows.observed - after
     out = []
     for log in np.unique(rows.log):
@@ -85,12 +89,13 @@ def courses(found: RobotDiagnosis | Changes, own: Mapping[str, Own]) -> list[Cou
             says = own.get(channel, Own(si, 1.0, 0.0, si))
             gaps = np.flatnonzero(np.diff(rows.window[mine])) + 1
             square = (rows.observed - simulated)[mine] ** 2 / rows.variance[mine]
-            columns = [np.insert(values[mine], gaps, np.nan) for values in (rows.time, simulated, corrected)]
-            recorded = np.insert(rows.observed[mine], gaps, np.nan)
-            t, *runs = columns
+            t, recorded, without, with_it = (
+                np.insert(values[mine], gaps, np.nan)
+                for values in (rows.time, rows.observed, simulated, corrected)
+            )
             out.append(Course(
                 found.composed.recordings[log].name, channel, says.unit, t, says.of(recorded),
-                *map(says.of, runs), float(np.nanmean(square)),
+                says.of(without), says.of(with_it), float(np.nanmean(square)),
             ))  # fmt: skip
     return out
 
