@@ -121,8 +121,7 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 	$(BIN)/python -m experiments.write_tables
 
 sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
-	$(BIN)/python -m experiments.real.sts3215 $(SET) --part judge --cases 10 --output experiments/results/sts3215.json
-	$(BIN)/python -m experiments.real.sts3215 $(SET) --part mixed --cases 8 --output experiments/results/sts3215_mixed.json
+	$(BIN)/python -m experiments.real.sts3215 $(SET) --cases 5 --seed 1 --output experiments/results/sts3215.json
 	$(BIN)/python -m experiments.real.bam $(SET) --output experiments/results/sts3215_bam.json
 	$(BIN)/python -m experiments.write_tables
 
@@ -133,6 +132,7 @@ real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECOR
 	$(BIN)/python -m experiments.real.kth_handover $(REAL)/kth_handover
 	$(BIN)/python -m experiments.real.way_eeg_gal $(REAL)/way_eeg_gal_p1
 	$(BIN)/python -m experiments.real.robot_gap xl330 $(REAL)/xl330_pendulum --figures docs/figures
+	$(BIN)/python -m experiments.real.xl330_sheet $(REAL)/xl330_pendulum --diagnose --output experiments/results/xl330_sheet.json
 	$(BIN)/python -m experiments.real.robot_gap so101 $(REAL)/so101 --seconds 10 --figures docs/figures
 	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
 	$(BIN)/python -m experiments.real.collins $(REAL)/collins

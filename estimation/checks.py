@@ -3,7 +3,7 @@
 Posterior-predictive checks: could recordings like these come from the fitted model?
 
 For each channel the discrepancy is the weighted scatter of the grips' means about their prediction,
-with the scatter between grips at its prior median (it may not absorb what it is asked about): its
+with the scatter between grips at its prior median (it may not absorb what is checked): its
 posterior-predictive p-value compares observed with replicated scatter (Gelman, Meng, Stern 1996). A
 small p-value says that grips differ by more than sensors and hand explain.
 """

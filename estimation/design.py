@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from math import gcd, lcm
+from operator import itemgetter
 
 import numpy as np
 
@@ -43,7 +44,7 @@ from estimation.pads import (
     squeeze_give,
     unit_pads,
 )
-from hmmseg.contact.decompose import FREE, PROPERTIES, height_equations
+from hmmseg.contact.decompose import FREE, PROPERTIES, height_equations, reduced
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.task import BlockTask
@@ -63,14 +64,14 @@ def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str
     given = [
         _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
     ]
-    echelon = [_whole(row, order) for row in _echelon([_fractions(row) for row in given], order)]
+    echelon = [_whole(row, order) for row in _echelon(given, order)]
     single = [row for row in echelon if len(row) == 1]
     known = {name for row in single for name in row}
-    rest = [{k: v for k, v in row.items() if k not in known} for row in given]
-    left = [_whole(_fractions(row), order) for row in rest if row] + [r for r in echelon if len(r) > 1]
+    rest = [{k: Fraction(v) for k, v in row.items() if k not in known} for row in given]
+    left = [_whole(row, order) for row in rest if row] + [r for r in echelon if len(r) > 1]
     chosen = list(single)
     for row in sorted(left, key=_complexity):
-        if len(_echelon([_fractions(r) for r in [*chosen, row]], order)) > len(chosen):
+        if len(_echelon([*chosen, row], order)) > len(chosen):
             chosen.append(row)
     return sorted(single, key=lambda row: order.index(next(iter(row)))) + chosen[len(single) :]
 
@@ -79,29 +80,10 @@ def _complexity(row: Terms) -> tuple[int, bool, int]:
     return len(row), any(v < 0 for v in row.values()), sum(abs(v) for v in row.values())
 
 
-def _fractions(row: Mapping[str, int]) -> dict[str, Fraction]:
-    return {k: Fraction(v) for k, v in row.items()}
-
-
-def _echelon(rows: list[dict[str, Fraction]], order: Sequence[str]) -> list[dict[str, Fraction]]:
+def _echelon(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[dict[str, Fraction]]:
     """Rows of the reduced row echelon form, pivots in `order`."""
-    pivots: dict[str, dict[str, Fraction]] = {}
-    for row in rows:
-        for name, pivot in pivots.items():
-            if name in row:
-                row = _minus(row, row[name], pivot)
-        if not row:
-            continue
-        lead = next(name for name in order if name in row)
-        row = {k: v / row[lead] for k, v in row.items()}
-        pivots = {k: _minus(p, p[lead], row) if lead in p else p for k, p in pivots.items()}
-        pivots[lead] = row
-    return list(pivots.values())
-
-
-def _minus(a: dict[str, Fraction], factor: Fraction, b: dict[str, Fraction]) -> dict[str, Fraction]:
-    out = {k: a.get(k, Fraction(0)) - factor * b.get(k, Fraction(0)) for k in a | b}
-    return {k: v for k, v in out.items() if v}
+    exact = [{k: Fraction(v) for k, v in row.items()} for row in rows]
+    return list(reduced(exact, lambda row: next((name for name in order if name in row), None)).values())
 
 
 def _whole(row: Mapping[str, Fraction], order: Sequence[str]) -> Terms:
@@ -251,7 +233,7 @@ class PadDoubt:
     def slope_sd(self) -> np.ndarray:
         """Standard deviations (3,) by channel of what slopes are off by alike and each of its own.
 
-        A share of what truly gives, and beside it what noise of forces or places may make of all of them.
+        A share of what truly gives, and what noise of forces or places may make of all of them.
         """
         usual = SLOPE_SD * np.array([1.0, self.normal_give or 1.0, self.shear_give or 1.0])
         return np.hypot(usual, [0.0, *self.apart])
@@ -296,7 +278,7 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
 
 
 def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0.0) -> tuple[Nuisance, ...]:
-    """The deviations that the rig admits, and those that recordings show beside.
+    """The deviations that the rig admits, and those that recordings show as well.
 
     `biased` (4,): extra prior sd of each force bias [N]; `doubt`: of the pads' compliances; `touch_sd`
     [m]: how well the distance is known at which the fingers touch a block.
@@ -406,9 +388,11 @@ def pad_doubt(
             apart = shared_error(one[2], one[1])
             if one[0].size:
                 middle, error = middle_share(one[0], one[1], 0.0)
-                surest[channel] = min(surest[channel], (middle, float(np.hypot(error, apart))), key=sd_of)
+                surest[channel] = min(
+                    surest[channel], (middle, float(np.hypot(error, apart))), key=itemgetter(1)
+                )
             said = misstated(one[0], one[1], stated, admitted if stated else 0.0, apart)
-            found[channel] = max(found[channel], said, key=lambda share_and_odds: share_and_odds[1])
+            found[channel] = max(found[channel], said, key=itemgetter(1))
         if not stated:
             possible[channel] = possible_share(mine[0], mine[1])
     normal, shear = (
@@ -420,11 +404,6 @@ def pad_doubt(
         (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
         seen=((-surest[DISTANCE][0], surest[DISTANCE][1]), surest[RISE]),
     )  # fmt: skip
-
-
-def sd_of(found: tuple[float, float]) -> float:
-    """The second of a value and its standard deviation."""
-    return found[1]
 
 
 def _usual(weighed: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:

@@ -2,8 +2,8 @@
 
 Coulomb's law: |shear| <= mu x normal force in every held sample (the paper's Table 3 takes the
 largest ratio of the recorded ones). The bound here is the posterior of the largest true ratio
-(ratio_bound.py); a finger that slips (slip.py) is at the limit, so the bound is then mu itself.
-Where a block is slid, the net force tells the friction against its support (ground.py).
+(`largest_ratio`); a finger that slips (`slip_evidence`) is at the limit, so the bound is then mu itself.
+Where a block is slid, the net force tells the friction against its support (`ground_friction`).
 """
 
 from __future__ import annotations

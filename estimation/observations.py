@@ -9,8 +9,8 @@ Three observations a grip (the span from pickup to place of one move):
 
 Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2
 pooled over grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal
-1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask. A hand that
-rolls is read as if it were level, and blocks that slide in the grip lose what slid.
+1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask. Places of blocks
+that slid in the grip count for less.
 """
 
 from __future__ import annotations
@@ -24,16 +24,13 @@ import numpy as np
 from estimation.pads import SLOPE_SD, UNSTATED, Slope, landing, middle_share, shear_give, slopes_within
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
-from hmmseg.hand.roll import with_roll
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.io.trial import ROLL
 from hmmseg.levels import TAIL
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.emissions import acceleration, thin
-from hmmseg.segmentation.posteriors import tilts
 from hmmseg.tables import Brief
 
 FARTHEST_LAG = 11  # numerics: samples; autocorrelations beyond are noise
@@ -284,9 +281,9 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
                 counts[move][key] = (masks[:, members].any(axis=1) & (weight > 0)).sum(axis=1)
         free = best[[s.index for s in steps if s.state == FREE]].any(axis=0)
         free &= np.isfinite(thinned.fx1 + thinned.fy1 + thinned.fx2 + thinned.fy2)
-        # Beside a contact change one finger alone may touch, and the sample next to it be contact already.
-        beside = 1 + int(np.ceil(APART / float(np.median(np.diff(thinned.t)))))
-        free &= np.convolve(~free, np.ones(2 * beside + 1), "same") == 0
+        # Next to a contact change one finger alone may touch, and a sample be contact already.
+        margin = 1 + int(np.ceil(APART / float(np.median(np.diff(thinned.t)))))
+        free &= np.convolve(~free, np.ones(2 * margin + 1), "same") == 0
         robust = np.zeros((len(FORCE_CHANNELS), free.size))
         for row, name in zip(robust, FORCE_CHANNELS, strict=True):
             scale = _free_scale(thinned, name, free)
@@ -338,35 +335,6 @@ def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: st
     if not residuals:
         return 1.0
     return max(robust_sd(np.concatenate(residuals)), 1e-9)
-
-
-# Of velocities only means are read, which a roll leaves alone.
-TURNED = ("x1", "y1", "x2", "y2", "fx1", "fy1", "fx2", "fy2")
-
-
-def without_roll(aligned: AlignedTrials) -> AlignedTrials:
-    """The same with what each carry shows of a roll taken out of trials and signals.
-
-    Trials whose roll was recorded are level as they were read.
-    """
-    return replace(aligned, trials=tuple(_levelled(trial, aligned) for trial in aligned.trials))
-
-
-def _levelled(trial: TrialAlignment, aligned: AlignedTrials) -> TrialAlignment:
-    s = trial.signals
-    if ROLL in trial.trial.channels or trial.trial.inertia is not None:
-        return trial  # a wrist's fingers are made up level
-    medians = [b.quantile(0.5) for b in trial.boundaries]
-    edges = np.maximum.accumulate([float(s.t[0]), *medians, float(s.t[-1])])
-    ends = list(pairwise(edges))
-    roll = np.zeros(s.t.size)
-    for inside, tilt, _ in tilts(s, pads_of(aligned.rig), ends, aligned.subtasks):
-        roll[inside] = np.nan_to_num(tilt)
-    if not roll.any():
-        return trial
-    level = with_roll(trial.trial, roll)
-    changed = {name: level.channels[name] for name in TURNED}
-    return replace(trial, trial=level, signals=replace(s, **changed))
 
 
 SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide

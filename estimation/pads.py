@@ -79,7 +79,7 @@ def slope(
     """Robust slope of readings over the give, each group (num_timesteps,) with a level of its own.
 
     `reading` is what `place`, which positions alone tell, becomes with the nominal give; `place` grows with
-    the give. The rate of the give is fitted beside it: it takes what a pad's viscosity, or a force that is
+    the give. The rate of the give is fitted as well: it takes what a pad's viscosity, or a force that is
     late, adds while the give changes. `t` [s]; `noise`: sd of one reading at least; `sds`: those that sensors
     are known to have, of a give and of a place [m]. None where too few samples tell.
     """
@@ -144,7 +144,7 @@ def _less(values: np.ndarray, others: np.ndarray, trust: np.ndarray) -> np.ndarr
 
 
 def middle_share(shares: np.ndarray, variances: np.ndarray, error: np.ndarray | float) -> tuple[float, float]:
-    """Weighted median of slopes (K,) and its standard error, each off by `error` beside its variance."""
+    """Weighted median of slopes (K,) and its standard error, each off by `error` besides its variance."""
     order = np.argsort(shares)
     cumulative = np.cumsum((1 / (variances + error**2))[order])
     middle = float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
@@ -165,7 +165,7 @@ def misstated(
     `stated`: whether the rig has pads that give; of those that it calls rigid any give is a surprise;
     `admitted`: sd of the share by [systematic]. The weighted median, so that no single grip decides. `apart`:
     what all of them may be off by together. A rig that is right leaves the share normal about 0 with these
-    errors, a wrong one (MISSTATED) with the foams' spread beside; both are 0 where slopes speak for the rig.
+    errors, a wrong one (MISSTATED) with the foams' spread added; both are 0 where slopes speak for the rig.
     """
     if not shares.size:
         return 0.0, 0.0

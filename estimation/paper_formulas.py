@@ -16,7 +16,7 @@ and pads do to it is not in it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,13 +72,9 @@ class PluginEstimates:
 
     def to_json(self) -> dict:
         """The `properties` and `reasons` of the JSON of `identify`."""
-        return {
-            "properties": {
-                name: {key: None if value is None else value.to_json() for key, value in entry.items()}
-                for name, entry in self.properties.items()
-            },
-            "reasons": dict(self.reasons),
-        }
+        shown = {name: {key: None if value is None else value.to_json() for key, value in entry.items()}
+                 for name, entry in self.properties.items()}  # fmt: skip
+        return {"properties": shown, "reasons": dict(self.reasons)}
 
 
 @dataclass(frozen=True)
@@ -116,8 +112,17 @@ def estimate_plugin(
 ) -> PluginEstimates:
     """The paper's estimates of every object of a task from its segmented trials.
 
-    `states` are the contact states of each trial's samples (by default those of the paper's
-    thresholds). ValueError if the sequences differ in length.
+    Args:
+        trials_signals: one a trial.
+        segmentations: one a trial.
+        task: of all trials.
+        states: contact states of each trial's samples; by default those of the paper's thresholds.
+
+    Returns:
+        Mean and standard deviation of every property, or why it has none.
+
+    Raises:
+        ValueError: the sequences differ in length.
     """
     labels = [label_states(s) for s in trials_signals] if states is None else list(states)
     task = _as_performed(task, segmentations)
@@ -132,8 +137,8 @@ def estimate_plugin(
     reasons: dict[str, str] = {}
     for name in task.objects:
         found = {
-            "weight": _over_carries(trials, steps, name, "weight", lambda s: s.fy, TRIM),
-            "width": _over_carries(trials, steps, name, "width", lambda s: s.distance, 0.0),
+            "weight": _over_carries(trials, steps, name, "weight", "fy", TRIM),
+            "width": _over_carries(trials, steps, name, "width", "distance", 0.0),
             "height": heights.get(name),
             "friction": _friction(trials, steps, name),
         }
@@ -141,7 +146,10 @@ def estimate_plugin(
         for key, value in found.items():
             if value is None:
                 shown = "no trial shows enough identified samples of the subtasks it needs"
-                reasons[f"{name}.{key}"] = known[name][key].reason or _no_carry(steps, name, key) or shown
+                carried = any(s.state == ABOVE_GROUND and s.object == name for s in steps)
+                if key in ("weight", "width") and not carried:
+                    shown = f"no move carries {name}, and the formula averages over a carry"
+                reasons[f"{name}.{key}"] = known[name][key].reason or shown
     return PluginEstimates(properties, reasons)
 
 
@@ -186,22 +194,12 @@ def _pooled(means: Sequence[_Mean], unit: str, names: Sequence[str]) -> Estimate
 
 
 def _over_carries(
-    trials: Sequence[_Trial],
-    steps: tuple[Subtask, ...],
-    name: str,
-    key: str,
-    signal: Callable[[Signals], np.ndarray],
-    trim: float,
+    trials: Sequence[_Trial], steps: tuple[Subtask, ...], name: str, key: str, signal: str, trim: float
 ) -> Estimate | None:
     carries = [s for s in steps if s.state == ABOVE_GROUND and s.object == name]
-    means, names = [], []
-    for trial in trials:
-        for carry in carries:
-            mean = _mean(signal(trial.signals)[trial.samples(carry.index, trim)])
-            if mean is not None:
-                means.append(mean)
-                names.append(f"{carry.name} {carry.object}")
-    return _pooled(means, UNITS[key], names)
+    found = [(_mean(getattr(trial.signals, signal)[trial.samples(s.index, trim)]), s.label)
+             for trial in trials for s in carries]  # fmt: skip
+    return _pooled([mean for mean, _ in found if mean], UNITS[key], [label for mean, label in found if mean])
 
 
 def _heights(
@@ -227,15 +225,15 @@ def _heights(
         for name, weights in zip(np.array(task.objects)[determined], inverse[determined], strict=True):
             by_name[name].append(_combined(weights, rises))
             moves = {move for move, weight in zip(measured, weights, strict=True) if abs(weight) > 1e-9}
-            used[name] += [f"{s.name} {s.object}" for s in _ends(steps, moves)]
+            used[name] += [s.label for s in _ends(steps, moves)]
     return {name: _pooled(by_name[name], UNITS["height"], used[name]) for name in task.objects}
 
 
 def _combined(weights: np.ndarray, rises: Sequence[_Mean]) -> _Mean:
     """Weighted sum of independent means; its absolute value, as Table 3 has it."""
-    sd, error = (math.sqrt(weights**2 @ np.array(v) ** 2) for v in
-                 ([r.sd for r in rises], [r.error for r in rises]))  # fmt: skip
-    return _Mean(abs(float(weights @ [r.mean for r in rises])), sd, error)
+    mean, sd, error = np.array([(m.mean, m.sd, m.error) for m in rises]).T
+    return _Mean(abs(float(weights @ mean)), float(np.hypot.reduce(weights * sd)),
+                 float(np.hypot.reduce(weights * error)))  # fmt: skip
 
 
 def _ends(steps: tuple[Subtask, ...], moves: set[int]) -> list[Subtask]:
@@ -247,9 +245,8 @@ def _rise(trial: _Trial, steps: tuple[Subtask, ...], move: int) -> _Mean | None:
     pickup, place = (_mean(trial.signals.y2[trial.samples(s.index)]) for s in _ends(steps, {move}))
     if pickup is None or place is None:
         return None
-    return _Mean(
-        place.mean - pickup.mean, math.hypot(place.sd, pickup.sd), math.hypot(place.error, pickup.error)
-    )
+    sd, error = math.hypot(place.sd, pickup.sd), math.hypot(place.error, pickup.error)
+    return _Mean(place.mean - pickup.mean, sd, error)
 
 
 def _friction(trials: Sequence[_Trial], steps: tuple[Subtask, ...], name: str) -> FrictionBound | None:
@@ -263,10 +260,3 @@ def _friction(trials: Sequence[_Trial], steps: tuple[Subtask, ...], name: str) -
                 best = max(best, float(np.nanmax(ratio)))
                 names.append(f"{step.name} {name}")
     return FrictionBound(best, tuple(dict.fromkeys(names))) if names else None
-
-
-def _no_carry(steps: tuple[Subtask, ...], name: str, key: str) -> str | None:
-    carried = any(s.state == ABOVE_GROUND and s.object == name for s in steps)
-    if key in ("weight", "width") and not carried:
-        return f"no move carries {name}, and the formula averages over a carry"
-    return None

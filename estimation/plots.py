@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from scipy.special import ndtri
 from estimation.identification import Identification
 from estimation.observations import channel_values, gravity_factor
 from estimation.report import Actual
+from hmmseg import numbers
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE
 from hmmseg.numbers import SHOWN
 from hmmseg.plot.spans import name_spans, shade_spans
@@ -25,44 +25,46 @@ from hmmseg.segmentation.spans import Segmentation
 
 
 @dataclass(frozen=True)
-class PredictedSignal:
-    """A recorded signal (num_timesteps,) and the central 90 % band of a new sample.
+class Prediction:
+    """A recorded signal less what the model predicts of it, and the band of a new sample, (num_timesteps,).
 
-    `low`, `median`, `high` are NaN where the model predicts nothing of the signal. SI units.
+    `low` and `high` bound the central 90 % about 0, NaN where nothing is predicted; in units of the `label`.
     """
 
-    name: str
+    label: str
     observed: np.ndarray
     low: np.ndarray
-    median: np.ndarray
     high: np.ndarray
 
+    @property
+    def coverage(self) -> float:
+        """Share of the predicted samples that lie in their band; NaN where there is none."""
+        there = np.isfinite(self.observed) & np.isfinite(self.low)
+        inside = (self.observed >= self.low) & (self.observed <= self.high)
+        return float(inside[there].mean()) if there.any() else float("nan")
 
-def predicted_signals(found: Identification, trial: int) -> tuple[np.ndarray, list[PredictedSignal]]:
-    """Times (num_timesteps,) [s] and, of one trial, the net vertical force and finger distance."""
+
+def predictions(found: Identification, trial: int) -> tuple[np.ndarray, list[Prediction]]:
+    """Times (num_timesteps,) [s] of one trial; its net vertical force and finger distance as predicted."""
     weighed = found.weighed[trial]
     signals, masks = weighed.signals, weighed.masks.mean(axis=0) > 0.5
     factor = gravity_factor(signals, found.rig)
     given = signals.distance - channel_values(signals, found.rig)["distance"]
-    force, distance = (np.full((2, signals.t.size), np.nan) for _ in range(2))
-    for step in found.aligned.subtasks:
-        inside = masks[step.index]
-        obj = str(step.object)
-        if step.state == ABOVE_GROUND and (obj, "weight") in found.names:
-            weight = found.of(obj, "weight")
-            force[0, inside] = weight.mean() * factor[inside]
-            force[1, inside] = np.hypot(np.sqrt(found.noise.variance["force"]), weight.std())
-        if step.state != FREE and (obj, "width") in found.names:
-            width = found.of(obj, "width")
-            distance[0, inside] = width.mean() + given[inside]
-            distance[1, inside] = np.hypot(np.sqrt(found.noise.variance["distance"]), width.std())
-    half = float(ndtri(0.95))
-    return signals.t, [
-        PredictedSignal(name, observed, mean - half * sd, mean, mean + half * sd)
-        for name, observed, (mean, sd) in (
-            ("net vertical force", signals.fy, force), ("finger distance", signals.distance, distance),
-        )
-    ]  # fmt: skip
+    out = []
+    for label, prop, key, scale, observed in (
+        ("Net fy less\npredicted [N]", "weight", "force", 1.0, signals.fy),
+        ("Distance less\npredicted [mm]", "width", "distance", 1e3, signals.distance),
+    ):
+        mean, half = np.full((2, signals.t.size), np.nan)
+        for step in found.aligned.subtasks:
+            held = step.state == ABOVE_GROUND if prop == "weight" else step.state != FREE
+            if held and (str(step.object), prop) in found.names:
+                inside, draws = masks[step.index], found.of(str(step.object), prop)
+                expected = draws.mean() * factor if prop == "weight" else draws.mean() + given
+                mean[inside] = expected[inside]
+                half[inside] = ndtri(0.95) * np.hypot(np.sqrt(found.noise.variance[key]), draws.std())
+        out.append(Prediction(label, scale * (observed - mean), -scale * half, scale * half))
+    return signals.t, out
 
 
 SIZE = 1.25  # look: in, a panel
@@ -97,10 +99,12 @@ def draw_corner(
         near = truth is not None and low[i] - reach <= truth <= high[i] + reach
         lines.append(truth if near else None)
         ranges.append((min(a, truth - pad), max(b, truth + pad)) if near and truth is not None else (a, b))
-    plot = _corner_function()
+    with warnings.catch_warnings():  # corner's ArviZ announces its own refactoring at import
+        warnings.filterwarnings("ignore", message="\\s*ArviZ is undergoing", category=FutureWarning)
+        from corner.corner import corner
     size = SIZE * len(names) + LEFT + RIGHT
     with canvas(path, width=size, height=size, layout=None) as figure:
-        plot(
+        corner(
             shown, fig=figure, labels=labels, range=ranges, truths=lines, truth_color=RED, color=BLUE,
             bins=30, smooth=0.8, quantiles=(0.025, 0.5, 0.975), plot_datapoints=False,
             plot_density=False, fill_contours=True, levels=(0.393, 0.68, 0.95), max_n_ticks=3,
@@ -114,14 +118,6 @@ def draw_corner(
         if any(line is not None for line in lines):
             figure.text(1 - RIGHT / size, 0.99, "lines: measured", color=RED, ha="right", va="top")
         return axes
-
-
-def _corner_function() -> Callable:
-    """corner's function; its ArviZ announces its own refactoring at import, which helps no user."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="\\s*ArviZ is undergoing", category=FutureWarning)
-        from corner.corner import corner
-    return corner
 
 
 def _measured(actual: Actual | None, obj: str, prop: str) -> float | None:
@@ -185,15 +181,14 @@ def _draw_row(
         measured_sd = 100 * measured[1] / measured[0]
         ax.fill_betweenx([y - 0.32, y + 0.32], -measured_sd, measured_sd, color=GREY, alpha=0.4, lw=0)
         reach = measured_sd
-    if estimate is None:
-        ax.text(0, y, " not determined ", va="center", ha="center", fontsize=7.5, style="italic",
-                color=GREY, backgroundcolor="white")  # fmt: skip
-        note(("–" + _against(measured, factor)) if measured else "")
-        return reach
-    if "mean" not in estimate:
-        ax.text(0, y, " lower bound only ", va="center", ha="center", fontsize=7.5, style="italic",
-                color=GREY, backgroundcolor="white")  # fmt: skip
-        note(f"≥ {estimate['lower_bound'] * factor:.2f} {unit}".rstrip() + _against(measured, factor))
+    if estimate is None or "mean" not in estimate:
+        said = " not determined " if estimate is None else " lower bound only "
+        ax.text(0, y, said, va="center", ha="center", fontsize=7.5, style="italic", color=GREY,
+                backgroundcolor="white")  # fmt: skip
+        bound = "–" if measured else ""
+        if estimate is not None:
+            bound = f"≥ {estimate['lower_bound'] * factor:.2f} {unit}".rstrip()
+        note(bound + _against(measured, factor))
         return reach
     reference = estimate["mean"] if measured is None else measured[0]
     for interval, width in (("interval_95", 1.0), ("interval_68", 3.2)):
@@ -202,67 +197,27 @@ def _draw_row(
         reach = max(reach, *map(abs, ends))
     centre = 100 * (estimate["mean"] / reference - 1)
     ax.plot(centre, y, "o", color=BLUE, ms=3.5, mfc=BLUE if measured else "white", zorder=3)
-    digits = _digits(estimate["sd"] * factor)
-    shown = f"{estimate['mean'] * factor:.{digits}f} ± {estimate['sd'] * factor:.{digits}f} {unit}"
-    note(shown.rstrip() + _against(measured, factor))
+    note(numbers.estimate(estimate["mean"], estimate["sd"], SHOWN[key]) + _against(measured, factor))
     return max(reach, abs(centre))
 
 
 def _against(measured: tuple[float, float] | None, factor: float) -> str:
-    if measured is None:
-        return ""
-    value, sd = measured[0] * factor, measured[1] * factor
-    return f"  ({value:.{max(0, _digits(sd) - 1)}f})" if sd > 0 else f"  ({value:.4g})"
-
-
-def _digits(sd: float) -> int:
-    """Decimals that show two digits of a standard deviation."""
-    return max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 4
-
-
-UNITS = {
-    "net vertical force": ("Net fy less\npredicted [N]", 1.0),
-    "finger distance": ("Distance less\npredicted [mm]", 1e3),
-}
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A recorded signal and what the model predicts of it, all (num_timesteps,) as shown.
-
-    `low` and `high` bound the central 90 % of a new sample, NaN where nothing is predicted.
-    """
-
-    label: str
-    observed: np.ndarray
-    low: np.ndarray
-    median: np.ndarray
-    high: np.ndarray
-
-    @property
-    def coverage(self) -> float:
-        """Share of the predicted samples that lie in their band; NaN where there is none."""
-        there = np.isfinite(self.observed) & np.isfinite(self.low)
-        inside = (self.observed >= self.low) & (self.observed <= self.high)
-        return float(inside[there].mean()) if there.any() else float("nan")
+    return "" if measured is None else f"  ({numbers.plain(measured[0] * factor, 4)})"
 
 
 def draw_predictive(
-    t: np.ndarray,
-    predictions: Sequence[Prediction],
-    path: Path | None = None,
-    segmentation: Segmentation | None = None,
+    t: np.ndarray, shown: Sequence[Prediction], path: Path | None, segmentation: Segmentation
 ) -> list[Axes]:
-    """Recorded samples at t (num_timesteps,) [s] against predicted 90 % bands, a panel a signal.
+    """Recorded samples at t (num_timesteps,) [s] in predicted 90 % bands, a panel a signal.
 
     Samples outside their band are marked; each panel says which share lies inside.
     """
-    with canvas(path, height=1.5 + 1.25 * len(predictions)) as figure:
-        axes = list(np.atleast_1d(figure.subplots(len(predictions), 1, sharex=True)))
-        for ax, p in zip(axes, predictions, strict=True):
+    with canvas(path, height=1.5 + 1.25 * len(shown)) as figure:
+        axes = list(np.atleast_1d(figure.subplots(len(shown), 1, sharex=True)))
+        for ax, p in zip(axes, shown, strict=True):
             ax.plot(t, p.observed, ".", color=INK, ms=1.8)
             ax.fill_between(t, p.low, p.high, color=BLUE, alpha=0.35, lw=0)
-            ax.plot(t, p.median, color=BLUE, lw=0.9)
+            ax.axhline(0, color=BLUE, lw=0.9)
             outside = (p.observed < p.low) | (p.observed > p.high)
             ax.plot(t[outside], p.observed[outside], "x", color=RED, ms=3.5, mew=0.8)
             ax.set_ylabel(p.label)
@@ -270,10 +225,8 @@ def draw_predictive(
             if np.isfinite(p.coverage):
                 ax.text(0.995, 0.95, f"{100 * p.coverage:.0f} % inside", transform=ax.transAxes, ha="right",
                         va="top", fontsize=7)  # fmt: skip
-            if segmentation is not None:
-                shade_spans(ax, segmentation)
-        if segmentation is not None:
-            name_spans(axes[0], segmentation)
+            shade_spans(ax, segmentation)
+        name_spans(axes[0], segmentation)
         figure.align_ylabels(axes)
         axes[-1].set_xlabel("Time [s]")
         axes[-1].set_xlim(t[0], t[-1])
@@ -286,10 +239,4 @@ def draw_predictive(
 
 def draw_check(found: Identification, trial: int, path: Path | None = None) -> list[Axes]:
     """One trial's recorded signals less what the fitted model predicts, in its band."""
-    t, predicted = predicted_signals(found, trial)
-    shown = []
-    for p in predicted:
-        label, factor = UNITS[p.name]
-        around = (factor * (v - p.median) for v in (p.observed, p.low, p.median, p.high))
-        shown.append(Prediction(label, *around))
-    return draw_predictive(t, shown, path, found.segmentations[trial])
+    return draw_predictive(*predictions(found, trial), path, found.segmentations[trial])

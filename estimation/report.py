@@ -14,6 +14,7 @@ from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import CONTRADICTS
+from hmmseg.numbers import SHOWN, estimate, interval, plain
 
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
 
@@ -33,10 +34,19 @@ LIMITS = {"weight": (1e-4, 1e4), "width": (1e-5, 10.0), "height": (1e-5, 10.0), 
 
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
-    """Measured (value, standard deviation) of every property given, by object and property.
+    """Properties measured apart from the trials.
 
-    N for a weight, m for width and height, "1" for friction. InputError for an object that is
-    not among `objects` (a task's), an unknown key, a wrong unit or a number that cannot be.
+    Args:
+        path: a TOML file with tables [OBJECT.PROPERTY] of unit, value and sd.
+        objects: names of the task's objects.
+
+    Returns:
+        (value, standard deviation) by object and property: N for a weight, m for width and height, 1 for
+        friction.
+
+    Raises:
+        InputError: an object that is not among `objects`, an unknown key, a wrong unit or a number that
+            cannot be.
     """
     return parse_actual(read_toml(path), objects, str(path))
 
@@ -58,11 +68,18 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
 
 
 def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
-    """Identified `properties` (as in identify's JSON) beside measured values, by object and property.
+    """Identified properties compared with measured values.
 
-    Each with `relative_deviation`, `z` (in sds of both together), `inside_95` and `disagrees`: beyond
-    CONTRADICTS sds and beyond `smallest`, the relative deviation that matters. Of a friction that has a
-    lower bound alone it can only be said that the measured one lies below. Null where not identified.
+    Args:
+        properties: as in identify's JSON.
+        measured: value and standard deviation by object and property.
+        smallest: relative deviation that matters.
+
+    Returns:
+        By object and property: `value`, `sd`, and where the property was identified `relative_deviation`, `z`
+        (in sds of both together), `inside_95` and `disagrees`, which is beyond CONTRADICTS sds and beyond
+        `smallest`. Of a friction with a lower bound alone it can only be said that the measured one lies
+        below.
     """
     out: dict[str, Any] = {}
     for obj, entries in measured.items():
@@ -90,26 +107,19 @@ def disagreements(properties: dict[str, Any], compared: dict[str, Any]) -> list[
         for prop, row in entries.items():
             if not row.get("disagrees"):
                 continue
-            found, unit = properties[obj][prop], UNITS[prop]
-            value = _shown(row["value"], row["sd"], unit)
+            found, shown = properties[obj][prop], SHOWN[prop]
+            value = estimate(row["value"], row["sd"], shown)
             if "z" not in row:
                 bound = f"{found['lower_bound']:.3g}"
                 lines.append(f"{obj}.{prop}: measured as {value}, but it was held at {bound}")
                 continue
-            share, said = 100 * row["relative_deviation"], _shown(found["mean"], found["sd"], unit)
+            share, said = 100 * row["relative_deviation"], estimate(found["mean"], found["sd"], shown)
             side = "above" if share > 0 else "below"
             lines.append(
                 f"{obj}.{prop}: the recordings say {said}, {abs(share):.2g} % {side} what was measured "
                 f"({value}), {abs(row['z']):.0f} standard deviations away: one of the two is wrong"
             )
     return lines
-
-
-def _shown(value: float, sd: float, unit: str) -> str:
-    """As `0.4656 +- 0.0014 N`, lengths in mm, with the digits that the deviation leaves."""
-    factor, name = (1e3, " mm") if unit == "m" else (1.0, "" if unit == "1" else f" {unit}")
-    digits = 4 if sd <= 0 else min(max(1 - math.floor(math.log10(sd * factor)), 0), 6)
-    return f"{value * factor:.{digits}f} +- {sd * factor:.{digits}f}{name}"
 
 
 def _parse_entry(entry: Any, prop: str, where: str) -> tuple[float, float]:
@@ -133,9 +143,6 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
     return float(value)
 
 
-SHOWN = {"weight": (1.0, "N", 4), "width": (100.0, "cm", 4), "height": (100.0, "cm", 4)}
-
-
 def properties_table(body: dict[str, Any], measured=None) -> Table:
     """The properties for people to read, lengths in cm as the paper has them."""
     table = Table(title=f"properties ({body['method']})", title_justify="left")
@@ -143,28 +150,22 @@ def properties_table(body: dict[str, Any], measured=None) -> Table:
         table.add_column(head, no_wrap=head != "estimate")
     for obj, entries in body["properties"].items():
         for prop, entry in entries.items():
-            cells = [obj, prop, *_cells(prop, entry)]
+            shown = SHOWN[prop]
+            cells = [obj, prop, "unknown", ""]
+            if entry is not None and entry.get("mean") is None:
+                cells[2] = f">= {plain(entry['lower_bound'])}"
+            elif entry is not None:
+                cells[2:] = (
+                    estimate(entry["mean"], entry["sd"], shown),
+                    interval(*entry["interval_95"], shown, 2 * 1.96),
+                )
             if measured:
                 value = measured.get(obj, {}).get(prop)
-                factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
                 against = body.get("actual", {}).get(obj, {}).get(prop, {})
                 mark = "  disagrees" if against.get("disagrees") else ""
-                cells.append("" if value is None else f"{value[0] * factor:.{digits}f} {unit}{mark}")
+                cells.append("" if value is None else f"{estimate(*value, shown)}{mark}")
             table.add_row(*cells)
     return table
-
-
-def _cells(prop: str, entry: dict[str, Any] | None) -> tuple[str, str]:
-    if entry is None:
-        return "unknown", ""
-    factor, unit, digits = SHOWN.get(prop, (1.0, "", 3))
-    if entry.get("mean") is None:
-        return f">= {entry['lower_bound']:.{digits}f}", ""
-    low, high = (f"{v * factor:.{digits}f}" for v in entry["interval_95"])
-    return (
-        f"{entry['mean'] * factor:.{digits}f} +- {entry['sd'] * factor:.{digits}f} {unit}",
-        f"{low} to {high}",
-    )
 
 
 def inference_data(posterior: dict[str, np.ndarray]) -> Any:

@@ -43,9 +43,6 @@ Off = tuple[str, Callable[..., Any]]
 SPECIAL: dict[str, tuple[Off, ...]] = {
     "toe": (("hmmseg.segmentation.pads.find", lambda readings: NONE),),
     "lateness": (("hmmseg.segmentation.pads.lateness", lambda *a: None),),
-    "blocks that hang askew": (
-        ("hmmseg.segmentation.posteriors.corner_drops", lambda s, *a: (np.zeros(s.t.size), 0.0)),
-    ),
     "brief touches": (("hmmseg.segmentation.free_contacts._tapped", lambda *a: []),),
     "ringing loads": (("hmmseg.segmentation.pads.ringing", lambda *a: []),),
     "disagreement of force and place": (("hmmseg.segmentation.changes._discrepancy", lambda *a: 0.0),),

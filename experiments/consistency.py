@@ -13,7 +13,7 @@ import numpy as np
 
 from estimation.consistency import WELL_MADE, ties
 from estimation.design import build
-from estimation.observations import aligned_weights, with_slides, without_roll
+from estimation.observations import aligned_weights, with_slides
 from estimation.sampler import CERTAIN
 from hmmseg.api import align
 from hmmseg.errors import InputError
@@ -30,10 +30,9 @@ def main(folders: list[str]) -> None:
         except InputError as error:
             print(f"{folder.name}: {error}", flush=True)
             continue
-        level = without_roll(aligned)
-        weighed, noise = aligned_weights(level, np.random.default_rng(0))
+        weighed, noise = aligned_weights(aligned, np.random.default_rng(0))
         weighed = with_slides(weighed, noise, aligned.rig)
-        every = list(ties(level, weighed, build(level, weighed, noise)))
+        every = list(ties(aligned, weighed, build(aligned, weighed, noise)))
         cases, alarms = cases + 1, alarms + any(tie.probability > CERTAIN for tie in every)
         for tie in every:
             found[tie.kind].append(tie.value / np.hypot(1.0, tie.error / WELL_MADE[tie.kind]))

@@ -27,9 +27,16 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
-from hmmseg.contact.decompose import subtasks
+from hmmseg.contact.decompose import Subtask, subtasks
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg.segmentation.thresholds import Rule, segment_qualitative
+from hmmseg.segmentation.thresholds import (
+    Assignment,
+    Order,
+    StateLabels,
+    agreement,
+    monotone_order,
+    segment_qualitative,
+)
 
 RESULTS = Path(__file__).parent / "results"
 Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
@@ -43,12 +50,30 @@ def by_hmm(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation],
     return found.segmentations, found.to_json()["properties"]
 
 
-def by_rule(rule: Rule) -> Method:
-    """Spans of the thresholds, with this rule of order, and the paper's estimates."""
+def first_change_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assignment:
+    """Each subtask begins at the first sample after the last one's that shows its state."""
+    agrees = agreement(labels, steps)
+    length, count = agrees.shape
+    first, last, hits = np.full(count, -1), np.full(count, -1), 0
+    for s in range(count):
+        begin = 0 if s == 0 else first[s - 1] + 1
+        shown = np.flatnonzero(agrees[begin:, s])
+        if not shown.size:
+            break
+        first[s] = begin + shown[0]
+    reached = np.flatnonzero(first >= 0)
+    for s in reached:
+        last[s] = first[s + 1] - 1 if s + 1 in reached else length - 1
+        hits += int(agrees[first[s] : last[s] + 1, s].sum())
+    return Assignment(first, last, hits / length)
+
+
+def by_thresholds(order: Order) -> Method:
+    """Spans of the thresholds, in order by this rule, and the paper's estimates."""
 
     def run(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation], dict]:
         pairs = zip(case.trials[group], case.signals[group], strict=True)
-        spans = [segment_qualitative(trial, signals, case.task, rule=rule) for trial, signals in pairs]
+        spans = [segment_qualitative(trial, signals, case.task, order=order) for trial, signals in pairs]
         return spans, estimate_plugin(case.signals[group], spans, case.task).to_json()["properties"]
 
     return run
@@ -56,8 +81,8 @@ def by_rule(rule: Rule) -> Method:
 
 METHODS: dict[str, Method] = {
     "hmm": by_hmm,
-    "qualitative": by_rule("monotone"),
-    "first-change": by_rule("first-change"),
+    "qualitative": by_thresholds(monotone_order),
+    "first-change": by_thresholds(first_change_order),
 }
 
 

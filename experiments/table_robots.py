@@ -62,9 +62,9 @@ def check() -> str | None:
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
 
 
-def changed(name: str = "sts3215") -> str | None:
+def changed() -> str | None:
     """What changed of a servo."""
-    found = load(name)
+    found = load("sts3215")
     if found is None:
         return None
     rows = []
@@ -79,16 +79,6 @@ def changed(name: str = "sts3215") -> str | None:
         f"{seconds[len(seconds) // 2]:.0f} s. Code of {found['made_by']}."
     )
     return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
-
-
-def mixed() -> str | None:
-    """What changed of a servo, from one half of the configurations to the other."""
-    return changed("sts3215_mixed")
-
-
-def first() -> str | None:
-    """What changed of a servo, as the first run on the judging half had it."""
-    return changed("sts3215_first")
 
 
 def bam() -> str | None:

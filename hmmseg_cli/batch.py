@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hmmseg.errors import InputError
-from hmmseg_cli.process import keep_freed_memory
 
 if TYPE_CHECKING:
     from hmmseg.io.rig import Rig
@@ -154,7 +153,7 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Processes of this machine, or a cluster's workers."""
     if scheduler is None:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=keep_freed_memory) as pool:
+        with ProcessPoolExecutor(workers, mp_context=context) as pool:
             yield pool
         return
     try:

@@ -8,29 +8,29 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from hmmseg_cli.console import (
-    JsonOption,
-    Output,
-    QuietOption,
-    TrialsArgument,
-    UnusedSeed,
-    check_folder,
-    distinct_trials,
+from hmmseg.errors import InputError
+from hmmseg_cli.console import JsonOption, Output, QuietOption, TrialsArgument, UnusedSeed, distinct_trials
+from hmmseg_cli.diagnose_robot import (
+    MapOption,
+    OwnSimulator,
+    PatchOption,
+    SimulatorOption,
+    _read,
+    _stages,
+    _warn_of_engine,
 )
-from hmmseg_cli.diagnose_robot import PatchOption
 
 ModelOption = Annotated[
-    Path, typer.Option("--model", "--mjcf", metavar="XML", help="The robot's model, as MuJoCo reads it.")
-]
-MapOption = Annotated[
-    Path, typer.Option("--map", metavar="MAP.toml", help="Which column of the logs is what of the model.")
+    Path | None,
+    typer.Option("--model", "--mjcf", metavar="XML", help="The robot's model, as MuJoCo reads it."),
 ]
 
 
 def calibrate(
     logs: TrialsArgument,
-    model: ModelOption,
-    map_file: MapOption,
+    model: ModelOption = None,
+    map_file: MapOption = None,
+    simulator: SimulatorOption = None,
     patch: PatchOption = None,
     json: JsonOption = None,
     seed: UnusedSeed = 0,
@@ -38,35 +38,23 @@ def calibrate(
 ) -> None:
     """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these cannot tell."""
     with Output("calibrate", json=json, seed=seed, quiet=quiet) as out:
-        if patch is not None:
-            check_folder("--patch", patch)
-        from simgap.progress import heard
+        own = OwnSimulator(simulator, model, map_file, (), patch)
+        if not own.given:
+            raise InputError("--model", "missing", "--model XML --map MAP.toml, or --simulator FILE.py:NAME")
+        own.check_alone({})
         from simgap.robot_effects import UNMEASURED, effects_of
         from simgap.robots.calibrate import STAGES
         from simgap.robots.calibrate import calibrate as fitted
         from simgap.robots.patch import write_patch
-        from simgap.simulators.mjcf.load import load_mjcf
 
-        loaded = load_mjcf(model, map_file)
-        recordings = [loaded.read(path) for path in distinct_trials(logs)]
-        for warning in (*loaded.warnings, *(w for log in recordings for w in log.warnings)):
-            out.warn(warning)
-        more, wanted = loaded.effects(recordings), (*UNMEASURED, *loaded.map.sd)
-        effects = effects_of(loaded.simulator, recordings, more, wanted)
-        stage = "calibrating"
-        with out.progress(stage, total=STAGES) as advance:
-
-            def tell(text: str) -> None:
-                nonlocal stage
-                stage = text
-                advance(1, text)
-
-            with heard(lambda text: advance(0, f"{stage}: {text}")):
-                found = fitted(loaded.simulator, recordings, effects, length=loaded.map.length, tell=tell)
-        from simgap.simulators.mjcf.engine import warned
-
-        for line in warned():
-            out.warn(line)
+        robot, recordings, loaded = _read(out, distinct_trials(logs), own)
+        more = () if loaded is None else loaded.effects(recordings)
+        length = getattr(robot, "window", None) if loaded is None else loaded.map.length
+        wanted = (*UNMEASURED, *getattr(robot, "sd", ())) if loaded is not None else ()
+        effects = effects_of(robot, recordings, more, wanted)
+        with _stages(out, "calibrating", STAGES) as tell:
+            found = fitted(robot, recordings, effects, length=length, tell=tell)
+        _warn_of_engine(out, own)
         document = found.body()
         out.print(*tables(document))
         for name, reason in document["reasons"].items():

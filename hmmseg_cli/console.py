@@ -370,7 +370,7 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
 
 def _publish(staged: dict[Path, Path]) -> None:
     """Copy next to each destination first, then rename: nobody sees half a file, nor a copy after Ctrl-C."""
-    beside: dict[Path, Path] = {}
+    temporaries: dict[Path, Path] = {}
     destination = Path()
     try:
         for destination, source in staged.items():
@@ -379,26 +379,26 @@ def _publish(staged: dict[Path, Path]) -> None:
                 continue
             target = destination.resolve()
             target.parent.mkdir(parents=True, exist_ok=True)
-            beside[target] = target.with_name(f".hmmseg-{os.getpid()}-{len(beside)}")
-            shutil.copyfile(source, beside[target])
-        _put(beside)
+            temporaries[target] = target.with_name(f".hmmseg-{os.getpid()}-{len(temporaries)}")
+            shutil.copyfile(source, temporaries[target])
+        _put(temporaries)
     except OSError as error:
         raise InputError(str(destination), f"cannot be written ({error.strerror})") from error
     finally:
-        for temporary in beside.values():
+        for temporary in temporaries.values():
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
 
 
-def _put(beside: dict[Path, Path]) -> None:
+def _put(temporaries: dict[Path, Path]) -> None:
     """Rename all. Interrupted in between, the rest first; refused, all is as it was before."""
     interrupted: KeyboardInterrupt | None = None
-    before = {target: temporary.with_suffix(".old") for target, temporary in beside.items()}
+    before = {target: temporary.with_suffix(".old") for target, temporary in temporaries.items()}
     try:
         for target, old in before.items():
-            if len(beside) > 1 and target.exists():
+            if len(temporaries) > 1 and target.exists():
                 shutil.copyfile(target, old)
-        for target, temporary in beside.items():
+        for target, temporary in temporaries.items():
             try:
                 os.replace(temporary, target)
             except KeyboardInterrupt as interrupt:
@@ -406,7 +406,7 @@ def _put(beside: dict[Path, Path]) -> None:
                 if temporary.exists():
                     os.replace(temporary, target)
     except OSError:
-        for target, temporary in beside.items():
+        for target, temporary in temporaries.items():
             if before[target].exists():
                 os.replace(before[target], target)
             elif not temporary.exists():

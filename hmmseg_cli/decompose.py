@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from hmmseg_cli.console import JsonOption, Output, QuietOption, TaskArgument, UnusedSeed
 
-RigFile = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="The hand: what it cannot reveal is left out, with the reason.")]  # fmt: skip
 
-
-def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, seed: UnusedSeed = 0,
-              quiet: QuietOption = False) -> None:  # fmt: skip
+def decompose(
+    task: TaskArgument, json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False
+) -> None:
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task
     from hmmseg.contact.tables import decomposition_table, equation, reasons
@@ -22,11 +17,6 @@ def decompose(task: TaskArgument, rig: RigFile = None, json: JsonOption = None, 
 
     with Output("decompose", json=json, seed=seed, quiet=quiet) as out:
         found = decompose_task(read_task(task))
-        if rig is not None:
-            from hmmseg.contact.decompose import revealed_by
-            from hmmseg.io.rig import read_rig
-
-            found = revealed_by(found, read_rig(rig))
         out.print(*in_words(found), decomposition_table(found), equation(found))
         for note in (*found.notes, *(f"{key}: {reason}" for key, reason in reasons(found).items())):
             out.print(note)
@@ -42,5 +32,5 @@ def in_words(found: Any) -> list[str]:
             seen = dict.fromkeys(found.subtasks[k].label for one in entry.evidence[:1] for k in one.subtasks)
             if seen:
                 parts.append(f"{prop.replace('_', ' ')} in {' and '.join(seen)}")
-        lines.append(f"{name}: {'; '.join(parts) or 'nothing can be told of it'}.")
+        lines.append(f"{name}: {'; '.join(parts) or 'nothing is revealed'}.")
     return lines

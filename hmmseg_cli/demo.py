@@ -35,5 +35,5 @@ def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: See
         out.report = finding
         paper = rig.model_copy(update={"fingertip": rigid})
         body["diagnosis"] = diagnose.run(out, trials, task, paper, None, []).body
-        out.print(f"figures are in {figures}; the findings are told in {page} and {finding}")
+        out.print(f"figures are in {figures}; the findings are in {page} and {finding}")
         out.finish(body)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -195,6 +195,7 @@ def run(
     """Diagnose, and put table, figures and page where `out` has them go."""
     from estimation.report import read_actual
     from hmmseg.segmentation.align import align
+    from simgap.effects import catalogue
     from simgap.gap.diagnose import STAGES
     from simgap.gap.diagnose import diagnose as find
 
@@ -212,7 +213,7 @@ def run(
     pads = rig.fingertip.model_dump()
     more = settles(found.body, measured is not None)
     out.print(sentence(found.body, pads), *filter(None, [more]), *tables(found.body))
-    _draw(out, found, recordings, task, rig, measured)
+    _draw(out, found, [trial.name for trial in recordings], task, catalogue(), pads, measured)
     return found
 
 
@@ -222,6 +223,7 @@ def _against(
     """The generic diagnosis, against given simulated trials."""
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.diagnose import diagnose_blocks
+    from simgap.generic.effects import effects
 
     every = distinct_trials([*paths, *against])
     with out.progress("diagnosing", total=4) as advance:
@@ -243,59 +245,34 @@ def _against(
     for warning in found.warnings:
         out.warn(warning)
     out.print(sentence(found.body), *tables(found.body))
-    _draw_against(out, found, [trial.name for trial in read[: len(paths)]], task)
+    _draw(out, found, [trial.name for trial in read[: len(paths)]], task, effects())
     out.finish(found.body)
 
 
-def _draw_against(out: Output, found, files: Sequence[str], task) -> None:
-    """Figures and page of a diagnosis against given simulated trials."""
+def _draw(
+    out: Output, found, files: Sequence[str], task, candidates: Mapping[str, Any],
+    pads: dict[str, float] | None = None, measured=None,
+) -> None:  # fmt: skip
+    """Figures and page where wanted; `pads` of a diagnosis against the virtual model, which has them."""
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.gap_figures import draw_generic
-    from simgap.generic.effects import effects
-
-    shows = {name: candidate.shows for name, candidate in effects().items()}
-    _show(out, found.body, files, task, lambda path: draw_generic(found, path), shows=shows)
-
-
-def _draw(out: Output, found, recordings, task: BlockTask, rig: Rig, measured) -> None:
-    """Figures and page of a diagnosis against the virtual model."""
-    if out.figures is None and out.report is None:
-        return
-    from hmmseg_cli.gap_figures import draw_signal
-    from simgap.effects import catalogue
-
-    shows = {name: effect.shows for name, effect in catalogue().items()}
-    files = [trial.name for trial in recordings]
-    pads = rig.fingertip.model_dump()
-    _show(out, found.body, files, task, lambda path: draw_signal(found, path), pads, measured, shows)
-
-
-def _show(
-    out: Output,
-    body: dict[str, Any],
-    files: Sequence[str],
-    task,
-    signal: Callable[[Path], None],
-    pads: dict[str, float] | None = None,
-    measured=None,
-    shows: dict[str, str] | None = None,
-) -> None:
-    """Figures where wanted, and the page, from the body alone; `signal` draws the recorded one."""
     from hmmseg.contact.decompose import subtasks
+    from hmmseg_cli.gap_figures import draw_generic, draw_signal
     from hmmseg_cli.pages import Setting, page
     from simgap.report.figures import draw_all, draw_how_far
 
-    names = list(dict.fromkeys(s.label for s in subtasks(task)))
+    body, names = found.body, list(dict.fromkeys(s.label for s in subtasks(task)))
+    signal = draw_generic if pads is None else draw_signal
 
     def draw(path: Callable[[str], Path]) -> None:
-        signal(path("gap_signal.png"))
+        signal(found, path("gap_signal.png"))
         if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
             draw_how_far(body, path("gap_before_after.png"))
 
     if out.figures is not None:
         draw_all(body, names, out.figure)
-        signal(out.figure("gap_signal.png"))
+        signal(found, out.figure("gap_signal.png"))
     if out.report is not None:
-        setting = Setting(files, names, pads or {}, measured, shows or {}, out.warnings)
+        shows = {name: candidate.shows for name, candidate in candidates.items()}
+        setting = Setting(files, names, pads or {}, measured, shows, out.warnings)
         out.stage(out.report).write_text(page(body, setting, draw), encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import typer
 from rich.table import Table
 
 from hmmseg.errors import InputError
-from hmmseg_cli.console import Output, check_file, check_folder
+from hmmseg_cli.console import Output, check_file, check_folder, strict_json
 from simgap.report.finding import sentence
 from simgap.report.finding import tables as usual_tables
 
@@ -104,7 +105,10 @@ class OwnSimulator:
         if self.patch is not None:
             check_folder("--patch", self.patch)
         if self.history is not None:
+            from simgap.report.robot import history
+
             check_file("--history", self.history, (".jsonl",))
+            history(self.history)
         if self.rerun is not None:
             check_file("--rerun", self.rerun, (".rrd",))
             if importlib.util.find_spec("rerun") is None:
@@ -135,7 +139,12 @@ def _read(
 
 @contextmanager
 def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with what a long one is at; yields what is told of each stage that begins."""
+    """Progress by stages, with what a long one is at; yields what is told of each stage that begins.
+
+    InputError where the model runs so far from its logs that no equation can be solved.
+    """
+    from numpy.linalg import LinAlgError
+
     from simgap.progress import heard
 
     stage = text
@@ -146,7 +155,11 @@ def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
         advance(1, text)
 
     with out.progress(text, total=total) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
-        yield tell
+        try:
+            yield tell
+        except LinAlgError:
+            near = "a model that stays near its logs: a shorter time step?"
+            raise InputError("simulator", f"runs far away from the logs ({stage})", near) from None
 
 
 def _warn_of_engine(out: Output, own: OwnSimulator) -> None:
@@ -175,7 +188,7 @@ def diagnose_robot(
     phases = None
     if task is not None:
         from hmmseg.io.task import read_task
-        from simgap.robots.task_phases import phases_by_task
+        from simgap.robots.phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with _stages(out, "diagnosing", STAGES) as tell:
@@ -192,8 +205,9 @@ def diagnose_robot(
         )
     document = body(found)
     _warn_of_engine(out, own)
-    left = document["remainder"]["rms_over_noise"]
-    out.print(sentence(document), f"What is left is {left:.3g} times the noise.", *tables(document, found))
+    said, left = sentence(document), document["remainder"]["rms_over_noise"]
+    size = [] if "times the noise" in said else [f"What is left is {left:.3g} times the noise."]
+    out.print(said, *size, *tables(document, found))
     _deliver(out, own, found, document, loaded, recordings, found.composed.effects)
     if own.patch is not None:
         given = found.composed, found.linear.point, document, document["causes"]
@@ -261,17 +275,23 @@ def _deliver(
         document["history"] = robot.compared(past, now)
         out.print(*_history(document["history"], now))
         today = {"date": date.today().isoformat(), "files": [log.name for log in logs], "parameters": now}
-        lines = "".join(json.dumps(entry) + "\n" for entry in (*past, today))
+        lines = "".join(
+            json.dumps(json.loads(strict_json(e)), ensure_ascii=False) + "\n" for e in (*past, today)
+        )
         out.stage(own.history).write_text(lines, encoding="utf-8")
     folder = own.patch or out.figures or (out.report.parent if out.report is not None else None)
-    motion = robot.next_motion(document, logs)
+    motion, place = robot.next_motion(document, logs), None
     if motion is not None and folder is not None:
+        name = "next_motion.csv"
+        while any(log.name == name for log in logs):  # recorded when it was asked for last
+            name = f"next_{name}"
+        place = folder / name
         time = ("t", 1.0) if loaded is None else (loaded.map.time, loaded.map.time_factor)
         commands = [n for n, c in found.composed.simulator.channels.items() if c.kind == "command"]
         text = robot.motion_csv(motion, commands, units, time)
-        out.stage(folder / "next_motion.csv").write_text(text, encoding="utf-8")
-        document["next_experiment"]["file"] = str(folder / "next_motion.csv")
-        out.print(f"the motion to run next is in {folder / 'next_motion.csv'}")
+        out.stage(place).write_text(text, encoding="utf-8")
+        document["next_experiment"]["file"] = str(place)
+        out.print(f"the motion to run next is in {place}")
     if own.rerun is not None:
         robot.write_rerun(out.stage(own.rerun), robot.courses(found, units))
     if out.figures is None and out.report is None:
@@ -285,7 +305,10 @@ def _deliver(
 
         phases = ["all"] if isinstance(found, Changes) else sorted({c["subtask"] for c in document["where"]})
         shows = {n: e.says for n, e in effects.items()}
-        setting = Setting([log.name for log in logs], phases, shows=shows, warnings=out.warnings, own=units)
+        setting = Setting(
+            [log.name for log in logs], phases, shows=shows, warnings=out.warnings, own=units,
+            motion="" if place is None else os.path.relpath(place, out.report.parent),
+        )  # fmt: skip
         text = page(document, setting, lambda path: draw_robot_page(found, units, path))
         out.stage(out.report).write_text(text, encoding="utf-8")
 

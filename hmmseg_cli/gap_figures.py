@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +140,9 @@ def draw_robot(
 
 def draw_robot_page(found: Robot, own: Mapping[str, Own], path: Callable[[str], Path]) -> None:
     """Those that a page shows next to its own tables."""
-    every = courses(found, own)
+    draw_course(max(courses(found, own), key=lambda c: c.over), found, path("gap_signal.png"))
     if isinstance(found, RobotDiagnosis):
-        draw_courses([max(every, key=lambda c: c.over)], found, path("gap_signal.png"))
         draw_before_after(found, path("gap_before_after.png"))
-    else:
-        by_log = [[c for c in every if c.log == log] for log in dict.fromkeys(c.log for c in every)]
-        draw_courses(max(by_log, key=lambda cs: sum(c.over for c in cs)), found, path("gap_signal.png"))
 
 
 def _short(name: str) -> str:
@@ -154,29 +150,24 @@ def _short(name: str) -> str:
     return stem if len(stem) <= 22 else "…" + stem[-21:]
 
 
-def draw_courses(shown: Sequence[Course], found: Robot, path: Path) -> None:
-    """Recorded, simulated and corrected, some channels of one log; of one channel its residual beneath."""
+def draw_course(one: Course, found: Robot, path: Path) -> None:
+    """Recorded, simulated and corrected, and what each leaves beneath."""
     if isinstance(found, Changes):
         names, how = ("as it was", "with what changed"), "run freely from its first sample"
     else:
         last = "with the causes, held out" if found.shrinkage is not None else "with what was fitted"
         names, how = ("model as it came", last), "windows restarted from the recording"
-    alone = len(shown) == 1
-    with canvas(path, height=1.2 + 1.5 * max(len(shown), 2)) as figure:
-        axes = figure.subplots(max(len(shown), 2), 1, sharex=True)
-        for one, ax in zip(shown, axes, strict=False):
-            ax.plot(one.t, one.recorded, color="black", lw=1.2, label="recorded")
-            for run, colour, name in zip((one.simulated, one.corrected), (RED, BLUE), names, strict=True):
-                ax.plot(one.t, run, color=colour, lw=0.8, label=name)
-                if alone:
-                    axes[1].plot(one.t, one.recorded - run, color=colour, lw=0.8)
-            ax.set_ylabel(f"{one.channel} [{one.unit}]")
-        if alone:
-            axes[1].set_ylabel(f"residual [{shown[0].unit}]")
-            axes[1].axhline(0, color=GREY, lw=0.5)
-        axes[-1].set_xlabel("time [s]")
-        axes[0].legend(fontsize=6.5)
-        axes[0].set_title(f"{_short(shown[0].log)}: {how}")
+    with canvas(path, height=4.2) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        above.plot(one.t, one.recorded, color="black", lw=1.2, label="recorded")
+        for run, colour, name in zip((one.simulated, one.corrected), (RED, BLUE), names, strict=True):
+            above.plot(one.t, run, color=colour, lw=0.8, label=name)
+            below.plot(one.t, one.recorded - run, color=colour, lw=0.8)
+        above.set_ylabel(f"{one.channel} [{one.unit}]")
+        below.set(xlabel="time [s]", ylabel=f"residual [{one.unit}]")
+        below.axhline(0, color=GREY, lw=0.5)
+        above.legend(fontsize=6.5)
+        above.set_title(f"{_short(one.log)}: {how}")
 
 
 def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
@@ -196,6 +187,8 @@ def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
             axes.bar(at + place, each, 0.4, color=colour, label=name)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
         axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hmmseg.online.answer import Answer
+from hmmseg_cli.inspect import sparkline
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 REFRESH = 0.1  # look: s; a terminal shows no more
 WIDTH = 60  # numerics: points of a signal
 SECONDS = 10.0  # look: that it spans
-BLOCKS = " ▁▂▃▄▅▆▇█"
 
 
 class Live:
@@ -88,11 +88,6 @@ def picture(
 
 
 def spark(values: Sequence[float]) -> str:
-    """Values as a row of blocks from their least to their greatest, the greatest named."""
+    """Forces [N] as a row of bars from 0 or less, a blank where nothing is, the greatest named."""
     there = [v for v in values if math.isfinite(v)]
-    if not there:
-        return ""
-    low, high = min(0.0, *there), max(there)
-    scale = (len(BLOCKS) - 1) / max(high - low, 1e-9)
-    drawn = "".join(BLOCKS[round((v - low) * scale)] if math.isfinite(v) else "?" for v in values)
-    return f"{drawn} {high:.2f} N at most"
+    return f"{sparkline((0.0, *values))[1:]} {max(there):.2f} N at most" if there else ""

@@ -6,12 +6,14 @@ Any other exception is a bug and shows its traceback; what the machine refuses (
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import gc
 import os
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any
 
 import typer
 
@@ -35,7 +37,6 @@ from hmmseg_cli import (
     watch,
 )
 from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
-from hmmseg_cli.process import heard, keep_freed_memory
 
 # numerics: objects between two garbage collections: most are modules' and compilers', which stay anyway
 COLLECTED = 10_000
@@ -97,10 +98,36 @@ def _hmmseg(
     """Identify an object's weight, width, height and friction from what a robot hand felt."""
 
 
+AGAIN = 0.02  # numerics: s; the callback has returned by then, and if not it is sent once more
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[None]:
+    """Within it no interrupt is lost, or reported with a traceback.
+
+    A Ctrl-C that comes while a compiler calls back into Python is dropped there, and sent again here.
+    """
+    usual, waiting = sys.unraisablehook, []
+
+    def hook(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            usual(unraisable)
+            return
+        waiting.append(threading.Timer(AGAIN, _thread.interrupt_main))
+        waiting[-1].start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
+        for timer in waiting:
+            timer.cancel()
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code (0 or 2; 130 when interrupted)."""
     gc.set_threshold(COLLECTED, *gc.get_threshold()[1:])
-    keep_freed_memory()
     configure()
     _open_streams()
     args = list(sys.argv[1:] if args is None else args) or ["--help"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,7 +32,6 @@ FromOption = Annotated[Path | None, typer.Option(
 )]  # fmt: skip
 MjcfFile = Annotated[Path | None, typer.Option(
     "--mjcf", metavar="XML", help="Lay out a map.toml of this model and a log (--from).")]  # fmt: skip
-QUESTION = "Which hand: cartesian (fingertip positions), jointed (joint angles), gripper, or none"
 
 
 def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = None, mjcf: MjcfFile = None,
@@ -52,7 +50,7 @@ def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = No
         targets = [folder / "rig.toml", folder / "task.toml"]
         for path in targets:
             _free(path)
-        hand, rate = _asked(hand) if looked is None else _seen(hand, looked)
+        hand, rate = (hand or Hand.CARTESIAN, 50.0) if looked is None else _seen(hand, looked)
         pages = Environment(loader=PackageLoader("hmmseg_cli"), keep_trailing_newline=True, autoescape=False)
         for path, read in zip(targets, (read_rig, read_task), strict=True):
             staged = out.stage(path)
@@ -61,28 +59,12 @@ def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = No
             if looked is not None and looked.toml and path == targets[0]:
                 staged.write_text(extended(staged, [looked]), encoding="utf-8")
             read(staged)
-        then = (
-            "hmmseg inspect FILE looks into a recording"
-            if looked is None
-            else (
-                "say in task.toml what goes where, then: "
-                f"hmmseg segment {source} --task {targets[1]} --rig {targets[0]}"
-            )
-        )
+        then = "hmmseg inspect FILE looks into a recording"
+        if looked is not None:
+            then = ("say in task.toml what goes where, then: "
+                    f"hmmseg segment {source} --task {targets[1]} --rig {targets[0]}")  # fmt: skip
         out.print(f"{targets[0]} and {targets[1]} are laid out; {then}")
         out.finish({"files": [str(path) for path in targets], "hand": hand.value})
-
-
-def _asked(hand: Hand | None) -> tuple[Hand, float]:
-    """The hand and its rate [Hz]: from the terminal where there is one, else as most have it."""
-    if not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
-        return hand or Hand.CARTESIAN, 50.0
-    if hand is None:
-        hand = Hand(typer.prompt(QUESTION, default="cartesian", type=Hand, err=True))
-    rate = typer.prompt("Samples per second", default=50.0, type=float, err=True)
-    if not 0 < rate < 1e6:
-        raise InputError("samples per second", f"found {rate:g}", "a rate in Hz")
-    return hand, rate
 
 
 def _free(path: Path) -> None:

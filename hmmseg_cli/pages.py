@@ -160,22 +160,14 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
 Body = Mapping[str, Any]
 MOST = 8  # look: rows of a table
 NOTHING = 5e-3  # look: probability, or share of a gap, that is shown as none
-SHARES = (
-    "gain",
-    "scale",
-    "finger1",
-    "finger2",
-    "fx1",
-    "fy1",
-    "fx2",
-    "fy2",
-)  # shown in per cent if in no unit
+SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # in per cent if unitless
 
 
 @dataclass(frozen=True)
 class Setting:
     """What a page shows besides the body: recordings, subtasks in order, the rig's pads, what was measured,
-    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there.
+    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
+    and where the motion to run next is.
     """
 
     files: Sequence[str]
@@ -185,6 +177,7 @@ class Setting:
     shows: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     own: Mapping[str, Own] = field(default_factory=dict)
+    motion: str = ""
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
@@ -209,6 +202,8 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
+        compared="changes" in body,
+        motion=setting.motion,
         calibrated=_calibrated(body, setting),
         numerics=_numerics(body),
         properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
@@ -249,15 +244,8 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
     lows, highs = [c["band"][0] for c in cells], [c["band"][1] for c in cells]
     band = f"{min(lows):g} to {max(highs):g}" if None not in highs else ""
     scores = [c["z"] for c in cells if c["z"] is not None]
-    trials = str(len({c["trial"] for c in cells}))
-    return (
-        key[0],
-        key[1],
-        percent(finding.share_of(cells)),
-        f"{max(scores):.0f}" if scores else "",
-        trials,
-        band,
-    )
+    score, trials = f"{max(scores):.0f}" if scores else "", str(len({c["trial"] for c in cells}))
+    return (*key, percent(finding.share_of(cells)), score, trials, band)
 
 
 def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setting) -> list[tuple[str, ...]]:
@@ -352,13 +340,11 @@ def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tup
 
 def _detection(body: Body) -> str:
     p, fineness = body["detection"]["p_value"], body["detection"].get("resolution")
-    of = (
-        "Logs of a robot that is as its model"
-        if finding.of_robot(body)
-        else "A healthy recording of this rig and task"
-    )
-    verb = "differ" if finding.of_robot(body) else "differs"
-    text = f"{of} {verb} from it as much with {finding.p_text(p)}"
+    text = f"A healthy recording of this rig and task differs from it as much with {finding.p_text(p)}"
+    if "changes" in body:
+        text = f"Logs of a robot that did not change differ as much with {finding.p_text(p)}"
+    elif finding.of_robot(body):
+        text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
     fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"
@@ -370,6 +356,9 @@ def _far(body: Body) -> str:
     if not s or s.get("fraction") is None or s.get("before") is None:
         return ""
     fall = f"from {plain(s['before'])} to {plain(s['after'])}"
+    if "changes" in body:
+        rest = f"old ones leave {plain(s['noise_floor'])}"
+        return f"On {s['evaluated_on']} what is missed falls {fall} nats a row; {rest}."
     text = (
         f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
         f"healthy recordings leave {plain(s['noise_floor'])}."

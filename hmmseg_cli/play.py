@@ -22,7 +22,7 @@ RigFile = Annotated[Path | None, typer.Option("--rig", metavar="R", help="Pads a
 BlocksFile = Annotated[Path | None, typer.Option(
     "--blocks", metavar="P", help="A diagnosis's blocks: identify's JSON or an actual.toml.")]  # fmt: skip
 EffectOption = Annotated[list[str] | None, typer.Option(
-    "--effect", metavar="NAME", help="Switched on beside the nominal world.")]  # fmt: skip
+    "--effect", metavar="NAME", help="Switched on in addition to the nominal world.")]  # fmt: skip
 FolderOption = Annotated[Path, typer.Option("--output", metavar="DIR", help="Where trials are saved.")]
 PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of this machine; 0: any free.")]
 OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from datetime import datetime
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.formats.delimited import COMMENTS, SPACES, cells_of, separator_of, units_of
 from hmmseg.io.table import check_unique
-from hmmseg.io.units import LARGEST, LATEST, si_factor
+from hmmseg.io.units import LARGEST, LATEST, Column, si_factor, source_of
 
 if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
@@ -34,8 +35,6 @@ class Rows:
     """
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
-        from hmmseg.io.units import Column, source_of
-
         self._stream, self._number = stream, 0
         header = _text(self._line()).strip()
         if not header:
@@ -80,22 +79,19 @@ class Rows:
                 f"{WHERE}: row {self._number}", f"has {len(cells)} cells", f"{self._num} as in the header"
             )
         try:
-            values = [float(cells[i]) for i in self._picked]
+            values = [math.nan if i < 0 else float(cells[i]) for i in self._picked]
         except ValueError:
             values = [self._number_in(cells, i) for i in self._picked]
-        if -1 in self._picked:
-            values = [math.nan if i < 0 else v for i, v in zip(self._picked, values, strict=True)]
         if not math.isfinite(sum(values)):
             self._check(values, cells)
         if not self._plain:
             values = [s * v + o for v, (s, o) in zip(values, self._scales, strict=True)]
         for i, value in enumerate(values):
             if abs(value) > (LARGEST if i else LATEST):
-                where = f"{WHERE}: row {self._number}, column {self._names[self._picked[i]]}"
+                kind, most = ("reading of a hand's sensor", f"at most {LARGEST:.0g} in SI units")
                 if not i:
-                    raise InputError(where, f"{value:.3g} is no time", "a time in s")
-                problem = f"{value:.3g} is no reading of a hand's sensor"
-                raise InputError(where, problem, f"at most {LARGEST:.0g} in SI units")
+                    kind, most = "time", "a time in s"
+                raise InputError(self._cell(self._picked[i]), f"{value:.3g} is no {kind}", most)
         return values[0], values[1:]
 
     def _line(self) -> bytes:
@@ -120,41 +116,34 @@ class Rows:
         return all(scale == (1.0, 0.0) for scale in self._scales) and -1 not in self._picked
 
     def _number_in(self, cells: list[str], i: int) -> float:
-        if i < 0:
-            return math.nan
-        text = cells[i].strip().strip('"')
+        """A cell that is no plain number: empty, quoted, with a decimal comma, or an ISO stamp as s since the
+        first."""
+        text = "" if i < 0 else cells[i].strip().strip('"')
         if not text:
             return math.nan
         if self._separator != "," and "." not in text:
             text = text.replace(",", ".")
-        try:
+        with contextlib.suppress(ValueError):
             return float(text)
-        except ValueError:
-            if i == self._picked[0] and text[:4].isdigit():
-                return self._seconds(i, cells, text)
-            raise self._wrong(i, cells) from None
+        if i == self._picked[0] and text[:4].isdigit():
+            with contextlib.suppress(
+                ValueError, TypeError
+            ):  # the latter of a stamp with a zone after one without
+                stamp = datetime.fromisoformat(text)
+                self._start = self._start or stamp
+                return (stamp - self._start).total_seconds()
+        raise self._wrong(i, cells)
 
-    def _seconds(self, i: int, cells: list[str], text: str) -> float:
-        """An ISO 8601 stamp as s since the first."""
-        try:
-            stamp = datetime.fromisoformat(text)
-        except ValueError:
-            raise self._wrong(i, cells) from None
-        if self._start is None:
-            self._start = stamp
-        if (stamp.tzinfo is None) != (self._start.tzinfo is None):
-            raise self._wrong(i, cells)
-        return (stamp - self._start).total_seconds()
+    def _cell(self, i: int) -> str:
+        return f"{WHERE}: row {self._number}, column {self._names[i]}"
 
     def _wrong(self, i: int, cells: list[str]) -> InputError:
-        found = cells[i].strip()[:60]
-        return InputError(f"{WHERE}: row {self._number}, column {self._names[i]}",
-                          f"{found!r} is not a finite number", "a number or an empty cell")  # fmt: skip
+        problem = f"{cells[i].strip()[:60]!r} is not a finite number"
+        return InputError(self._cell(i), problem, "a number or an empty cell")
 
     def _check(self, values: list[float], cells: list[str]) -> None:
         if math.isnan(values[0]):
-            column = self._names[self._picked[0]]
-            raise InputError(f"{WHERE}: row {self._number}, column {column}", "missing", "a time in s")
+            raise InputError(self._cell(self._picked[0]), "missing", "a time in s")
         for i, value in zip(self._picked, values, strict=True):
             if math.isinf(value):
                 raise self._wrong(i, cells)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import math
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,7 +43,7 @@ def watch(
     with Output("watch", json=destination, seed=seed, quiet=quiet) as out:
         watcher = Watcher(task, rig, lag)
         rows = Rows(sys.stdin.buffer, watcher)
-        _warm_up(task, rig, lag)
+        _warm_up(watcher)
         show = None
         if plot:
             from hmmseg_cli.live import Live
@@ -99,29 +97,21 @@ def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out
             show.update(answer)
 
 
-def _warm_up(task: Any, rig: Any, lag: float) -> None:
-    """Load what is compiled before the first row comes."""
+def _warm_up(watcher: Watcher) -> None:
+    """Load what is compiled, or slow to import, before the first row comes."""
     import numpy as np
 
-    from hmmseg.online.watcher import Watcher
+    from hmmseg.online.filter import Filter
 
-    scratch = Watcher(task, rig, lag)
-    names, hand = scratch.channels, scratch.filter.rig
-    gripper = hand.gripper
+    f = watcher.filter
+    size = 12
+    if f.rig.gripper is not None:
+        import scipy.ndimage
+        import scipy.spatial.transform  # noqa: F401
+
+        size = 16
+    scratch = Filter(f.task, f.rig, f.lag)
     for i in range(200):
-        values = np.zeros(len(names)) + 1e-4 * (i % 3)
-        if gripper is not None:  # moves, closes and stands
-            for name in gripper.position.values():
-                values[names.index(name)] = 0.01 * math.sin(0.1 * i)
-            for name in gripper.wrench[:3]:
-                values[names.index(name)] = -(0.1**2) * math.sin(0.1 * i) * 25
-            for name in gripper.opening:
-                values[names.index(name)] = max(0.03, min(0.06, 0.06 - 0.004 * (i - 100)))
-            if gripper.quaternion is not None:
-                values[names.index(gripper.quaternion[3])] = 1.0
-        elif not hand.jointed:
-            values[names.index("x2")] = 0.05
-        with contextlib.suppress(InputError):  # made-up rows need not tell how a sensor is mounted
-            scratch.update(0.02 * i, values).line()
-    with contextlib.suppress(InputError):
-        scratch.finish().line()
+        scratch.take(0.02 * i, np.full(size, 1e-4 * (i % 3)))
+        scratch.answer().line()
+    scratch.finish().line()

@@ -111,7 +111,7 @@ def draw(folder: Path, scale: float, path: Path, count: int = TOSSES) -> None:
     from hmmseg.plot.style import BLUE, RED, canvas
     from simgap.robots.linear import base_at
     from simgap.robots.model import Composed
-    from simgap.robots.noise import noises
+    from simgap.robots.rows import noises
     from simgap.robots.windows import FLIES, RESTS
 
     with tempfile.TemporaryDirectory() as into:

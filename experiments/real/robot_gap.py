@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.real.hiro_gap import rounded
 from experiments.saving import save
-from hmmseg_cli.gap_figures import draw_before_after, draw_courses
+from hmmseg_cli.gap_figures import draw_before_after, draw_course
 from simgap.report.robot import courses
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose
@@ -97,7 +97,7 @@ def published(found: RobotDiagnosis, name: str, output: Path | None, figures: Pa
     save(output or RESULTS / f"{name}.json", summary(found))
     if figures is not None:
         widest = max(courses(found, {}), key=lambda c: c.over)
-        draw_courses([widest], found, figures / f"{name}_signal.png")
+        draw_course(widest, found, figures / f"{name}_signal.png")
         draw_before_after(found, figures / f"{name}_before_after.png")
 
 

@@ -5,23 +5,19 @@ hand and of the object it manipulates: finger on object, object on its support. 
 quasistatic equations between measured signals and unknowns (planar statics of a rigid block between two
 fingertips). A property is determined when some combination of the equations of a subtask, alone or with
 another of the same move, leaves it as the only unknown, which exact elimination finds without tolerances.
-What no pair determines is sought in all moves together, as the heights in a tower of three are. A sensor in
-the wrist does not feel the grip, so that it reveals less.
+What no pair determines is sought in all moves together, as the heights in a tower of three are.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
-from hmmseg.io.task import GROUND, AnyTask, BlockTask, Move, SequenceTask
+from hmmseg.io.task import GROUND, AnyTask, BlockTask, SequenceTask
 from hmmseg.tables import Tabled
-
-if TYPE_CHECKING:
-    from hmmseg.io.rig import Rig
 
 FREE = "free-motion"
 ON_GROUND = "hold-on-ground"
@@ -31,48 +27,32 @@ FINGERS = ("finger1", "finger2")
 
 
 @dataclass(frozen=True)
-class Contact:
-    """One active constraint: `body` touches `surface`; `slips` where it moves along it."""
-
-    body: str
-    surface: str
-    slips: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.body}-{self.surface}" + (" (slipping)" if self.slips else "")
-
-
-@dataclass(frozen=True)
 class ContactState:
-    """The active constraints of the hand and the manipulated object between two changes.
+    """The constraints of the hand and the object that it manipulates, between two changes of them.
 
-    `beneath` are the objects from the manipulated object's support down to the ground (empty
-    where it stands on the ground, or is not held). `move` is the 0-based index of the move.
+    `name`: the state's; the paper calls every support the ground. `support`: what the held object touches
+    besides the fingers, None while free or lifted. `beneath`: objects from its support down to the ground.
+    `move`: 0-based index of the move.
     """
 
     object: str
-    contacts: frozenset[Contact]
+    name: str
+    support: str | None
     beneath: tuple[str, ...]
     move: int
 
     @property
     def held(self) -> bool:
         """Whether the fingers are on the object."""
-        return any(contact.body in FINGERS for contact in self.contacts)
+        return self.name != FREE
 
     @property
-    def support(self) -> Contact | None:
-        """The contact of the held object with what it stands on, None while free or lifted."""
-        return next((contact for contact in self.contacts if contact.body == self.object), None)
-
-    @property
-    def name(self) -> str:
-        """The contact state's name; the paper calls every support the ground."""
-        if not self.held:
-            return FREE
-        if self.support is None:
-            return ABOVE_GROUND
-        return SLIDING if self.support.slips else ON_GROUND
+    def constraints(self) -> tuple[str, ...]:
+        """The active contacts of the hand and the held object."""
+        fingers = [f"{finger}-{self.object}" for finger in FINGERS if self.held]
+        slips = " (slipping)" if self.name == SLIDING else ""
+        standing = [] if self.support is None else [f"{self.object}-{self.support}{slips}"]
+        return tuple(sorted(fingers + standing))
 
 
 def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
@@ -88,36 +68,20 @@ def contact_states(task: BlockTask) -> Iterator[ContactState]:
     """The task's contact states in order, one between every two changes of the constraint set.
 
     The hand closes on the object, breaks or slips its support contact, restores one at the
-    destination, and opens; each is a set of contacts made and lost.
+    destination, and opens.
     """
     support = dict(task.initial)
-    yield ContactState(task.performed[0].object, frozenset(), (), 0)
+    yield ContactState(task.performed[0].object, FREE, None, (), 0)
     for index, move in enumerate(task.performed):
-        active: frozenset[Contact] = frozenset()
-        for made, lost in _changes(move, support[move.object]):
-            active = (active - lost) | made
-            if Contact(move.object, move.to) in made:
-                support[move.object] = move.to
-            standing = any(contact.body == move.object for contact in active)
-            beneath = stack(support, move.object) if standing else ()
-            yield ContactState(move.object, active, beneath, index)
-
-
-def _changes(move: Move, origin: str) -> list[tuple[frozenset[Contact], frozenset[Contact]]]:
-    """Contacts (made, lost) at each event of a move, from closing to opening the hand.
-
-    The support contact becomes one of the hand's own constraints once the hand holds the object.
-    """
-    fingers = frozenset(Contact(finger, move.object) for finger in FINGERS)
-    start, end = Contact(move.object, origin), Contact(move.object, move.to)
-    none: frozenset[Contact] = frozenset()
-    moving = frozenset({Contact(move.object, origin, slips=True)}) if move.slide else none
-    return [
-        (fingers | {start}, none),
-        (moving, frozenset({start})),
-        (frozenset({end}), moving),
-        (none, fingers | {end}),
-    ]
+        obj, beneath = move.object, stack(support, move.object)
+        yield ContactState(obj, ON_GROUND, support[obj], beneath, index)
+        if move.slide:
+            yield ContactState(obj, SLIDING, support[obj], beneath, index)
+        else:
+            yield ContactState(obj, ABOVE_GROUND, None, (), index)
+        support[obj] = move.to
+        yield ContactState(obj, ON_GROUND, move.to, stack(support, obj), index)
+        yield ContactState(obj, FREE, None, (), index)
 
 
 WEIGHT, WIDTH, HEIGHT, FRICTION = "weight", "width", "height", "friction"
@@ -140,20 +104,27 @@ class Source:
     sample: int = 0
 
 
-@dataclass(frozen=True)
-class Equation:
-    """sum(unknowns) = sum(sources), each with a rational coefficient."""
-
-    unknowns: dict[Unknown, Fraction]
-    sources: dict[Source, Fraction]
-
-    def minus(self, factor: Fraction, other: Equation) -> Equation:
-        """This equation less `factor` times another."""
-        return Equation(_minus(self.unknowns, factor, other.unknowns),
-                        _minus(self.sources, factor, other.sources))  # fmt: skip
+Key = TypeVar("Key")
+Row = dict[Key, Fraction]  # a sum of its keys with these coefficients, which is 0
+Equation = Row[Unknown | Source]
 
 
-def _minus(a: dict, factor: Fraction, b: dict) -> dict:
+def reduced(rows: Iterable[Row[Key]], lead: Callable[[Row[Key]], Key | None]) -> dict[Key, Row[Key]]:
+    """Rows of the reduced row echelon form by their pivots, which `lead` chooses (None: a row has none)."""
+    pivots: dict[Key, Row[Key]] = {}
+    for row in rows:
+        for key in [key for key in row if key in pivots]:
+            row = _minus(row, row[key], pivots[key])
+        pivot = lead(row)
+        if pivot is None:
+            continue
+        row = {key: value / row[pivot] for key, value in row.items()}
+        pivots = {key: _minus(old, old[pivot], row) if pivot in old else old for key, old in pivots.items()}
+        pivots[pivot] = row
+    return pivots
+
+
+def _minus(a: Row[Key], factor: Fraction, b: Row[Key]) -> Row[Key]:
     difference = {key: a.get(key, Fraction(0)) - factor * b.get(key, Fraction(0)) for key in a | b}
     return {key: value for key, value in difference.items() if value}
 
@@ -174,53 +145,48 @@ def balance(index: int, state: ContactState, loads: int = 1) -> list[Equation]:
     """
     if not state.held:
         return []
-    name, support, grasp = state.object, state.support, str(state.move)
+    name, grasp = state.object, str(state.move)
     bottom: list[Unknown] = [(HEIGHT, below) for below in state.beneath]
-    if support is None:
+    if state.support is None:
         bottom = [("lift", str(index))]
-    equations = [_equation(index, X_POSITIONS, {(WIDTH, name): 1})]
+    equations = [_equation({(WIDTH, name): 1}, Source(index, X_POSITIONS))]
     for finger in FINGERS:
-        equations.append(_equation(index, Y_POSITIONS, dict.fromkeys([*bottom, ("grip", finger, grasp)], 1)))
-    if support is None:
-        return [*equations, _equation(index, Y_FORCES, {(WEIGHT, name): 1})]
+        held = dict.fromkeys([*bottom, ("grip", finger, grasp)], 1)
+        equations.append(_equation(held, Source(index, Y_POSITIONS)))
+    if state.support is None:
+        return [*equations, _equation({(WEIGHT, name): 1}, Source(index, Y_FORCES))]
     for sample in range(loads):
         load, push = ("load", str(index), str(sample)), ("push", str(index), str(sample))
-        equations.append(_equation(index, Y_FORCES, {(WEIGHT, name): 1, load: -1}, sample))
-        equations.append(_equation(index, X_FORCES, {push: 1}, sample))
-        if support.slips:
-            friction = (FRICTION_ON + support.surface, name)
-            slip = {push: Fraction(1), load: Fraction(-1, 3), friction: Fraction(-sample - 2)}
-            equations.append(Equation(slip, {}))
+        equations.append(_equation({(WEIGHT, name): 1, load: -1}, Source(index, Y_FORCES, sample)))
+        equations.append(_equation({push: 1}, Source(index, X_FORCES, sample)))
+        if state.name == SLIDING:
+            friction = (FRICTION_ON + state.support, name)
+            equations.append({push: Fraction(1), load: Fraction(-1, 3), friction: Fraction(-sample - 2)})
     return equations
 
 
-def _equation(index: int, signal: str, unknowns: dict[Unknown, int], sample: int = 0) -> Equation:
-    return Equation({key: Fraction(value) for key, value in unknowns.items()},
-                    {Source(index, signal, sample): Fraction(1)})  # fmt: skip
+def _equation(unknowns: Mapping[Unknown, int], measured: Source) -> Equation:
+    """That the unknowns, with these coefficients, sum to what is measured."""
+    return {key: Fraction(value) for key, value in unknowns.items()} | {measured: Fraction(-1)}
 
 
-def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> dict[Unknown, Equation]:
-    """Unknowns that the equations determine, each with the combination that does.
+def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> dict[Unknown, Row[Source]]:
+    """Unknowns that the equations determine, each as a combination of sources.
 
-    Reduced row echelon form: an unknown is in the row space on its own exactly when its pivot
-    row holds nothing else. `known` unknowns are taken as given.
+    An unknown is in the row space on its own exactly when its pivot row holds no other. `known` unknowns are
+    taken as given.
     """
+
+    def unknown(row: Equation) -> list[Unknown]:
+        return [key for key in row if not isinstance(key, Source)]
+
+    def lead(row: Equation) -> Unknown | None:
+        return min(unknown(row), key=is_property, default=None)  # nuisances go first
+
     given = set(known)
-    pivots: dict[Unknown, Equation] = {}
-    for equation in equations:
-        left = {key: value for key, value in equation.unknowns.items() if key not in given}
-        row = Equation(left, equation.sources)
-        for unknown in [key for key in row.unknowns if key in pivots]:
-            row = row.minus(row.unknowns[unknown], pivots[unknown])
-        if not row.unknowns:
-            continue  # depends on the others: a check on the data, no information
-        pivot = min(row.unknowns, key=is_property)  # nuisances go first
-        row = Equation({}, {}).minus(-1 / row.unknowns[pivot], row)
-        for other, old in pivots.items():
-            if pivot in old.unknowns:
-                pivots[other] = old.minus(old.unknowns[pivot], row)
-        pivots[pivot] = row
-    return {unknown: row for unknown, row in pivots.items() if len(row.unknowns) == 1}
+    rows = ({key: value for key, value in row.items() if key not in given} for row in equations)
+    return {pivot: {key: -value for key, value in row.items() if isinstance(key, Source)}
+            for pivot, row in reduced(rows, lead).items() if len(unknown(row)) == 1}  # fmt: skip
 
 
 def labelled(subtask: str, obj: str | None) -> str:
@@ -327,17 +293,11 @@ class Decomposition(Tabled):
             return state == ABOVE_GROUND
         return state == SLIDING or not entry.name.startswith(FRICTION_ON)
 
-    def minimal(self, wanted: Collection[str] | None = None) -> tuple[Subtask, ...]:
-        """The minimal sequence: subtasks that reveal a wanted property name (None: any).
-
-        Free motions stay where a move reveals something, as they delimit it in time.
-        """
+    def minimal(self) -> tuple[Subtask, ...]:
+        """The minimal sequence: subtasks that reveal a property, and the free motions that delimit them."""
         if not self.properties:
             return self.subtasks
-        revealed = {s.index: [entry.name for entry, _ in self.reveals(s.index)] for s in self.subtasks}
-        useful = {
-            i for i, names in revealed.items() if names and (wanted is None or set(names) & set(wanted))
-        }
+        useful = {s.index for s in self.subtasks if self.reveals(s.index)}
         moves = {self.subtasks[index].move for index in useful}
         delimiting = {s.index for s in self.subtasks if s.state == FREE and s.move in moves}
         first = {0} if moves else set()  # delimits whichever move is the first to stay
@@ -368,18 +328,12 @@ def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
     """The ordered subtasks of a task."""
     if isinstance(task, SequenceTask):
         return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
-    return _named(list(contact_states(task)))
-
-
-def _named(states: list[ContactState]) -> tuple[Subtask, ...]:
     named, held = [], False
-    for index, state in enumerate(states):
-        names = {FREE: "release" if index else "pregrasp", ON_GROUND: "place" if held else "pickup",
+    for i, state in enumerate(contact_states(task)):
+        names = {FREE: "release" if i else "pregrasp", ON_GROUND: "place" if held else "pickup",
                  SLIDING: "slide", ABOVE_GROUND: "carry"}  # fmt: skip
-        support = None if state.support is None else state.support.surface
-        contacts = tuple(sorted(str(contact) for contact in state.contacts))
-        named.append(Subtask(index, names[state.name], state.object, state.name, state.move,
-                             support, contacts))  # fmt: skip
+        named.append(Subtask(i, names[state.name], state.object, state.name, state.move, state.support,
+                             state.constraints))  # fmt: skip
         held = state.held
     return tuple(named)
 
@@ -387,9 +341,14 @@ def _named(states: list[ContactState]) -> tuple[Subtask, ...]:
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
     """For each performed move, how far its object's bottom rises, as a sum of object heights.
 
-    Entries are (0-based index of the move, {object: coefficient}): bottom height at place minus
-    bottom height at pickup; the paper's height of the block beneath (its Table 3) is the case of
-    a single coefficient. A slide rises by nothing: {}.
+    The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
+
+    Args:
+        task: of blocks.
+
+    Returns:
+        (0-based index of the move, {object: coefficient}) a move: bottom height at place minus bottom
+        height at pickup. A slide rises by nothing: {}.
     """
     states = list(contact_states(task))
     equations = []
@@ -418,7 +377,7 @@ def decompose(task: AnyTask) -> Decomposition:
     notes = ()
     if task.repeat == "unknown":
         notes = ("the moves repeat as often as the recording shows; one round is decomposed",)
-    return Decomposition(task, _named(states), properties, notes)
+    return Decomposition(task, subtasks(task), properties, notes)
 
 
 def _strength(evidence: Evidence) -> tuple[bool, bool, tuple[int, ...]]:
@@ -431,7 +390,9 @@ def _learn(states: list[ContactState]) -> dict[Unknown, list[Evidence]]:
     moves: dict[object, list[list[int]]] = {}  # moves alike in all contacts determine alike
     for _, group in itertools.groupby((i for i, s in enumerate(states) if s.held), lambda i: states[i].move):
         indices = list(group)
-        moves.setdefault(tuple((states[i].contacts, states[i].beneath) for i in indices), []).append(indices)
+        moves.setdefault(tuple((states[i].constraints, states[i].beneath) for i in indices), []).append(
+            indices
+        )
     for alike in moves.values():
         _learn_within(states, alike, learned)
     equations = [e for alike in moves.values() for i in alike[0] for e in balance(i, states[i])]
@@ -472,23 +433,26 @@ def _learn_friction(index: int, state: ContactState, learned: dict[Unknown, list
     learned.setdefault((FRICTION, state.object), []).append(Evidence(forces, bound=True))
     if state.support is None:
         return
-    friction = (FRICTION_ON + state.support.surface, state.object)
-    target = friction if state.support.slips else ("load", str(index), "0")
+    friction = (FRICTION_ON + state.support, state.object)
+    target = friction if state.name == SLIDING else ("load", str(index), "0")
     equations = balance(index, state)
-    known = {unknown for equation in equations for unknown in equation.unknowns
-             if any(way.condition is None for way in learned.get(unknown, ()))} - {friction}  # fmt: skip
+    unknowns = {key for equation in equations for key in equation if not isinstance(key, Source)}
+    known = {key for key in unknowns if any(way.condition is None for way in learned.get(key, ()))}
+    known -= {friction}
     if target in determined(equations, known):
         given = tuple(u for u in known if target not in determined(equations, known - {u}))
-        learned.setdefault(friction, []).append(Evidence(forces, not state.support.slips, given))
+        learned.setdefault(friction, []).append(Evidence(forces, state.name != SLIDING, given))
         return
     for unknown, row in determined(balance(index, state, loads=3), known).items():
         if is_property(unknown):
             learned.setdefault(unknown, []).append(_evidence(row, condition=VARYING_LOAD))
 
 
-def _evidence(row: Equation, moved: dict[int, int] | None = None, condition: str | None = None) -> Evidence:
-    sources = {((moved or {}).get(source.subtask, source.subtask), source.signal) for source in row.sources}
-    return Evidence(tuple(Source(*source) for source in sorted(sources)), condition=condition)
+def _evidence(
+    sources: Iterable[Source], moved: Mapping[int, int] | None = None, condition: str | None = None
+) -> Evidence:
+    used = {((moved or {}).get(source.subtask, source.subtask), source.signal) for source in sources}
+    return Evidence(tuple(Source(*source) for source in sorted(used)), condition=condition)
 
 
 def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str) -> str:
@@ -503,34 +467,3 @@ def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str
     if not any(state.held and state.object == name for state in states):
         return f"no recorded move grips {name}"
     return f"no recorded move lifts {name} clear of its support"
-
-
-HIDDEN_GRIP = (
-    "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
-    "[gripper] would tell"
-)
-TOUCHED = "from the opening at which the pads touch, as what they give under the grip is not measured"
-
-
-def revealed_by(found: Decomposition, rig: Rig) -> Decomposition:
-    """The decomposition as this hand can carry it out: what it cannot reveal is without evidence.
-
-    A fingertip hand reveals all; a gripper with a wrist sensor alone has the sum of both fingers' forces,
-    which leaves weight, height and friction on a support as they are.
-    """
-    if rig.gripper is None or rig.gripper.grip_known:
-        return found
-    properties = {}
-    for obj, entries in found.properties.items():
-        kept = dict(entries)
-        if FRICTION in kept:
-            kept[FRICTION] = replace(kept[FRICTION], evidence=(), reason=HIDDEN_GRIP)
-        if WIDTH in kept:
-            evidence = tuple(_touched(each) for each in kept[WIDTH].evidence)
-            kept[WIDTH] = replace(kept[WIDTH], evidence=evidence)
-        properties[obj] = kept
-    return replace(found, properties=properties)
-
-
-def _touched(evidence: Evidence) -> Evidence:
-    return evidence if evidence.condition else replace(evidence, condition=TOUCHED)

@@ -18,8 +18,7 @@ leaves out):
 A hand that rolls turns its fingers and what they hold together. These equations hold along and across the
 hand, so differences between the fingers are turned back first (`turned`); sums and means stay as they are:
 weight hangs down however the hand is turned. A roll shows as a height difference of the fingers
-(`rolled_offset`), and what hangs in a rolled hand has one corner lower than the middle of its base
-(`corner_drop`).
+(`rolled_offset`).
 
 Emissions (hmmseg.segmentation), observations of properties (estimation) and residuals of the gap (simgap) are
 built from these functions; the dynamics of the virtual model (simgap.world) is tested against them. All
@@ -81,11 +80,6 @@ def turned(across: Values, up: Values, angle: Values) -> tuple[Values, Values]:
 def rolled_offset(distance: Values, roll: Values) -> Values:
     """Height difference [m] that a small roll [rad] gives to fingers at this distance [m]."""
     return distance * roll
-
-
-def corner_drop(width: Values, tilt: Values) -> Values:
-    """How far [m] the lowest corner of a block, tilted by a small angle [rad], is below its base's middle."""
-    return rolled_offset(width, abs(tilt)) / 2
 
 
 def hanging(weight: Values, pads: Pads) -> Values:

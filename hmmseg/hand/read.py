@@ -40,12 +40,24 @@ LONG = 1_000_000  # numerics: rows from which on a recording is read in pieces: 
 
 
 def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceTask | None = None) -> Trial:
-    """Trial from a file, a pandas or polars DataFrame or a dict of arrays; InputError says where it fails.
+    """A recording, read and checked.
 
     The channels kept are the rig's (joint space, Cartesian or a gripper's), or for a plain ordered
     task the ones it names (every column but `t` otherwise), taken from the columns or messages
-    that the rig's `[columns]` or `[topics]` map to them. A hand's recording that cannot be as it is
-    (other units, flipped signs, swapped fingers) is refused with what to write into the rig.
+    that the rig's `[columns]` or `[topics]` map to them.
+
+    Args:
+        source: a file, a pandas or polars DataFrame, or a dict of arrays.
+        rig: the hand; a plain ordered task needs none.
+        task: a plain ordered task; none for a task of blocks.
+
+    Returns:
+        The trial, in SI units.
+
+    Raises:
+        InputError: a file cannot be read, or a hand's recording cannot be as it is (other units, flipped
+            signs, swapped fingers); it says where, and what to write into the rig.
+        ValueError: neither a rig nor a task is given.
     """
     if task is None and rig is None:
         raise ValueError("a block task's trial needs its rig")

@@ -22,7 +22,7 @@ import numpy as np
 
 from hmmseg.hand.kinematics import forward, jacobian
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.io.trial import ROLL, Trial, position_pairs
+from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.robust import bridged
 from hmmseg.tables import Brief
 
@@ -77,8 +77,6 @@ class Signals(Brief):
     touches: tuple[tuple[float, float], ...] = ()  # times of touch and release known apart, and sds [s]
     timing: np.ndarray | None = None  # sd of when a force changed that changes there [s]
     free: np.ndarray | None = None  # share of a sample in which nothing is held for sure
-    roll: np.ndarray | None = None  # of the hand [rad], where recorded; the rest is as if it had none
-    coupled: bool = False  # both fingers are one gripper's: what they differ by in height is a roll
 
     @property
     def x(self) -> np.ndarray:
@@ -164,8 +162,7 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
     sds = {f"sd_{name}": np.sqrt(variance) for name, variance in variances.items()}
     force = np.nan if noise.force is None else noise.force
     return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,  # type: ignore[arg-type]
-                   touches=trial.touches, timing=trial.timing, free=trial.free,
-                   roll=channels.get(ROLL), coupled=not rig.jointed)  # fmt: skip
+                   touches=trial.touches, timing=trial.timing, free=trial.free)  # fmt: skip
 
 
 def _square(sd: float | None) -> float:

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.contact.decompose import HIDDEN_GRIP
 from hmmseg.errors import InputError
 from hmmseg.hand.plausibility import REACH, Finding, all_changed, changed, length_unit
 from hmmseg.hand.sensing import tool_warnings
@@ -266,33 +265,28 @@ def counts_closing(trial: Trial, rig: Rig) -> InputError:
     return InputError(f"{trial.file}: column {name}", problem, finding.remedy)
 
 
-def lifts_pull(trial: Trial, rig: Rig, load: float) -> InputError:
-    """The line for lifts that take weight [N] off the hand, whichever sign is stated."""
-    problem = f"say that what is lifted pulls up with {abs(load):.3g} N: the sign is the other way round"
-    return _other_sign(trial, rig, problem)
+def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
+    """The line for a sign that is the other way round: lifts take weight `load` [N] off the hand.
+
+    None: nothing is lifted that would tell, and free motion contradicts the stated sign.
+    """
+    problem = "go against the hand's own acceleration in free motion"
+    if load is not None:
+        problem = f"say that what is lifted pulls up with {abs(load):.3g} N"
+    where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
+    said = str(not rig.wrist.reaction).lower() if rig.wrist.reaction is not None else "true"
+    return InputError(
+        where, f"{problem}: the sign is the other way round", f"reaction = {said} under [gripper]"
+    )
 
 
-def goes_against(trial: Trial, rig: Rig) -> InputError:
-    """The line for a stated sign that free motion contradicts, where nothing is lifted that would tell."""
-    problem = "go against the hand's own acceleration in free motion: the sign is the other way round"
-    return _other_sign(trial, rig, problem)
-
-
-def borne_out(trial: Trial, rig: Rig, load: float) -> str:
+def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
     """The warning where a lift tells one sign and free motion the other: readings that go with the pose."""
-    gripper = rig.wrist
-    where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
+    where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
     return (
         f"{where} bear {load:.3g} N of what is lifted, but go against the hand's own acceleration in free "
         "motion: they change with the pose, and loads are wrong by as much"
     )
-
-
-def _other_sign(trial: Trial, rig: Rig, problem: str) -> InputError:
-    gripper = rig.wrist
-    where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
-    said = not gripper.reaction if gripper.reaction is not None else True
-    return InputError(where, problem, f"reaction = {str(said).lower()} under [gripper]")
 
 
 def points_down(trial: Trial, rig: Rig) -> InputError:
@@ -455,6 +449,10 @@ SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a tou
 CLIPPED = 2.0  # chosen: noise scales
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
 NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
+HIDDEN_GRIP = (
+    "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
+    "[gripper] would tell"
+)
 HALVES = (
     "columns fx1, fx2 and fy1, fy2 are the same in every sample, half of a wrist's force each: the grip is "
     "read from the fingers' distance instead"
@@ -496,9 +494,9 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     if held.lifts and max(held.lifts) < 0:
         held, rig, signs = _with_other_sign(trial, rig, pose, opening, pressing, held)
     elif held.lifts and held.tool.against:
-        signs = (borne_out(trial, rig, max(held.lifts)),)
+        signs = (pose_remark(trial, rig, max(held.lifts)),)
     elif held.tool.against:
-        raise goes_against(trial, rig)
+        raise other_sign(trial, rig)
     if held.grips and not held.lifts:
         text = contradiction(trial, rig, pose, opening, held)
         if text is not None:
@@ -521,8 +519,8 @@ def _with_other_sign(
         other = rig.model_copy(update={"gripper": rig.wrist.model_copy(update={"reaction": reaction})})
         found = held_by(trial, other, pose, opening, pressing)
         if found.lifts and max(found.lifts) > 0:
-            return found, other, (borne_out(trial, other, max(found.lifts)),)
-    raise lifts_pull(trial, rig, min(held.lifts))
+            return found, other, (pose_remark(trial, other, max(found.lifts)),)
+    raise other_sign(trial, rig, min(held.lifts))
 
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,

@@ -62,15 +62,11 @@ def validated(model: type[Model], table: dict[str, Any], where: str) -> Model:
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
     """Keys of the table in which the unknown last part of `location` stands."""
     for part in location[:-1]:
-        field = _field(model, str(part))
+        named = {field.alias or name: field for name, field in model.model_fields.items()}
+        field = named.get(str(part))
         inner = None if field is None else _inner_model(field.annotation)
         model = inner if inner is not None else model  # a table of tables: its names are not fields
     return [field.alias or name for name, field in model.model_fields.items()]
-
-
-def _field(model: type[BaseModel], key: str) -> Any:
-    named = {field.alias or name: field for name, field in model.model_fields.items()}
-    return named.get(key)
 
 
 def _inner_model(annotation: Any) -> type[BaseModel] | None:

@@ -31,7 +31,7 @@ from hmmseg.hand.wrist import (
     give_of,
     grip_force_of,
     grip_of,
-    lifts_pull,
+    other_sign,
 )
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
@@ -259,7 +259,7 @@ class Wrist:
         if load is None:
             return
         if load < 0:
-            raise lifts_pull(trial, self.rig, load)
+            raise other_sign(trial, self.rig, load)
         if load == 0.0:
             self._opening.refuse()
 

@@ -31,14 +31,13 @@ from hmmseg.segmentation.conformity import (
     plan,
     task_boundaries,
 )
-from hmmseg.segmentation.emissions import WINDOW, Features, Parameters, features, thin, without
+from hmmseg.segmentation.emissions import WINDOW, Features, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import (
     InMemory,
     OnDisk,
-    Parts,
     Recorded,
     cut,
     merge_point,
@@ -84,27 +83,29 @@ class Pool:
 
 
 def pooled(
-    recordings: Sequence[Signals], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig,
+    parts: Sequence[tuple[Recorded, slice]], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig,
     taps: Sequence[Spans],
 ) -> Pool:  # fmt: skip
-    """One fit of all that fit; a second one where their forces come late.
+    """One fit of all `parts` of recordings that are `fitting`; a second one where their forces come late.
 
-    `taps` [s] of each recording are touches that belong to no subtask.
+    `taps` [s] of each part are touches that belong to no subtask.
     """
 
-    def once(signals: Sequence[Signals], again: bool) -> tuple[list[Reading], Fit, Sensing]:
+    def once(late: Sensing | None = None) -> tuple[list[Reading], Fit, Sensing]:
+        signals = (recorded.part(samples) for recorded, samples in parts)
+        signals = signals if late is None else (read_again(s, late) for s in signals)
         readings = [_read(s, rig, t) for s, t in zip(signals, taps, strict=True)]
         fitted = fit([readings[i].features for i in fitting], steps)
         fine = [readings[i].fine for i in fitting]
         # Forces of a wrist's fingers show no pads of their own.
-        again = again or any(r.fine.touches for r in readings)
+        again = late is not None or any(r.fine.touches for r in readings)
         paths = [(readings[i].thinned.t, a.path) for i, a in zip(fitting, fitted.posteriors, strict=True)]
         return readings, fitted, sense(fine, paths, steps, fitted.parameters, rig, again)
 
-    readings, fitted, sensing = once(recordings, again=False)
+    readings, fitted, sensing = once()
     remarks, late = sensing.remarks(rig), sensing.late
     if sensing.late:
-        readings, fitted, again = once([read_again(s, sensing) for s in recordings], again=True)
+        readings, fitted, again = once(sensing)
         remarks = replace(again, late=True, filter=sensing.filter, delay=sensing.delay).remarks(rig)
         sensing = replace(again, delay_sd=float(np.hypot(again.delay_sd, sensing.delay_sd)))
     changes = [
@@ -113,12 +114,6 @@ def pooled(
     ]
     disagreement = disagreements([c for own in changes for c in own if c is not None])
     return Pool(readings, fitted, sensing, changes, disagreement, remarks, late)
-
-
-def unfitted(recordings: Sequence[Signals], parameters: Parameters, rig: Rig, taps: Sequence[Spans]) -> Pool:
-    """Where no trial fits the task: what is known of the sensors, and no alignment."""
-    readings = [_read(s, rig, t) for s, t in zip(recordings, taps, strict=True)]
-    return Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
 
 
 def _read(signals: Signals, rig: Rig, taps: Spans) -> Reading:
@@ -161,12 +156,16 @@ def aligned_rounds(
     else:
         every, verdicts = _rounds(recordings, coarse, task, rig)
     steps = subtasks(task if all_fit else one_round(task))
-    flat = Parts([(r, p) for r, own in zip(recordings, every, strict=True) for p in own])
+    flat = [(r, p) for r, own in zip(recordings, every, strict=True) for p in own]
     of = [v for own in verdicts for v in own]
     fitting = [i for i, verdict in enumerate(of) if all_fit or verdict.failing is None]
-    parameters = of[0].free.parameters
     taps = [v.free.taps for v in of]
-    pool = pooled(flat, fitting, steps, rig, taps) if fitting else unfitted(flat, parameters, rig, taps)
+    if fitting:
+        pool = pooled(flat, fitting, steps, rig, taps)
+    else:  # what is known of the sensors, and no alignment
+        parameters = of[0].free.parameters
+        readings = [_read(r.part(p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
+        pool = Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
     position = {i: j for j, i in enumerate(fitting)}
     pieces = iter([
         _aligned(reading, steps, pool, position[i]) if i in position
@@ -349,11 +348,19 @@ def align(
 
     A trial that does not fit its task is kept out of the pool and aligned with the order that it
     shows instead: its subtasks before `failed` are the task's, boundaries after it are not. Its
-    log evidence is that of the order it shows. `all_fit`: all are taken to fit, whatever they show.
+    log evidence is that of the order it shows. Of a repeated task every round is such a trial: one
+    that fails leaves the others as they are.
 
-    Of a repeated task every round is such a trial: one that fails leaves the others as they are. `task`
-    of the result has its number of rounds (of several recordings with an unknown number, the most).
-    `signals`: to be read instead of the trials' own.
+    Args:
+        trials: recordings of one hand, at least one.
+        task: whose order they follow.
+        rig: the nominal hand.
+        all_fit: all are taken to fit, whatever they show.
+        signals: one a trial, to be read instead of its own.
+
+    Returns:
+        The trials with their alignments; `task` has its number of rounds (of several recordings with
+        an unknown number, the most).
     """
     if signals is None:
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
@@ -363,24 +370,17 @@ def align(
     done = performed(task, pieces)
     steps = subtasks(done)
     number = 1 if all_fit or done.repeat == "unknown" else done.repeat
-    trial_alignments = []
+    found = []
     for trial, s, own in zip(trials, signals, pieces, strict=True):
+        last, rate = float(s.t[-1]), float(1.0 / np.median(np.diff(s.t)))
         segmentation, boundaries, present = joined(
-            trial.file,
-            float(s.t[-1]),
-            float(1.0 / np.median(np.diff(s.t))),
-            own,
-            steps,
-            number,
-            task.repeat == "unknown",
-            pool.remarks,
-            s,
+            trial.file, last, rate, own, steps, number, task.repeat == "unknown", pool.remarks, s
         )
         thinned = thin(s, window=WINDOW)
-        trial_alignments.append(
+        found.append(
             TrialAlignment(trial, s, thinned, features(thinned, rig), boundaries, segmentation, present)
         )
-    return AlignedTrials(done, rig, steps, pool.fit, tuple(trial_alignments), pool.late)
+    return AlignedTrials(done, rig, steps, pool.fit, tuple(found), pool.late)
 
 
 def segment(trials: Sequence[Trial], task: BlockTask, rig: Rig) -> list[Segmentation]:
@@ -399,14 +399,6 @@ def segment_long(recording: LongRecording, task: BlockTask, rig: Rig) -> Segment
     pool, pieces = aligned_rounds([source], coarse, task, rig)
     done = performed(task, pieces)
     number = 1 if done.repeat == "unknown" else done.repeat
-    steps = subtasks(done)
-    return joined(
-        recording.file,
-        float(recording.t[-1]),
-        recording.rate,
-        pieces[0],
-        steps,
-        number,
-        task.repeat == "unknown",
-        pool.remarks,
-    )[0]
+    last = float(recording.t[-1])
+    return joined(recording.file, last, recording.rate, pieces[0], subtasks(done), number,
+                  task.repeat == "unknown", pool.remarks)[0]  # fmt: skip

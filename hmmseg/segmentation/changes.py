@@ -68,12 +68,6 @@ class Penetration:
     sd_rate: float
     form: float
     hidden: bool = False
-    ahead: np.ndarray | None = None
-
-    @property
-    def free_place(self) -> np.ndarray:
-        """Place (num_samples,) [m] of a thing that is apart."""
-        return self.place if self.ahead is None else self.place + self.ahead
 
     def restless(self, n: int) -> float:
         """How much the speed of what comes down wanders up to sample n: its variance a second [m^2/s^3]."""
@@ -102,21 +96,17 @@ def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.n
     log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
     pushes = np.where(force, log_ndtr(pressed / sd_pressed), 0.0) - log_force
     silent = np.where(force, _log_student(pressed / sd_apart) - np.log(sd_apart), 0.0)
-    # What stands on its corner comes to lie flat: its place is anywhere between.
-    ahead = np.zeros(c.t.size) if c.ahead is None else c.ahead
-    place, sd_place = place + ahead / 2, np.sqrt(c.sd_place**2 + ahead**2 / 12)
-    within = np.where(position, log_ndtr(place / sd_place), 0.0) - log_place
-    apart = np.where(position, c.free_place, 0.0)
-    beyond = np.where(position, log_ndtr(-apart / c.sd_place), 0.0) - log_place
+    within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
+    beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
     sd_force = np.hypot(sd_pressed, c.form * np.abs(pressed))
-    both = np.hypot(sd_force, sd_place)
-    depth = (sd_place**2 * pressed + sd_force**2 * place) / both**2
+    both = np.hypot(sd_force, c.sd_place)
+    depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
     # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
     # is lost in it, that would count against contact, of which force alone tells.
     deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
-    agree = agree + np.log(np.maximum(ROOT_2PI * sd_place / deep, 1.0))
-    held = agree + log_ndtr(depth * both / (sd_force * sd_place))
+    agree = agree + np.log(max(ROOT_2PI * c.sd_place / deep, 1.0))
+    held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))
     held = np.where(force & position & (not c.hidden), held, pushes + within)
     moved, rung = (STRAY, SELDOM) if making else (SELDOM, STRAY)
     neither = np.log(STRAY * SELDOM) - log_force - log_place
@@ -233,15 +223,12 @@ def cut(change: Change) -> Change | None:
     if not near.size:
         return None
     index = index[near[0] : near[-1] + 2]
-
-    def near_it(contacts: Sequence[Penetration]) -> tuple[Penetration, ...]:
-        return tuple(
-            replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index],
-                    ahead=None if c.ahead is None else c.ahead[index])
-            for c in contacts
-        )  # fmt: skip
-
-    return replace(change, contacts=near_it(change.contacts), unmoved=near_it(change.unmoved))
+    contacts, unmoved = (
+        tuple(replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
+              for c in each)
+        for each in (change.contacts, change.unmoved)
+    )  # fmt: skip
+    return replace(change, contacts=contacts, unmoved=unmoved)
 
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
@@ -283,7 +270,7 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
     z = [np.zeros(0)]
     for change in changes:
         if not change.making and len(change.contacts) == num_contacts:
-            z += [c.pressed[c.free_place < -SURE * c.sd_place] / c.sd_apart for c in change.contacts]
+            z += [c.pressed[c.place < -SURE * c.sd_place] / c.sd_apart for c in change.contacts]
     z2 = np.concatenate(z) ** 2
     z2 = z2[np.isfinite(z2)]
     if not z2.size:
@@ -373,7 +360,7 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
     """The crossing of interval n: by position where apart, by force where there is contact."""
     making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
-    pressed, gap = c.pressed[touching], c.free_place[apart]
+    pressed, gap = c.pressed[touching], c.place[apart]
     noise = c.sd_pressed * (known.louder if making else 1.0)
     sd_pressed = float(np.hypot(noise, c.form * abs(pressed)))
     if c.hidden:  # a rigid pad hides its compression

@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
 from hmmseg.densities import log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
@@ -256,8 +256,6 @@ def _log_gripped(
         out = grip + (carried + _broad(f, "vx", "vy") + _broad(f, "y"))
         out += np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
         return np.logaddexp(np.log1p(-LOST) + out, np.log(LOST) + free)
-    if state not in (ON_GROUND, SLIDING):
-        raise ValueError(f"no emission for the contact state {state!r}")
     out = grip + log_between(fy, -f.span["press"], weight, scale["carry"])
     aside = None if state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
     upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), _broad(f, "vy")

@@ -1,19 +1,14 @@
-"""Posteriors of an aligned trial's boundaries, from what finger and block show of each contact change.
-
-A block in a hand that rolls hangs askew: one of its corners meets the ground before its middle would.
-"""
+"""Posteriors of an aligned trial's boundaries, from what finger and block show of each contact change."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
-from hmmseg.contact.equations import Pads, block_offset, block_y, corner_drop, hanging
-from hmmseg.hand.roll import slow_roll
+from hmmseg.contact.equations import Pads, block_y, hanging
 from hmmseg.hand.signals import Signals, central_differences, one_sided
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
@@ -23,58 +18,6 @@ from hmmseg.segmentation.changes import Change, Disagreement, Penetration, Prior
 from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span
-
-
-def tilts(
-    s: Signals, pads: Pads, ends: Sequence[tuple[float, float]], steps: Sequence[Subtask]
-) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """Of each carry its samples (num_timesteps,) and, on them, the block's tilt [rad], and its error [rad].
-
-    Against how it stood when it was gripped: as the recorded roll of the hand says, else as the pads'
-    places on the block show, of fingers that are one gripper's. `ends` (num_subtasks, 2) [s]: first and last
-    time of every subtask.
-    """
-    if s.roll is None and not s.coupled:  # a block slips along one finger and stays upright
-        return
-    offset = block_offset(s.offset, s.fy1, s.fy2, pads)
-    for before, step in pairwise(steps):
-        start, end = ends[step.index]
-        lift = ends[before.index][1]
-        inside = (s.t >= start) & (s.t <= end)
-        stood = (s.t > lift - DRIFTS) & (s.t <= lift)
-        if (before.state, step.state) != (ON_GROUND, ABOVE_GROUND) or not inside.any():
-            continue
-        shown = offset if s.roll is None else s.roll
-        stood &= np.isfinite(shown)
-        if not stood.any():
-            continue
-        change = shown[inside] - np.median(shown[stood])
-        if s.roll is not None:
-            yield inside, change, 0.0
-        else:
-            yield inside, *slow_roll(s.t[inside], change, s.distance[inside])
-
-
-def corner_drops(
-    s: Signals, pads: Pads, ends: Sequence[tuple[float, float]], steps: Sequence[Subtask]
-) -> tuple[np.ndarray, float]:
-    """How far the lowest corner of what is carried lies below its base's middle (num_timesteps,) [m], and sd.
-
-    After a landing as at its moment, until the block stands flat.
-    """
-    out, worst = np.zeros(s.t.size), 0.0
-    for inside, tilt, sd in tilts(s, pads, ends, steps):
-        there = s.distance[inside][np.isfinite(s.distance[inside])]
-        if not there.size:
-            continue
-        width = float(np.median(there))
-        out[inside] = np.nan_to_num(corner_drop(width, tilt))
-        last = np.flatnonzero(inside)[-1]
-        following = np.flatnonzero(s.t <= s.t[last] + DRIFTS)
-        out[last + 1 : following[-1] + 1] = out[last]
-        worst = max(worst, float(corner_drop(width, sd)))
-    return out, worst
-
 
 PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
 STIFFEST = 1e-7  # numerics: m/N
@@ -87,8 +30,7 @@ class Contacts:
     `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
     position along its own closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just
     after each sample, by finger, `sinking` (2, T) that of the mean height downwards [m/s]; `deflection` (T,):
-    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N];
-    `drop` (T,): how far the lowest corner of a carried block lies below the middle of its base [m].
+    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N].
     """
 
     signals: Signals
@@ -99,7 +41,6 @@ class Contacts:
     sinking: np.ndarray
     deflection: np.ndarray
     tangential: np.ndarray
-    drop: np.ndarray
     weight: dict[str, float]
     sd: dict[str, float]
 
@@ -182,7 +123,7 @@ class Contacts:
         return self._timely(Penetration(
             self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
             self.sd["deflection"], self.sd["carried"], sd_y, self.sd["vy"],
-            self.sensing.shear.form, self.sensing.shear.value < RIGID, ahead=self.drop,
+            self.sensing.shear.form, self.sensing.shear.value < RIGID,
         ), making)  # fmt: skip
 
     def _timely(self, c: Penetration, making: bool) -> Penetration:
@@ -198,7 +139,7 @@ class Contacts:
             return replace(c, place=c.place - moved)
         # What is farther apart than it moves within a reading has no compression to be late: its force rings.
         meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(self.sensing.delay))
-        sure = (c.pressed > SURE * c.sd_apart) & ~(c.free_place < -SURE * c.sd_place - meanwhile)
+        sure = (c.pressed > SURE * c.sd_apart) & ~(c.place < -SURE * c.sd_place - meanwhile)
         return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
 
 
@@ -212,13 +153,8 @@ def shown(pads: Pads) -> Pads:
     return Pads(*(max(float(c), STIFFEST) for c in pads))
 
 
-def contacts(
-    signals: Signals, sensing: Sensing, parameters: Parameters, drop: tuple[np.ndarray, float] | None = None
-) -> Contacts:
-    """Contacts of one trial; noise the rig does not state is learned from the recording.
-
-    `drop`: of a carried block's lowest corner, and its sd [m] (`corner_drops`); None: level.
-    """
+def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Contacts:
+    """Contacts of one trial; noise the rig does not state is learned from the recording."""
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
     inward = np.stack([s.x1, -s.x2])
@@ -229,18 +165,17 @@ def contacts(
     pads, toe = shown(sensing.pads), sensing.normal.toe
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
-    lowest, lowest_sd = (np.zeros(s.t.size), 0.0) if drop is None else drop
     return Contacts(
         signals=s, sensing=sensing,
         compression=_compression(normal, sensing),
         inward=inward, inward_rate=rates, sinking=sinking, deflection=-block_y(0.0, fy1, fy2, pads),
-        tangential=np.stack([fy1, fy2]), drop=lowest,
+        tangential=np.stack([fy1, fy2]),
         weight=parameters.weight,
         sd={
             "compression": force * (float(pads.normal1) + toe.slope),
             "inward": sd_x,
             "inward_rate": sd_vx,
-            "y": float(np.sqrt(sd_y**2 / 2 + level**2 + lowest_sd**2)),
+            "y": float(np.sqrt(sd_y**2 / 2 + level**2)),
             "vy": sd_vy / root2,
             "deflection": root2 * hanging(force, pads),
             "carried": hanging(max(parameters.scale["carry"], root2 * force), pads),
@@ -289,8 +224,7 @@ def contact_changes(
     path = posterior.smoothed.argmax(axis=1)
     last = np.searchsorted(path, np.arange(len(steps) - 1), side="right") - 1
     edges = [float(t[0]), *t[last], float(t[-1])]
-    drop = corner_drops(signals, sensing.pads, list(pairwise(edges)), steps)
-    table = contacts(signals, sensing, parameters, drop)
+    table = contacts(signals, sensing, parameters)
     out = []
     for k in range(len(steps) - 1):
         probability = posterior.moves[0][:, k]

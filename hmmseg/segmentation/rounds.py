@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 
@@ -26,20 +25,6 @@ from hmmseg.segmentation.emissions import Features, thin
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts
 
 MARGIN = 64  # numerics: rows read on either side of a part, for differences of its neighbours
-
-
-@runtime_checkable
-class Recorded(Protocol):
-    """One recording's times (num_timesteps,) [s], and the signals of any of its samples."""
-
-    @property
-    def t(self) -> np.ndarray:
-        """Times (num_timesteps,) [s]."""
-        ...
-
-    def part(self, samples: slice) -> Signals:
-        """Signals of some samples."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -100,26 +85,7 @@ class OnDisk:
         return Signals(**joined)  # type: ignore[arg-type]
 
 
-class Parts(Sequence[Signals]):
-    """Parts of recordings, read at each access."""
-
-    def __init__(self, parts: Sequence[tuple[Recorded, slice]]) -> None:
-        self.parts = list(parts)
-
-    def __len__(self) -> int:
-        return len(self.parts)
-
-    @overload
-    def __getitem__(self, i: int) -> Signals: ...
-    @overload
-    def __getitem__(self, i: slice) -> Parts: ...
-    def __getitem__(self, i: int | slice) -> Signals | Parts:
-        if isinstance(i, slice):
-            return Parts(self.parts[i])
-        recorded, samples = self.parts[i]
-        return recorded.part(samples)
-
-
+Recorded = InMemory | OnDisk
 GLANCE = 4096  # numerics: samples that tell which of the recording's blocks is which object
 
 

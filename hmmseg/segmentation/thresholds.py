@@ -3,12 +3,9 @@
 The rival of the switching model, after Dupont, Schulteis, Millman and Howe (1999), Section 3.3
 and Table 2. Signals become tri-valued by symmetric thresholds; rules on those values name the
 contact state of every sample (0 where no rule holds); the known order of the subtasks turns
-states into spans. Two ways to do the last step:
-
-- `monotone`: of all assignments in the task's order, the one that agrees with most samples.
-  Where several do, the one that holds on the ground longer: net upward force under a weight
-  that still rests shows as hold-above-ground, which the rules cannot tell apart.
-- `first-change`: the next subtask begins at the first sample that shows its state.
+states into spans: of all assignments in that order, the one that agrees with most samples. Where several do,
+the one that holds on the ground longer: net upward force under a weight that still rests shows as
+hold-above-ground, which the rules cannot tell apart.
 """
 
 from __future__ import annotations
@@ -16,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -31,7 +27,6 @@ FORCE_THRESHOLD = 0.05  # cited: N
 VELOCITY_THRESHOLD = 0.05  # cited: m/s
 NUMBERS = {FREE: 1, ABOVE_GROUND: 2, ON_GROUND: 3, SLIDING: 3}  # cited: the paper's; 0 is none of them
 JUMP = 0.05  # chosen: share of all samples by which going on behind a missing subtask must agree better
-Rule = Literal["monotone", "first-change"]
 
 
 @dataclass(frozen=True)
@@ -185,45 +180,38 @@ def _trimmed(agrees: np.ndarray, entries: dict[int, int]) -> Assignment:
     return Assignment(first, last, hits / length)
 
 
-def first_change_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assignment:
-    """Each subtask begins at the first sample after the last one's that shows its state."""
-    agrees = agreement(labels, steps)
-    length, count = agrees.shape
-    first, last, hits = np.full(count, -1), np.full(count, -1), 0
-    for s in range(count):
-        begin = 0 if s == 0 else first[s - 1] + 1
-        shown = np.flatnonzero(agrees[begin:, s])
-        if not shown.size:
-            break
-        first[s] = begin + shown[0]
-    reached = np.flatnonzero(first >= 0)
-    for s in reached:
-        last[s] = first[s + 1] - 1 if s + 1 in reached else length - 1
-        hits += int(agrees[first[s] : last[s] + 1, s].sum())
-    return Assignment(first, last, hits / length)
-
-
 def segment_qualitative(
     trial: Trial,
     signals: Signals,
     task: AnyTask,
     force_threshold: float = FORCE_THRESHOLD,
     velocity_threshold: float = VELOCITY_THRESHOLD,
-    rule: Rule = "monotone",
+    order: Order = monotone_order,
 ) -> Segmentation:
     """Segmentation of one trial by thresholds, rules and the order of the subtasks.
 
     A boundary lies anywhere between the last sample of one subtask and the first of the next:
     its median is the midpoint, its deviation and interval those of a uniform. There is no
-    evidence. A subtask without samples fails the trial; the others keep their spans. A task
-    with `repeat = "unknown"` is repeated as often as agrees best. Thresholds in N and m/s.
-    InputError for a plain ordered task and for thresholds that are not > 0.
+    evidence. A subtask without samples fails the trial; the others keep their spans.
+
+    Args:
+        trial: the recording.
+        signals: its signals in task space.
+        task: a task of blocks; one with `repeat = "unknown"` is repeated as often as agrees best.
+        force_threshold: below which a force counts as none [N].
+        velocity_threshold: below which a velocity counts as none [m/s].
+        order: how the states of samples become subtasks in order.
+
+    Returns:
+        The trial's segmentation.
+
+    Raises:
+        InputError: a plain ordered task, or thresholds that are not > 0.
     """
     if not isinstance(task, BlockTask):
         raise InputError("task", "a plain ordered task has no contact states to threshold",
                          "objects and moves, or the method hmm")  # fmt: skip
     labels = label_states(signals, force_threshold, velocity_threshold)
-    order = {"monotone": monotone_order, "first-change": first_change_order}[rule]
     steps, assigned = _repeated(task, labels, order)
     failed = None
     if not assigned.complete:
@@ -241,14 +229,13 @@ def _repeated(task: BlockTask, labels: StateLabels, order: Order) -> tuple[tuple
     if task.repeat != "unknown":
         steps = subtasks(task)
         return steps, order(labels, steps)
-    best = None
-    for number in range(1, labels.state.size):
+    best = subtasks(replace(task, repeat=1)), order(labels, subtasks(replace(task, repeat=1)))
+    for number in range(2, labels.state.size):
         steps = subtasks(replace(task, repeat=number))
         assigned = order(labels, steps)
-        if best is not None and not (assigned.complete and assigned.agreement > best[1].agreement):
+        if not (assigned.complete and assigned.agreement > best[1].agreement):
             break
         best = steps, assigned
-    assert best is not None  # at least eight samples: the loop ran
     return best
 
 

@@ -220,12 +220,19 @@ ENOUGH = (
 
 
 def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | None = None) -> SequenceModel:
-    """Emissions and durations of a plain ordered task.
+    """Learn emissions and durations of a plain ordered task.
 
-    `labels` maps a trial's name (with or without its suffix) to its boundaries [s], one fewer than
-    subtasks, None where unknown, or to {subtask: its start}; a skipped optional subtask has two equal ones.
-    One boundary of one trial helps, and trials without labels help too. Raises InputError for trials too
-    short for the task, missing channels and labels that do not fit.
+    Args:
+        trials: recordings, labelled or not; those without labels help too.
+        task: the order of the subtasks.
+        labels: by a trial's name (with or without its suffix) its boundaries [s], one fewer than subtasks,
+            None where unknown, or {subtask: its start}; a skipped optional subtask has two equal ones.
+
+    Returns:
+        The model learned.
+
+    Raises:
+        InputError: trials too short for the task, missing channels or labels that do not fit.
     """
     if not trials:
         raise InputError("trials", "none given", "at least one trial")

@@ -151,7 +151,18 @@ def save_model(model: SequenceModel, path: str | Path) -> None:
 
 
 def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
-    """Read a model; InputError where the file is no model or was learned for another task."""
+    """Read a model.
+
+    Args:
+        path: a file written by `save_model`.
+        task: for which it was learned.
+
+    Returns:
+        The model.
+
+    Raises:
+        InputError: the file is no model, or was learned for another task.
+    """
     where = str(path)
     try:
         table = unpack(Path(path))

@@ -122,11 +122,20 @@ _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interva
 
 def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
                      model: SequenceModel | None = None) -> list[Segmentation]:  # fmt: skip
-    """One segmentation a trial; without a model, one is learned from these trials themselves.
+    """Segment recordings of a plain ordered task.
 
-    A trial that does not follow the task says so in `failed` and keeps its spans. A skipped optional
-    subtask has no span. Where trials can be read in several ways, spans have `alternatives` and the
-    segmentation a `question`. InputError where trials, task and model do not go together.
+    Args:
+        trials: recordings.
+        task: the order of the subtasks.
+        model: learned by `fit_sequence`; without one, it is learned from these trials themselves.
+
+    Returns:
+        One segmentation a trial. A trial that does not follow the task says so in `failed` and keeps its
+        spans. A skipped optional subtask has no span. Where trials can be read in several ways, spans have
+        `alternatives` and the segmentation a `question`.
+
+    Raises:
+        InputError: trials, task and model do not go together.
     """
     if model is None:
         model = fit_sequence(trials, task)

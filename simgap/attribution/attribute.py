@@ -192,7 +192,10 @@ def attribute(
     ranked, others = ranked[:EXAMINED], None
     if heldout and (found.p_value < ALARM or forced):
         others = Heldout.of(gap, noise**2, (j for part in ranked for j in part))
-    examined = {part: _examined(f, part, by_group, rng, others) for part in ranked}
+    examined = {
+        part: _examined(f, part, by_group, rng, others, lambda causes: _accounted(f, models, value, causes))
+        for part in ranked
+    }
     sets = [_explanation(f, parts[m.effects], float(x), examined) for m, x in zip(models, w, strict=True)]
     small = None
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
@@ -313,8 +316,13 @@ def _examined(
     by_group: np.ndarray,
     rng: np.random.Generator,
     others: Heldout | None = None,
+    accounted: Callable[[tuple[int, ...]], float] = lambda causes: 0.0,
 ) -> _Examined:
-    """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
+    """`others`: trials predicted by the others; a cause must predict them better than the set without it.
+
+    Where all squares of these trials are no more than the noise's, no share of them can be gone: how much
+    causes explain is then the share of the evidence for a gap that is `accounted` for by them.
+    """
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     same = {j: _same(f, model, j) for j in effects}
@@ -339,9 +347,14 @@ def _examined(
     far = others.how_far(causes) if others is not None and causes else None
     share = 1 - explained.remainder if far is None else far.fraction
     if far is None and others is not None and shifting:
-        share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
+        share = accounted(causes)
     sure = known(left, share, factors) if causes else 0.0
     return _Examined(effects, model, explained, same, causes, sure)
+
+
+def _accounted(f: Forms, models: list[Model], value: float, causes: tuple[int, ...]) -> float:
+    """Share of the evidence for a gap, `value` [nats], that is gone where causes act for certain."""
+    return 1 - max(statistic(f, models, causes), 0.0) / value if value > 0 else 0.0
 
 
 def _same(f: Forms, model: Model, effect: int) -> Invariance:

@@ -8,7 +8,7 @@ that of their Cauchy prior. `search` finds the sets.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -162,7 +162,7 @@ class Model:
 class Forms:
     """Quadratic forms of a gap by group: products (G, M, M) of the spectrum's columns, counts (G,).
 
-    `lenient`: a group is as likely as not off by what does not matter.
+    `lenient`: a group is as likely as not off by what does not matter. `modes`: sets fitted so far.
     """
 
     gap: Gap
@@ -171,6 +171,7 @@ class Forms:
     product: np.ndarray
     count: np.ndarray
     lenient: bool = False
+    modes: dict[tuple[int, ...], Model] = field(init=False, default_factory=dict)
 
     @cached_property
     def extra(self) -> np.ndarray:
@@ -257,6 +258,8 @@ def channel_of(f: Forms) -> np.ndarray:
 def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
     """The set's mode and evidence, the better one of two starts: all groups count alike, and as they would
     with every effect as it was linearised."""
+    if effects in f.modes:
+        return f.modes[effects]
     taken = quadratic_forms(f, effects)
     found = [mode(f, taken, np.ones(f.count.size))]
     if effects:
@@ -265,7 +268,8 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
             c = f.gap.candidates[j]
             x[mine] = (c.at - c.neutral) / c.scale
         found.append(mode(f, taken, f.marginal(effects, taken.energy(x))[1], x))
-    return max(found, key=lambda m: m.score)
+    f.modes[effects] = max(found, key=lambda m: m.score)
+    return f.modes[effects]
 
 
 @dataclass(frozen=True)

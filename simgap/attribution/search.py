@@ -131,6 +131,11 @@ def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
     return other, [replace(m, score=score(m)) for m in models]
 
 
+def clear(value: float, most: float) -> bool:
+    """Whether a statistic is that of a gap for certain, were a healthy one twice the `most` that was seen."""
+    return value - 2 * max(0.0, most) > -np.log(SURE)
+
+
 def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
     """The chance of a healthy recording to show so large a statistic.
 
@@ -149,7 +154,7 @@ def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
         exceed += twin >= value
         expected = float(np.logaddexp.reduce([*taken, 0.0])) - np.log(len(taken) + 1)
         p = float(np.exp(min(0.0, max(expected, 0.0) - value)))
-        if exceed >= ENOUGH or value - 2 * max(0.0, *taken) > -np.log(SURE):
+        if exceed >= ENOUGH or clear(value, max(taken)):
             break
     if not taken:
         return Detection(value, p, 0.0)

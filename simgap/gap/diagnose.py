@@ -346,7 +346,7 @@ def diagnose(
     def null(value: float) -> Iterable[float]:
         if healthy is not None:
             return own_healthy(found, healthy, actual)
-        return twin_statistics(found, actual, seed, tell) if twins and value > NIL else ()
+        return twin_statistics(found, value, actual, seed, tell) if twins and value > NIL else ()
 
     gap, verdict = attributed(found, forced, seed, null)
     causes = _causes(found, gap, verdict)
@@ -384,14 +384,16 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    models: list[Model] | None = sought(forms(gap))
+    models: list[Model] | None = sought(forms(gap), 1)
     leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    if models[0].effects and not forced:
+        models = None  # to be sought more widely
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(
             found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
         )
-        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
+        gap = together(found.problem, gap, found.healthy, joint, left, found.redrawn)
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 

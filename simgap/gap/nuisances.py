@@ -60,11 +60,6 @@ def _inertial(given: Problem) -> list[np.ndarray]:
     return [-change[:, None]]
 
 
-def inertia_column(given: Problem) -> int:
-    """Where the pads' inertia stands among a gap's nuisances, properties first."""
-    return given.num_properties + len(_admitted(given))
-
-
 def _late_rates(given: Problem) -> list[np.ndarray]:
     """Columns (n, 1) of speeds that are differences of positions, late by half a sample, or smoothed.
 

@@ -288,13 +288,13 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
     """Whitened residuals (T, N, C) of a candidate at coordinates u."""
     _, arrays, w = given.constants
     world = _without_effects(given, effects, u)
-    return np.asarray(_whitened(world, arrays, w, jnp.asarray(given.properties(u)))[0])
+    return np.asarray(_whitened(world, arrays, w, given.properties(u))[0])
 
 
 def residual_of(given: Problem, world: World) -> np.ndarray:
     """Whitened residuals (n,) of a world that effects were taken out of, properties as expected."""
     _, arrays, w = given.constants
-    usual = jnp.asarray(given.properties(neutral(given)))
+    usual = given.properties(neutral(given))
     return np.asarray(_whitened(world, arrays, w, usual)[0]).ravel()[given.existing]
 
 
@@ -319,8 +319,7 @@ _raw = jax.jit(residuals)
 
 
 def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
-    on = jnp.asarray(_on(given, effects))
-    return _corrected(given.constants[0], jnp.asarray(u), on, given.num_properties)
+    return _corrected(given.constants[0], u, _on(given, effects), given.num_properties)
 
 
 def _on(given: Problem, effects: Sequence[str]) -> np.ndarray:
@@ -339,6 +338,21 @@ class Evaluated(NamedTuple):
     cost: float
 
 
+def _left(given: Problem, on: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
+    """Residual (n,) at coordinates u of the effects that are `on`, and the cost of doubts [nats]."""
+    world, arrays, w = given.constants
+    world = _corrected(world, u, on, given.num_properties)
+    z, doubts = _whitened(world, arrays, w, given.properties(u))
+    return np.asarray(z).ravel()[given.existing], float(doubts)
+
+
+def _prior(given: Problem, mine: np.ndarray, blocks: list[np.ndarray], u: np.ndarray) -> float:
+    """What the priors of properties and parameters say against coordinates u [nats]."""
+    own = u[mine[: given.num_properties]]
+    cost = 0.5 * float(own @ own)
+    return cost + sum(0.5 * (1 + b.size) * float(np.log1p(u[mine[b]] @ u[mine[b]])) for b in blocks)
+
+
 def evaluated(
     given: Problem,
     effects: tuple[str, ...],
@@ -346,43 +360,33 @@ def evaluated(
     mine: np.ndarray,
     blocks: list[np.ndarray],
     usual: np.ndarray | None = None,
+    known: tuple[np.ndarray, float] | None = None,
 ) -> Evaluated:
     """What a candidate leaves at coordinates u, and its derivatives by the columns `mine`.
 
     They are differences over a small step: in double precision good to STEP of a usual deviation, and cheaper
     to compile than derivatives. `usual` (n, P): those by the properties, which an effect hardly changes,
-    where they are known already.
+    where they are known already; `known`: residual and doubts at u.
     """
-    k, on = given.num_properties, jnp.asarray(_on(given, effects))
-    recorded, arrays, w = given.constants
-
-    def without(u: np.ndarray) -> World:
-        return _corrected(recorded, jnp.asarray(u), on, k)
-
-    properties = jnp.asarray(given.properties(u))
+    k, on, (_, arrays, w) = given.num_properties, _on(given, effects), given.constants
+    z, doubts = known or _left(given, on, u)
+    push, lift = np.empty((z.size, mine.size), order="F"), np.zeros(mine.size)
     if usual is None:
-        steps = given.properties(u + STEP * np.eye(k + 1, u.size, -1))
-        every = _whitened_at_each(without(u), arrays, w, jnp.asarray(steps))
+        steps = given.properties(u + STEP * np.eye(k, u.size))
+        world = _without_effects(given, effects, u)
+        found, doubt = _whitened_at_each(world, arrays, w, steps)
+        push[:, :k] = ((np.asarray(found).reshape(k, -1)[:, given.existing] - z) / STEP).T
+        lift[:k] = (np.asarray(doubt) - doubts) / STEP
     else:
-        every = [z[None] for z in _whitened(without(u), arrays, w, properties)]
-    found, doubt = (np.asarray(each) for each in every)
-    z, doubts, step = [found.reshape(len(found), -1)], [doubt], u.copy()
-    for column in mine[k:]:
-        step[column] += STEP
-        residual, doubt = _whitened(without(step), arrays, w, properties)
-        step[column] = u[column]
-        z.append(np.asarray(residual).reshape(1, -1))
-        doubts.append(np.asarray(doubt)[None])
-    z, doubts = np.concatenate(z)[:, given.existing], np.concatenate(doubts)
-    push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
-    if usual is not None:
-        push, lift = np.concatenate([usual, push], 1), np.concatenate([np.zeros(k), lift])
-    own = u[mine[:k]]
-    cost = 0.5 * float(given.product(z[0], z[0])) + float(doubts[0]) + 0.5 * float(own @ own)
-    for block in blocks:
-        x = u[mine[block]]
-        cost += 0.5 * (1 + block.size) * float(np.log1p(x @ x))
-    return Evaluated(z[0], float(doubts[0]), push, lift, cost)
+        push[:, :k] = usual
+    step = u.copy()
+    for j in range(k, mine.size):
+        step[mine[j]] += STEP
+        there, doubt = _left(given, on, step)
+        push[:, j], lift[j] = (there - z) / STEP, (doubt - doubts) / STEP
+        step[mine[j]] = u[mine[j]]
+    cost = 0.5 * float(given.product(z, z)) + doubts + _prior(given, mine, blocks, u)
+    return Evaluated(z, doubts, push, lift, cost)
 
 
 def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
@@ -397,6 +401,7 @@ def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
 
 STEPS = 12  # numerics: of an iteration, at most
 CLOSE = 0.02  # numerics: nats
+AS_TOLD = 0.1  # numerics: share of what a step gains, within which derivatives are still good
 
 
 @dataclass(frozen=True)
@@ -425,11 +430,18 @@ class Fitted:
     cost: float
 
 
-def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | None = None) -> Fitted:
+def fit(
+    given: Problem,
+    start: Start,
+    steps: int = STEPS,
+    usual: np.ndarray | None = None,
+    there: Evaluated | None = None,
+) -> Fitted:
     """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
 
     Properties have normal priors, an effect's parameters together a Cauchy distribution. `usual`: derivatives
-    by the properties, if `evaluated` need not take them anew.
+    by the properties, if `evaluated` need not take them anew. Others are taken anew where a step gained
+    otherwise than they foretold. `there`: the start as `evaluated`, where that is known.
     """
     mine, z = columns_of(given, start.effects), given.num_properties
     low, high = (edge[mine] for edge in limits(given))
@@ -439,24 +451,44 @@ def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | No
     for key in start.effects:
         blocks.append(np.arange(at, at + len(free_parameters(key))))
         at += blocks[-1].size
-    now, damping = evaluated(given, start.effects, u, mine, blocks, usual), 1e-3
+    now, damping = there or evaluated(given, start.effects, u, mine, blocks, usual), 1e-3
+    on = _on(given, start.effects)
+    square, bent, stale = given.product(now.push, now.push), False, False
+
+    def anew() -> tuple[Evaluated, np.ndarray]:
+        found = evaluated(given, start.effects, u, mine, blocks, usual, (now.residual, now.doubts))
+        return found, given.product(found.push, found.push)
+
     for _ in range(steps):
         prior = np.ones(mine.size)
         for block in blocks:
             x = u[mine[block]]
             prior[block] = (1 + block.size) / (1 + x @ x)
-        slope = given.product(now.push, now.residual) + now.lift + prior * u[mine]
-        bend = given.product(now.push, now.push) + np.diag(prior)
-        step, _ = least(bend + damping * np.diag(np.diag(bend)), -slope, low - u[mine], high - u[mine])
+        pull = given.product(now.push, now.residual) + now.lift
+        bend = square + np.diag(prior)
+        step, _ = least(bend + damping * np.diag(np.diag(bend)), -pull - prior * u[mine],
+                        low - u[mine], high - u[mine])  # fmt: skip
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
-        new = evaluated(given, start.effects, trial, mine, blocks, usual)
-        if np.isfinite(new.cost) and new.cost < now.cost:
-            gained, u, now, damping = now.cost - new.cost, trial, new, damping / 5
+        left, doubts = _left(given, on, trial)
+        before, after = (_prior(given, mine, blocks, where) for where in (u, trial))
+        cost = 0.5 * float(given.product(left, left)) + doubts + after
+        gained, way = now.cost - cost, trial[mine] - u[mine]
+        if np.isfinite(cost) and gained > 0:
+            foretold = -float(pull @ way) - 0.5 * float(way @ square @ way)
+            off = abs(gained - before + after - foretold)
+            u, now, damping = trial, now._replace(residual=left, doubts=doubts, cost=cost), damping / 5
+            bent, stale = bent or off > CLOSE, True
             if gained < CLOSE:
                 break
+            if off > AS_TOLD * abs(foretold):
+                (now, square), bent, stale = anew(), False, False
+        elif stale:
+            (now, square), bent, stale = anew(), False, False
         else:
             damping *= 8
             if damping > 1e3:
                 break
+    if bent:
+        now, _ = anew()
     return Fitted(start.effects, u, mine, now.residual, now.push, now.doubts, now.cost)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import (
+    Evaluated,
     Fitted,
     Problem,
     Start,
@@ -80,18 +82,30 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     what swings with it has no size.
     """
     every, usual = starts(given, key, healthy.u), healthy.push
-    ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < PROMISING:
-        return fit(given, ranked[0][2], 0, usual)
-    leading = [start for _, start, _ in ranked[:LEADERS]]
-    if len(leading) > 1:
-        screened = sorted((fit(given, s, SCREEN, usual) for s in leading), key=lambda f: f.cost)
-        leading = [Start((key,), screened[0].u)]
-    return fit(given, leading[0], usual=usual)
+    ranked = sorted((_ranked(given, start, usual) for start in every), key=lambda r: r.cost)
+    first = ranked[0]
+    there = first.there if first.now is None else first.start
+    if healthy.cost - first.cost < PROMISING:
+        return fit(given, there, 0, usual, first.now)
+    if len(ranked) > 1:
+        screened = sorted(
+            (fit(given, r.there, SCREEN, usual) for r in ranked[:LEADERS]), key=lambda f: f.cost
+        )
+        there = Start((key,), screened[0].u)
+    return fit(given, there, usual=usual, there=first.now)
 
 
-def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Start]:
-    """A start's cost after a linear step of all but its gridded parameters, and the start there."""
+class _Ranked(NamedTuple):
+    """A start, its `cost` after a linear step of all but its gridded parameters, and the start `there`; what
+    was evaluated `now`, at the start itself, where no parameter is gridded."""
+
+    cost: float
+    start: Start
+    there: Start
+    now: Evaluated | None
+
+
+def _ranked(given: Problem, start: Start, usual: np.ndarray) -> _Ranked:
     (key,) = start.effects
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     fixed = [
@@ -103,7 +117,8 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Sta
     columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
     u = start.u.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    now = evaluated(given, start.effects, u, columns, [], usual)
+    own = np.arange(given.num_properties, columns.size)
+    now = evaluated(given, start.effects, u, columns, [own], usual)
     bend = given.product(now.push, now.push) + np.eye(columns.size)
     pull = -given.product(now.push, now.residual) - u[columns]
     step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
@@ -112,7 +127,7 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Sta
     left = now.residual + now.push @ (there[columns] - u[columns])
     own = there[: given.num_properties]
     cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
-    return cost, Start(start.effects, there)
+    return _Ranked(cost, Start(start.effects, u), Start(start.effects, there), None if fixed else now)
 
 
 # Align again with an effect taken out: late or softened forces displace the boundaries themselves.
@@ -206,10 +221,13 @@ def search(
     forced: Sequence[str] = (),
     tell: Progress = silent,
     identified: Identified | None = None,
+    noisy: bool = True,
 ) -> Search:
     """Fit the catalogue, and what is `forced`, to aligned trials; InputError where none fits its task.
 
-    `identified`: what `identify` made of the same trials, where that is known already.
+    `identified`: what `identify` made of the same trials, where that is known already. `noisy`: whether to
+    see what sensors' noise makes of the candidates (`simgap.gap.assemble.redrawn`), which takes half of the
+    time.
     """
     misled: list[str] = []
     names, trials = candidate_names(aligned.rig, excluded, forced), [one.trial for one in aligned.trials]
@@ -221,15 +239,16 @@ def search(
         tell("aligning trials that seem not to fit")
         aligned, misled = _aligned_all(aligned, actual, keys)
     aligned, warnings = _complete(aligned)
-    if identified is None:
+    if identified is None and not _all_measured(aligned, actual):
         tell("identifying properties")
         identified = identify_aligned(aligned).centres
+    identified = identified or {}
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, Start((), neutral(given)))
     fits = [best_fit(given, key, healthy) for key in keys]
-    others = redrawn(given)
-    for _ in range(ROUNDS):
+    others = redrawn(given) if noisy else ()
+    for _ in range(ROUNDS if noisy else 0):
         again = _anew(aligned, given, healthy, fits, others)
         if again is None:
             break
@@ -242,6 +261,12 @@ def search(
         warnings = [not_compared(trials), *warnings]
     return Search(aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
                   identified, (*misled, *warnings))  # fmt: skip
+
+
+def _all_measured(aligned: AlignedTrials, actual: dict | None) -> bool:
+    """Whether every property was measured apart."""
+    given = actual or {}
+    return all(kind in given.get(name, {}) for name in aligned.task.objects for kind in PROPERTIES)
 
 
 def _anew(

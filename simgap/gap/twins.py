@@ -23,7 +23,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.posterior import forms
-from simgap.attribution.search import sought, statistic
+from simgap.attribution.search import clear, sought, statistic
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.gap.frame import as_from_wrist, of_wrist
@@ -129,48 +129,57 @@ def carried(
     return weight, width
 
 
-MOST = 8  # numerics: twins at most
-BATCH = 4  # numerics: twins that are simulated at once
+BATCHES = (1, 3, 4)  # numerics: twins that are simulated at once: the first alone mostly tells enough
 LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
 QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
 
 
 def twin_statistics(
     found: Search,
+    value: float,
     actual: dict | None,
     seed: int,
     tell: Progress = silent,
 ) -> Iterator[float]:
-    """Statistics of healthy twins of a search, one by one, from the cache where they are known.
+    """Statistics of healthy twins of a search, whose own is `value`, one by one, from the cache where they
+    are known.
 
-    Where this hand or these blocks cannot be simulated there are none.
+    What sensors' noise makes of a twin's candidates is seen only where its statistic without that, which is
+    no smaller, is a sign of a gap and leaves `value` in doubt. Where this hand or these blocks cannot be
+    simulated there are none.
     """
     frame = found.problem.frame
     file = _file(found.trials, frame.task, frame.rig, actual, seed)
     known: list[float] = kept_value(file) or []
     yield from known
-    for start in range(len(known) - len(known) % BATCH, MOST, BATCH):
+    start = 0
+    for size in BATCHES:
+        which = range(start, start := start + size)
+        if len(known) >= which.stop:
+            continue
         tell("simulating healthy twins")
         try:
-            twins = _recorded(found, range(start, start + BATCH), seed)
+            twins = _recorded(found, which, seed)
         except (InputError, ValueError):
             return
-        for k, trials in enumerate(twins, start):
+        for k, trials in zip(which, twins, strict=True):
             if k < len(known):
                 continue
             with suppress(InputError):  # a twin that drops its block is none
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
-                known.append(healthy_statistic(twin, actual, found.identified))
+                most = healthy_statistic(twin, actual, found.identified, noisy=False)
+                sure = most <= 0 or clear(value, most)  # what is no sign of a gap counts as nothing
+                known.append(most if sure else healthy_statistic(twin, actual, found.identified))
                 keep_value(file, known)
                 yield known[-1]
 
 
 def healthy_statistic(
-    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None
+    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None, noisy: bool = True
 ) -> float:
     """The statistic of one healthy recording, through the whole search; its blocks as `identified`."""
-    f = forms(search(aligned, actual, identified=identified).gap)
+    f = forms(search(aligned, actual, identified=identified, noisy=noisy).gap)
     return statistic(f, sought(f, 1))
 
 

@@ -370,12 +370,18 @@ def _fitted(
     root, size = block.root * np.sqrt(block.trials), len(mine)
     priors, ends = np.eye(size), np.array([s.parameter.limits for s in mine]).T
 
-    def left(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([root @ (target - shift_at(given, block, mine, u)), u])
+    seen = dict[bytes, np.ndarray]()
+
+    def at(u: np.ndarray) -> np.ndarray:
+        if u.tobytes() not in seen:
+            seen[u.tobytes()] = shift_at(given, block, mine, u)
+        return seen[u.tobytes()]
 
     def push(u: np.ndarray) -> np.ndarray:
-        now = shift_at(given, block, mine, u)
-        return np.stack([(shift_at(given, block, mine, u + step) - now) / STEP for step in STEP * priors], 1)
+        return np.stack([(at(u + step) - at(u)) / STEP for step in STEP * priors], 1)
+
+    def left(u: np.ndarray) -> np.ndarray:
+        return np.concatenate([root @ (target - at(u)), u])
 
     def slopes(u: np.ndarray) -> np.ndarray:
         return np.concatenate([-root @ push(u), priors])
@@ -386,7 +392,7 @@ def _fitted(
         least_squares(left, np.clip(u, *ends), slopes, ends, ftol=CLOSE, max_nfev=STEPS) for u in every
     ]
     u = min(descents, key=lambda d: d.cost).x
-    return u, shift_at(given, block, mine, u), push(u)
+    return u, at(u), push(u)
 
 
 def _candidates(white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:

@@ -18,13 +18,14 @@ from scipy.special import stdtrit
 
 from simgap.channels import ChannelEffect, Theta, at_rest, channel_effects
 from simgap.effect import Parameter
-from simgap.generic.trials import Cut, Layout, bin_edges, log_power, means, resampled, transformed, windowed
+from simgap.generic.trials import Layout, bin_edges, log_power, means, resampled, transformed, windowed
 
 FINE = 2048  # numerics: points of the mean course
 SMOOTH = 9  # numerics: coefficients over which a spectrum is smoothed
+LINE = 1e-12  # numerics: of a channel: a straight line bends less from step to step
 LEAST = 4  # numerics: coefficients that a mean power is taken of
 COARSE = 10.0  # prior: what a given simulation is off by, of what a calibrated robot's sensors are
-NOISE = "noise_level"
+NOISE, LATE = "noise_level", "force_lag"
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Scene:
     """What predictions start from: the layout, mean real boundaries and the mean simulated course on them.
 
     `t` (FINE,) [s] and `course` (C, FINE); `floor` (C,): power of the simulated noise; `ring`: the
-    oscillation looked for. `cache`: spectra computed so far.
+    oscillation looked for. `plain_waves`: spectra as simulated by channel; `cache`: powers computed so far.
     """
 
     layout: Layout
@@ -106,7 +107,8 @@ class Scene:
     course: np.ndarray
     floor: np.ndarray
     ring: Ring | None = None
-    cache: dict[tuple, list[np.ndarray]] = field(default_factory=dict, repr=False)
+    plain_waves: dict[int, list[np.ndarray]] = field(default_factory=dict, repr=False)
+    cache: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def bins(self) -> np.ndarray:
@@ -158,12 +160,26 @@ def predicted(given: Scene, channel: int, acting: Acting, rung: np.ndarray | Non
 
     `rung` (K, 2): sine and cosine amplitudes of a vibration from each subtask's start on.
     """
-    x, layout = read(given.t, given.course[channel], acting), given.layout
-    rung = np.zeros((len(layout.window), 2)) if rung is None else rung
+    x, rate = read(given.t, given.course[channel], acting), given.layout.rate
+    rung = np.zeros((len(given.layout.window), 2)) if rung is None else rung
     for k in np.flatnonzero(rung.any(1)):
         x = x + rung[k] @ given.waves[k]
-    out = [means(given.t, x, given.bins)]
-    more = acting.get(NOISE, {}).get("sd", 0.0)
+    whole, part = divmod(acting.get(LATE, {}).get("delay", 0.0) * rate, 1.0)
+    fast = 0.0
+    # Between samples noise would be smoothed: a lag by parts of one has a share of both neighbours' powers.
+    for shift, share in ((whole, 1 - part), (whole + 1, part)):
+        if share > 1e-9:
+            late = {LATE: {"delay": shift / rate}} if LATE in acting else {}
+            fast = fast + share * _log_powers(given, channel, {**acting, **late}, rung)
+    return np.concatenate([means(given.t, x, given.bins), np.atleast_1d(fast)])
+
+
+def _log_powers(given: Scene, channel: int, acting: Acting, rung: np.ndarray) -> np.ndarray:
+    """Mean log powers of the simulated trials' sub-bands in all subtasks, as they are read."""
+    key = channel, tuple((n, *sorted(v.items())) for n, v in sorted(acting.items())), rung.tobytes()
+    if key in given.cache:
+        return given.cache[key]
+    layout, out, more = given.layout, [np.zeros(0)], acting.get(NOISE, {}).get("sd", 0.0)
     added = max(more * abs(more), -given.floor[channel])  # no more noise can be missing than there is
     for k, wave in enumerate(_waves(given, channel, acting)):
         if layout.coefficients[k]:
@@ -171,7 +187,8 @@ def predicted(given: Scene, channel: int, acting: Acting, rung: np.ndarray | Non
                 t = (np.arange(wave.shape[1]) + 0.5) / layout.rate
                 wave = wave + transformed(rung[k] @ ring_waves(given, t))
             out.append(log_power(layout, np.maximum(wave**2 + added, 0.0), channel, k).mean(0))
-    return np.concatenate(out)
+    given.cache[key] = np.concatenate(out)
+    return given.cache[key]
 
 
 def read(t: np.ndarray, values: np.ndarray, acting: Acting) -> np.ndarray:
@@ -187,35 +204,43 @@ def _waves(given: Scene, channel: int, acting: Acting) -> list[np.ndarray]:
     """DCT coefficients (S, window) of the simulated trials in each subtask, as they are read.
 
     What lies at the noise floor is the sensor's own noise, which is added behind what it is read through: its
-    power there is put back to what it was, by what becomes of noise alone.
+    power there is put back to what it was.
     """
-    known = {f"force_{e.name}" for e in channel_effects().values()}
-    key = channel, tuple((n, *sorted(v.items())) for n, v in sorted(acting.items()) if n in known)
-    if key in given.cache:
-        return given.cache[key]
     lay, name = given.layout, given.layout.ensembles.channels[channel]
-    cuts, noise = lay.ensembles.sim, given.floor[channel]
-
-    def cut_up(cut: Cut, values: np.ndarray) -> list[np.ndarray]:
-        values = read(cut.trial.t - cut.edges[0], values, acting) if key[1] else values
-        return [transformed(windowed(lay, cut, channel, k, values)) for k in range(len(lay.window))]
-
-    each = [cut_up(cut, _bridged(cut.trial.t, cut.trial.channels[name])) for cut in cuts]
-    out = [np.array(waves) for waves in zip(*each, strict=True)]
-    hiss = np.sqrt(noise) * np.random.default_rng(0).standard_normal(cuts[0].trial.t.size)
-    alone = given.cache[(channel, "noise", key[1])] = [_smooth(w) for w in cut_up(cuts[0], hiss)]
-    if key[1]:
-        _waves(given, channel, {})
-        for k, before in enumerate(given.cache[(channel, "noise", ())]):
-            now = _smooth(out[k])
-            out[k] = out[k] * np.sqrt(np.maximum(now + noise * (1 - alone[k] / before), 0.0) / now)
-    given.cache[key] = out
+    noise, x = given.floor[channel], given.course[channel]
+    straight = np.ptp(np.diff(read(given.t, x, acting) - x)) < LINE * (1 + np.abs(x).max())  # in no spectrum
+    if straight and channel in given.plain_waves:
+        return given.plain_waves[channel]
+    rows: list[list[np.ndarray]] = [[] for _ in lay.window]
+    for cut in lay.ensembles.sim:
+        t, values = cut.trial.t, cut.trial.channels[name]
+        there = np.isfinite(values)
+        values = values if there.all() else np.interp(t, t[there], values[there])
+        if not straight:  # a second before the start as the first one, mirrored: what is held has no noise
+            m = min(t.size - 1, int(cut.trial.rate))
+            before, early = 2 * t[0] - t[m:0:-1], values[m:0:-1]
+            every = np.concatenate([before, t]) - cut.edges[0]
+            values = read(every, np.concatenate([early, values]), acting)[m:]
+        for k, mine in enumerate(rows):
+            mine.append(windowed(lay, cut, channel, k, values))
+    out = [transformed(np.array(mine)) for mine in rows]
+    if straight:
+        given.plain_waves[channel] = out
+        return out
+    for k, plain in enumerate(_waves(given, channel, {})):
+        now, floor = _smooth(out[k]), np.minimum(noise, _smooth(plain))
+        lost = 1 - _response(lay.rate, plain.shape[1], acting)
+        out[k] = out[k] * np.sqrt(np.maximum(now + floor * lost, 0.0) / now)
     return out
 
 
-def _bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    there = np.isfinite(values)
-    return values if there.all() else np.interp(t, t[there], values[there])
+def _response(rate: float, window: int, acting: Acting) -> np.ndarray:
+    """By how much the power of white noise is multiplied at the frequencies (window,) of a DCT."""
+    t, click = np.arange(FINE) / rate, np.zeros(FINE)
+    click[FINE // 8] = 1.0
+    heard = read(t, click, acting) - read(t, np.zeros(FINE), acting)
+    power = np.square(np.abs(np.fft.rfft(heard)))
+    return np.interp(np.arange(window) * rate / (2 * window), np.fft.rfftfreq(FINE, 1 / rate), power)
 
 
 def _smooth(waves: np.ndarray) -> np.ndarray:
@@ -239,10 +264,7 @@ def ring_waves(given: Scene, t: np.ndarray) -> np.ndarray:
 # grid and refined. Intervals from the scatter between trials (jackknife), which needs no noise model.
 
 DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
-LIGHTEST, HEAVIEST = (
-    1e-3,
-    0.25,
-)  # chosen: damping below which it is no ring, and beyond which a course is none
+LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: damping below or beyond which it is no ring
 FREQUENCIES = 80  # numerics: where searches start
 SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
 SHORTEST = 12  # numerics: samples of a window in which an oscillation is looked for

@@ -147,7 +147,8 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
         if len(own) == 1 and _part(cause) is not None and own[0]["unit"] not in ("", "1"):
             shown, nominal = shown_as(own[0]["unit"]), own[0]["nominal"]
             value = estimate(own[0]["mean"], 0.0, shown)
-            text += f" {value} (model: {plain(shown[0] * nominal) if nominal else 0})"
+            before = "before" if "changes" in body else "model"
+            text += f" {value} ({before}: {plain(shown[0] * nominal) if nominal else 0})"
         texts.append(text)
     return " and ".join(texts)
 
@@ -181,9 +182,7 @@ def sentences(body: Body) -> list[str]:
     if verdict == "none":
         return [f"The model reproduces the recording to within the sensors' noise ({p})."]
     if verdict == "unknown":
-        text = (
-            f"Recording and model differ beyond noise ({p}); no known cause explains the larger part of it."
-        )
+        text = f"Recording and model differ beyond noise ({p}); no known cause explains the larger part."
         return [text, *doubted(body), *moving(body)]
     chance = probability(body)
     out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
@@ -247,9 +246,8 @@ def explained(body: Body) -> str:
     if len(known) == 1:
         own = known[0][1]
         ends = between(*(own.get("interval_90") or (None, None)))
-        return f"It explains {percent(own['share'])} of the gap" + (
-            f" (90 % interval {ends})." if ends else "."
-        )
+        sure = f" (90 % interval {ends})" if ends else ""
+        return f"It explains {percent(own['share'])} of the gap{sure}."
     shares = ", ".join(f"{plain_name(n)} explains {percent(a['share'])}" for n, a in known)
     return f"Of the gap, {shares}."
 
@@ -273,9 +271,7 @@ def remains(body: Body) -> list[str]:
     noise = rest.get("rms_over_noise")
     size = f" All that is left is {plain(noise)} times the noise." if noise else ""
     if body["verdict"] == "unknown":
-        return [
-            f"{percent(rest['share'])} of the gap is left when every likely cause has had its part.{size}"
-        ]
+        return [f"{percent(rest['share'])} of the gap is left after every likely cause.{size}"]
     p = rest.get("p_value")
     sure = "" if p is None else f" ({p_text(p)})"
     if rest["share"] < 0.01 and not _noise(rest):
@@ -406,13 +402,7 @@ def tables(body: Mapping[str, Any]) -> list[Table]:
             cells.add_column(head, no_wrap=True)
         for row in body["where"][:8]:
             low, high = row["band"]
-            cells.add_row(
-                row["trial"],
-                row["channel"],
-                row["subtask"],
-                f"{low:g}-{high:g}",
-                f"{100 * row['share']:.0f} %",
-                f"{row['z']:.1f}",
-            )
+            numbers = f"{low:g}-{high:g}", f"{100 * row['share']:.0f} %", f"{row['z']:.1f}"
+            cells.add_row(row["trial"], row["channel"], row["subtask"], *numbers)
         out.append(cells)
     return out

@@ -114,13 +114,17 @@ def motion_csv(
 
 
 def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every parameter that a diagnosis tells, by name: what was calibrated, and over it what was found."""
-    known = document.get("calibrated") or {}
-    out = dict(known.get("parameters", known))
-    for name in document["causes"]:
-        out |= document["effects"].get(name, {"parameters": {}})["parameters"]
+    """Every parameter that a diagnosis tells, by name: what was calibrated, over it what was named; of the
+    members of a set nothing is told."""
     keys = ("mean", "sd", "interval_90", "unit")
-    return {name: {k: p.get(k) for k in keys} for name, p in out.items()}
+    known = (document.get("calibrated") or {}).get("parameters") or {}
+    out = {name: {k: p.get(k) for k in keys} for name, p in known.items()}
+    for name in (*document["causes"], *document["indistinguishable"]):
+        found = document["effects"].get(name, {"parameters": {}})["parameters"]
+        for short, p in found.items():
+            told = {k: p.get(k) if document["verdict"] == "named" or k == "unit" else None for k in keys}
+            out[name if len(found) == 1 else f"{name}.{short}"] = told
+    return out
 
 
 def history(path: Path) -> list[dict[str, Any]]:

@@ -24,7 +24,7 @@ from simgap.robots.fit import FINEST, Whiten, moved_to
 from simgap.robots.heldout import folds_of
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point
-from simgap.robots.noise import noises
+from simgap.robots.rows import noises
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator

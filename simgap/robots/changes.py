@@ -42,7 +42,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
-from simgap.robots.noise import noises
+from simgap.robots.rows import noises
 from simgap.robots.unchanged import (
     WIDER,
     Broken,
@@ -336,14 +336,16 @@ class Changes:
         gone = float(np.clip((before - after) / max(before - floor, 1e-9), 0, 1))
         fraction = gone if names else None
         explanations = {"+".join(sorted(c.effects)): c for c in (best, *self.others) if c.effects}
-        chances = self.probabilities
+        parts = [(n, c, sorted(c.effects)) for n, c in explanations.items()]
+        parts += [(n, best, [n]) for n in (names if len(names) > 1 else ()) if n not in explanations]
         effects = {
             name: {
-                "parameters": {n: v | {"nominal": v["old"]} for n, v in self.sizes(c).items()},
-                "log_evidence": float(np.sum(nothing.left - c.left)), "property_shift": {},
+                "parameters": self._parameters(c, of), "property_shift": {},
+                "log_evidence": float(np.sum(nothing.left - c.left)),
                 "heldout_score": float(np.mean(nothing.left - c.left)),
-            } for name, c in explanations.items()
+            } for name, c, of in parts
         }  # fmt: skip
+        chances = self.probabilities
         calibrated = {} if self.calibration is None else self.calibration.body()
         acting = {n: sum(p for e, p in chances.items() if n in e.split("+")) for n in (*names, *others)}
         p_none = min((c.p_value for c in (best, *self.others) if c.effects), default=1.0)
@@ -369,6 +371,16 @@ class Changes:
                          for n, v in calibrated.get("numerics", {}).items()},
             "next_experiment": self._next_experiment([*names, *others]),
         }  # fmt: skip
+
+    def _parameters(self, change: Change, effects: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """Sizes by short name, or by effect and short name where there are several effects."""
+        known, out = self.sizes(change), {}
+        for name in effects:
+            shorts = self.composed.effects[name].parameters
+            for short in shorts:
+                size = known[name if len(shorts) == 1 else f"{name}.{short}"]
+                out[short if len(effects) == 1 else f"{name}.{short}"] = size | {"nominal": size["old"]}
+        return out
 
     def _next_experiment(self, separates: Sequence[str]) -> dict[str, Any] | None:
         """Of the motions run, the one by whose losses the best explanation and the closest other differ most;
@@ -528,23 +540,25 @@ def _concluded(
 
 
 def _unlike(new: np.ndarray, old: np.ndarray) -> float:
-    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t."""
+    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t of their
+    logarithms, as some motions are missed by far more than others."""
     if old.size < 2:
         return 0.5
-    sd = max(float(old.std(ddof=1)), 1e-12) * np.sqrt(1 / old.size + 1 / new.size)
-    return float(student.sf((new.mean() - old.mean()) / sd, old.size - 1))
+    a, b = np.log(np.maximum(new, 1e-12)), np.log(np.maximum(old, 1e-12))
+    sd = max(float(b.std(ddof=1)), 1e-12) * np.sqrt(1 / b.size + 1 / a.size)
+    return float(student.sf((a.mean() - b.mean()) / sd, b.size - 1))
 
 
 def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, float]:
     """A probability of nothing, of the unknown, and of every explanation. Of a p-value the odds of nothing
-    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations share
-    what is left as the paired tests have it."""
+    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations as simple
+    as the best share what is left as the paired tests have it."""
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)
         return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
 
-    changed = [c for c in tried if c.effects]
+    changed = [c for c in tried if c.effects and len(c.effects) == max(len(best.effects), 1)]
     none, unknown = odds(best.p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
     weight = {"+".join(sorted(c.effects)): beaten(c, best) for c in changed if c is not best}
     weight |= {"+".join(sorted(best.effects)): 1.0} if best.effects else {}

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 
 from hmmseg.errors import InputError, nearest
 from simgap.progress import Progress, silent
-from simgap.robot_effects import UNMEASURED, doubted, effects_of
+from simgap.robot_effects import LACKING, STATED, UNMEASURED, doubted, effects_of
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.experiments import NextLog, next_log
 from simgap.robots.heldout import Shrinkage, folds_of, shrinkage
-from simgap.robots.identifiable import Identifiability
 from simgap.robots.linear import Linear
-from simgap.robots.model import Composed
-from simgap.robots.noise import noises
+from simgap.robots.model import Composed, Point, motions
 from simgap.robots.phases import Phases, phases_of
-from simgap.robots.repeats import motions
+from simgap.robots.rows import noises
 from simgap.robots.search import Search, Settled
-from simgap.robots.verdict import RobotVerdict, verdict_on
+from simgap.robots.sets import Identifiability
+from simgap.robots.verdict import NextLog, RobotVerdict, next_log, verdict_on
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -99,7 +98,7 @@ def diagnose(
     length = getattr(simulator, "window", None) if length is None else length
     given = {} if length is None else {"length": length}
     tell("calibration")
-    calibrated = _calibrated(simulator, recordings, effects, length)
+    calibrated = _Calibrated(simulator, recordings, effects, length)
     whole = Composed.of(simulator, recordings, effects, noise, **given)
     whole = replace(whole, motion=motions(whole))
     parts = phases_of(simulator, recordings) if phases is None else phases
@@ -115,24 +114,38 @@ def diagnose(
     return found
 
 
-def _calibrated(
-    simulator: Simulator,
-    recordings: Sequence[Recording],
-    effects: Mapping[str, RobotEffect],
-    length: float | None,
-) -> Calibration | None:
-    """The model with what nobody measured fitted, None where there is nothing of the kind."""
-    wide = doubted(effects, UNMEASURED, getattr(simulator, "sd", {}))
-    numerics = getattr(simulator, "numerics", ())
-    if not any(e.fitted and not any(p in numerics for p in e.model.values()) for e in wide.values()):
-        return None
-    return calibrate(simulator, recordings, wide, length=length, judged=False)
+class _Calibrated:
+    """The model with what nobody measured fitted: `found`, None where there is nothing of the kind. Called,
+    it gives the point, with what models lack fitted too: that is for where a search leaves a gap."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        recordings: Sequence[Recording],
+        effects: Mapping[str, RobotEffect],
+        length: float | None,
+    ) -> None:
+        self._given = simulator, recordings, effects, length
+        self.found = self._by(STATED)
+
+    def __call__(self) -> Point:
+        if any(fnmatchcase(n, p) for n in self._given[2] for p in LACKING):
+            self.found = self._by(UNMEASURED)
+        return {} if self.found is None else self.found.point
+
+    def _by(self, patterns: Sequence[str]) -> Calibration | None:
+        simulator, recordings, effects, length = self._given
+        wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
+        numerics = getattr(simulator, "numerics", ())
+        if not any(e.fitted and not any(p in numerics for p in e.model.values()) for e in wide.values()):
+            return None
+        return calibrate(simulator, recordings, wide, length=length, judged=False)
 
 
 def _diagnosed(
     composed: Composed,
     phases: Phases,
-    calibrated: Calibration | None,
+    calibrated: _Calibrated,
     forced: Sequence[str],
     seed: int,
     tell: Progress,
@@ -148,7 +161,7 @@ def _diagnosed(
 
     wanted = tuple(n for n, e in composed.effects.items() if not e.fitted)
     fold = folds_of(composed.rows, len(composed.recordings), groups)
-    search = Search(composed, wanted, fold, {} if calibrated is None else dict(calibrated.point))
+    search = Search(composed, wanted, fold, calibrated)
     best = search.forced(tuple(forced)) if forced else search.run(tell)
     nothing = search.known[frozenset()]
     for name in search.diverged:
@@ -164,5 +177,5 @@ def _diagnosed(
     verdict = verdict_on(search, best, far, phases, seed, bool(forced))
     return RobotDiagnosis(
         composed, phases, search, best, verdict, far if verdict.causes else None, search.identifiable,
-        next_log(search, best, verdict), calibrated, tuple(warnings),
+        next_log(search, best, verdict), calibrated.found, tuple(warnings),
     )  # fmt: skip

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hmmseg.errors import InputError
 from simgap.robots.rows import Rows
 from simgap.robots.windows import FREE, moves, reaches
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
+
+if TYPE_CHECKING:
+    from hmmseg.io.task import AnyTask
 
 WHOLE = "whole"
 
@@ -94,3 +99,29 @@ def phases_by_motion(simulator: Simulator, recordings: Sequence[Recording]) -> P
         starts.append(edges[changes])
         numbers.append(np.array(going, int)[changes])
     return Phases(("still", "moving"), tuple(starts), tuple(numbers))
+
+
+def phases_by_task(recordings: Sequence[Recording], task: AnyTask, where: str = "task") -> Phases:
+    """The phases that the task's `sequence` names, in each log where the HMM finds them.
+
+    InputError for a task of blocks, a channel that the logs do not have, and a log that does not follow the
+    task.
+    """
+    from hmmseg.io.task import SequenceTask
+    from hmmseg.io.trial import Trial
+    from hmmseg.sequence.segment import segment_sequence  # slow to import
+
+    if not isinstance(task, SequenceTask):
+        raise InputError(where, "is a task of blocks", 'sequence = ["approach", ...]')
+    channels = task.channels or tuple(recordings[0].columns)
+    for name in channels:
+        if name not in recordings[0].columns:
+            raise InputError(f"{where}: channels", f"no column {name}", ", ".join(recordings[0].columns))
+    trials = [Trial(r.name, r.t, {n: r[n] for n in channels}) for r in recordings]
+    starts, numbers = [], []
+    for found in segment_sequence(trials, task):
+        if found.failed is not None:
+            raise InputError(found.file, f"does not follow {where}: {found.failed}")
+        numbers.append(np.array([task.sequence.index(s.subtask) for s in found.spans]))
+        starts.append(np.array([s.start for s in found.spans]))
+    return Phases(task.sequence, tuple(starts), tuple(numbers))

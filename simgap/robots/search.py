@@ -10,7 +10,7 @@ where another would is no measure of either. What was fitted exactly on the way 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -21,10 +21,20 @@ from scipy.stats import t as student
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import moved_to, prior_cost
-from simgap.robots.identifiable import Identifiability, identifiability
 from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
 from simgap.robots.model import Composed, Point
-from simgap.robots.sets import Names, Sets, cancelling, log_odds, neighbours, pairs, point_of, without
+from simgap.robots.sets import (
+    Identifiability,
+    Names,
+    Sets,
+    cancelling,
+    identifiability,
+    log_odds,
+    neighbours,
+    pairs,
+    point_of,
+    without,
+)
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
 from simgap.robots.windows import STRIKES
 from simgap.simulators.protocol import Parameter
@@ -72,12 +82,12 @@ class Settled:
 @dataclass
 class Search:
     """Sets of candidates along windows; `fold` (N,) of each row. `known`: sets that were fitted, each at its
-    best."""
+    best; `calibrated`: where calibration ended."""
 
     composed: Composed
     wanted: Names
     fold: np.ndarray
-    calibrated: Point = field(default_factory=dict)
+    calibrated: Callable[[], Point] = dict
     known: dict[frozenset[str], Settled] = field(default_factory=dict)
     starts: dict = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
@@ -123,11 +133,12 @@ class Search:
     def _calibrated(self) -> Settled | None:
         """Of what calibration moved as much as is needed: taken back one by one where the whole acts, in
         closed form."""
-        moved = {n: v for n, v in self.calibrated.items() if n in self.wanted and self._off(n, v)}
+        calibrated = self.calibrated()
+        moved = {n: v for n, v in calibrated.items() if n in self.wanted and self._off(n, v)}
         if not moved:
             return None
         names = tuple(moved)
-        begin = {n: self.calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
+        begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
         whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
         sets, levels, effects = self.place(whole, names)
         score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(levels)))

@@ -20,7 +20,7 @@ from hmmseg.robust import robust_sd
 from simgap.robots.calibrate import Calibration
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point
-from simgap.robots.noise import resolution
+from simgap.robots.rows import resolution
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -32,12 +32,7 @@ POSITIVE = 0.3  # numerics: of its sd, above which a parameter that cannot be ne
 STEP = 0.02  # numerics: of a finite difference
 STEPS, FAR = 10, 1.0  # numerics: of a fit, and how far each goes at most, in coordinates
 GAINED = 1e-3  # numerics: of a fit's cost, what a step must gain for it to go on
-WIDER = (
-    8.0,
-    4.0,
-    2.0,
-    1.0,
-)  # numerics: of scales and parameters in turn, tails' scales first wider than they are
+WIDER = (8.0, 4.0, 2.0, 1.0)  # numerics: scales of tails, first wider than they are
 
 
 @dataclass(frozen=True)
@@ -284,7 +279,7 @@ class Old:
     fitted, by unit the information (M, p, p) and pull (M, p) on them, their `prior` (p, p), `dependence`: as
     how many rows that depend on each other one counts (units' pulls scatter so much more than those of
     independent rows would, and the prior has so much more weight), how logs of a unit that took no part are
-    `missed` (M,) [nats a row], the channels' `scale` (C,), and the logs' `motions`."""
+    `missed` (M,) [nats a row], and the channels' `scale` (C,)."""
 
     point: Point
     theta: Coordinates
@@ -295,7 +290,6 @@ class Old:
     dependence: float
     missed: np.ndarray
     scale: np.ndarray
-    motions: list[Motion]
 
 
 def _objective(
@@ -350,18 +344,8 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
         step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
         missed[u] = without(halved(lambda z, f=without: f(z)[0], np.zeros(p), step))[1]
-    return Old(
-        point,
-        theta,
-        runs.units,
-        information,
-        pull,
-        prior,
-        dependence,
-        missed,
-        runs.scale,
-        motions_of(composed),
-    )
+    every = information, pull, prior, dependence, missed, runs.scale
+    return Old(point, theta, runs.units, *every)
 
 
 def units_of(old: Composed, new: Composed) -> tuple[np.ndarray, np.ndarray]:

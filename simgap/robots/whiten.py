@@ -26,7 +26,6 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.fft import dct
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
@@ -42,7 +41,7 @@ dtrtri: Any = lapack.dtrtri  # type: ignore[attr-defined]
 TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
 ENOUGH = 40  # numerics: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
-SMOOTH = 12  # numerics: cosines of a channel in a block, of which what is smooth consists
+SMOOTH = 12  # numerics: directions of a channel in a block, of which what is smooth consists
 ALONE = -4.0  # prior: log odds of a window to be off for reasons of its own
 WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 # numerics: log variances are found to a hundredth of a nat
@@ -180,17 +179,17 @@ class Covariances:
         """The discrepancy of a residual (N,) by maximum likelihood; sources for which it gains less than
         WORTH have none. `wide`: windows whose variance is larger, by which factor."""
         smooth, names = self._smooth, self.names
-        left = smooth.projected(residual, wide or {})
+        left, rest = smooth.projected(residual, wide or {})
         kept = list(range(len(names)))
         x = smooth.first_guess(left)
-        plain = smooth.cost(np.zeros(0), left, [])[0]
+        plain = smooth.cost(np.zeros(0), left, rest, [])[0]
         while kept:
             bounds = [(v - 20.0, v + 12.0) for v in x]
             done = minimize(
-                smooth.cost, x, (left, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE
+                smooth.cost, x, (left, rest, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE
             )
             without = [
-                smooth.cost(np.delete(done.x, i), left, kept[:i] + kept[i + 1 :])[0] - done.fun
+                smooth.cost(np.delete(done.x, i), left, rest, kept[:i] + kept[i + 1 :])[0] - done.fun
                 for i in range(len(kept))
             ]
             least = int(np.argmin(without))
@@ -256,38 +255,69 @@ def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float
 
 @dataclass(frozen=True)
 class _Smooth:
-    """Blocks in their channels' first cosines, in which a discrepancy is, padded to one size: covariances
-    without one (B, m, m) and of each source at s = 1 (K, B, m, m); `basis` by block (n, m)."""
+    """Blocks, in units of the rows' noise, by the directions in which starts and discrepancies move them
+    most, padded to one size: covariances without a discrepancy (B, m, m) and of each source at s = 1
+    (K, B, m, m); `basis` by block (n, m).
+
+    In all other directions rows count as independent ones, each by the `share` (N,) that is left of it, with
+    a variance of 1 and of each source at s = 1 (K, N): what ties no rows is as large there. By the former
+    alone what is smooth could be called white, at the expense of all rows.
+    """
 
     rows: tuple[np.ndarray, ...]
     windows: tuple[int, ...]
+    scale: tuple[np.ndarray, ...]
     basis: tuple[np.ndarray, ...]
     plain: np.ndarray
     source: np.ndarray
+    share: np.ndarray
+    white: np.ndarray
 
     @classmethod
     def of(cls, blocks: tuple[Block, ...], names: tuple[str, ...]) -> _Smooth:
         """Of these blocks and sources."""
-        basis = tuple(_cosines(block) for block in blocks)
+        scale, basis, parts = [], [], []
+        for block in blocks:
+            sd = np.sqrt(block.variance)
+            each = np.zeros((len(names), sd.size, sd.size))
+            for k, name in enumerate(names):
+                if name in block.sources:
+                    block.sources[name].add(each[k], 1.0)
+            each /= sd[:, None] * sd
+            start = block.start / sd[:, None]
+            tied = [one / np.trace(one) for one in each if np.any(one - np.diag(np.diag(one)))]
+            both = start @ start.T / max(float(np.sum(start**2)), 1e-300) + sum(tied)
+            count = min(sd.size, SMOOTH * np.unique(block.channel).size)
+            b = np.linalg.eigh(both)[1][:, -count:]
+            other = np.eye(sd.size) - b @ b.T
+            scale.append(sd)
+            basis.append(b)
+            whole = [np.eye(count) + (b.T @ start) @ (b.T @ start).T, *(b.T @ one @ b for one in each)]
+            parts.append(
+                (whole, [np.einsum("ij,jk,ki->i", other, one, other, optimize=True) for one in each])
+            )
         size = max((b.shape[1] for b in basis), default=0)
         plain = np.tile(np.eye(size), (len(blocks), 1, 1))
         source = np.zeros((len(names), len(blocks), size, size))
-        for i, (block, b) in enumerate(zip(blocks, basis, strict=True)):
-            m = b.shape[1]
-            plain[i, :m, :m] = b.T @ block.covariance() @ b
-            for k, name in enumerate(names):
-                if name in block.sources:
-                    one = np.zeros((block.rows.size, block.rows.size))
-                    block.sources[name].add(one, 1.0)
-                    source[k, i, :m, :m] = b.T @ one @ b
-        return cls(tuple(b.rows for b in blocks), tuple(b.window for b in blocks), basis, plain, source)
+        for i, (whole, _) in enumerate(parts):
+            m = len(whole[0])
+            plain[i, :m, :m] = whole[0]
+            source[:, i, :m, :m] = np.array(whole[1:]).reshape(-1, m, m)
+        share = np.maximum(np.concatenate([1 - np.sum(b**2, 1) for b in basis] or [np.zeros(0)]), 1e-9)
+        rest = [np.array(one).reshape(len(names), -1) for _, one in parts]
+        white = np.maximum(np.concatenate(rest or [np.zeros((len(names), 0))], 1), 0.0) / share
+        rows, windows = tuple(b.rows for b in blocks), tuple(b.window for b in blocks)
+        return cls(rows, windows, tuple(scale), tuple(basis), plain, source, share, white)
 
-    def projected(self, residual: np.ndarray, wide: Mapping[int, float]) -> np.ndarray:
-        """A residual (N,) in the blocks' cosines (B, m), in units as if no window were `wide`."""
-        out = np.zeros(self.plain.shape[:2])
-        for i, (rows, b) in enumerate(zip(self.rows, self.basis, strict=True)):
-            out[i, : b.shape[1]] = b.T @ residual[rows] / wide.get(self.windows[i], 1.0) ** 0.5
-        return out
+    def projected(self, residual: np.ndarray, wide: Mapping[int, float]) -> tuple[np.ndarray, np.ndarray]:
+        """A residual (N,) in the blocks' directions (B, m), as if no window were `wide`, and what is left of
+        it (N,), both in units of noise."""
+        out, rest = np.zeros(self.plain.shape[:2]), []
+        for i, (rows, sd, b) in enumerate(zip(self.rows, self.scale, self.basis, strict=True)):
+            mine = residual[rows] / sd / wide.get(self.windows[i], 1.0) ** 0.5
+            out[i, : b.shape[1]] = b.T @ mine
+            rest.append(mine - b @ out[i, : b.shape[1]])
+        return out, np.concatenate(rest or [np.zeros(0)])
 
     def first_guess(self, left: np.ndarray) -> np.ndarray:
         """Log variances (K,): each such that all of them together make up the squares."""
@@ -300,7 +330,9 @@ class _Smooth:
             out.append(np.log(max(float(share), 1e-30) / max(len(trace), 1)))
         return np.array(out)
 
-    def cost(self, x: np.ndarray, left: np.ndarray, kept: list[int]) -> tuple[float, np.ndarray]:
+    def cost(
+        self, x: np.ndarray, left: np.ndarray, rest: np.ndarray, kept: list[int]
+    ) -> tuple[float, np.ndarray]:
         """Minus the log likelihood at log variances (k,) of the sources that are kept, and its gradient."""
         variance = np.exp(x)
         whole = self.plain + np.tensordot(variance, self.source[kept], 1) if kept else self.plain
@@ -315,18 +347,11 @@ class _Smooth:
             if kept
             else []
         )
-        return value, variance * np.array(slope)
-
-
-def _cosines(block: Block) -> np.ndarray:
-    """The first cosines of each channel of a block (n, m)."""
-    out = []
-    for c in np.unique(block.channel):
-        mine = np.flatnonzero(block.channel == c)
-        whole = np.zeros((block.channel.size, min(mine.size, SMOOTH)))
-        whole[mine] = np.asarray(dct(np.eye(mine.size), axis=0, norm="ortho")).T[:, :SMOOTH]
-        out.append(whole)
-    return np.concatenate(out, 1)
+        white = self.white[kept]
+        own = 1 + variance @ white
+        value += 0.5 * float(self.share @ np.log(own) + np.sum(rest**2 / own))
+        slope = np.array(slope) + 0.5 * white @ (self.share / own - (rest / own) ** 2)
+        return value, variance * slope
 
 
 def _factored(matrix: np.ndarray) -> np.ndarray:

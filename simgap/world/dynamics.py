@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -221,10 +221,16 @@ def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
                          (tuple(normals[0]), tuple(normals[1])), tuple(support))  # fmt: skip
 
 
-def drift(state: State, h: Scalar) -> State:
+Moving = TypeVar("Moving", State, Tips)
+
+
+def drift(moving: Moving, h: Scalar) -> Moving:
     """Positions moved on by h [s] at constant velocity."""
-    return state._replace(x=tuple(a + h * v for a, v in zip(state.x, state.vx, strict=True)),
-                          y=tuple(a + h * v for a, v in zip(state.y, state.vy, strict=True)))  # fmt: skip
+    x, y = (
+        tuple(a + h * v for a, v in zip(at, speed, strict=True))
+        for at, speed in ((moving.x, moving.vx), (moving.y, moving.vy))
+    )
+    return moving._replace(x=x, y=y)
 
 
 def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
@@ -385,20 +391,15 @@ def perform(physics: Physics, hand: Impedance, command: Array, state: State, sub
         def one(k: Array, carry: tuple[State, Tips]) -> tuple[State, Tips]:
             state, tips = carry
             target = tips_of(jnp.concatenate([row[:4] + row[4:] * ((k + 0.5) * h), row[4:]]))
-            tips = _move(tips, h / 2)
+            tips = drift(tips, h / 2)
             state, loads = interact(physics, drift(state, h / 2), tips)
-            tips = _move(_pull(hand, tips, target, loads, h), h / 2)
+            tips = drift(_pull(hand, tips, target, loads, h), h / 2)
             return drift(kick(physics, state, loads, h), h / 2), tips
 
         return jax.lax.fori_loop(0, substeps, one, carry), out
 
     _, rows = jax.lax.scan(period, (state, start), jnp.concatenate([command, slope], axis=1))
     return record_of(rows, len(state.x))
-
-
-def _move(tips: Tips, h: Scalar) -> Tips:
-    return tips._replace(x=tuple(a + h * v for a, v in zip(tips.x, tips.vx, strict=True)),
-                         y=tuple(a + h * v for a, v in zip(tips.y, tips.vy, strict=True)))  # fmt: skip
 
 
 def _pull(hand: Impedance, tips: Tips, target: Tips, loads: Loads, h: Scalar) -> Tips:

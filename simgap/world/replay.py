@@ -108,11 +108,13 @@ def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray]
     for design, values, weight in zip(designs, samples, weights, strict=True):
         w = (weight[rows] * inside[..., None]) ** 2  # (T, window, axes)
         y = values[rows] - (samples[0][:, None] if design is designs[0] else 0.0)
-        normal = normal + np.einsum("twa,twi,twj->taij", w, design, design)
-        right = right + np.einsum("twa,twi,twa->tai", w, design, y)
+        squares = (design[..., :, None] * design[..., None, :]).reshape(*s.shape, 9)
+        normal = normal + (np.swapaxes(w, 1, 2) @ squares).reshape(normal.shape)
+        right = right + np.swapaxes(w * y, 1, 2) @ design
         square = square + (w * y**2).sum(1)
         count = count + (w > 0).sum(1)
-    proper = np.isfinite(np.linalg.cond(normal)) & (np.linalg.cond(normal) < 1e12) & (count >= 3)
+    with np.errstate(invalid="ignore"):
+        proper = (np.linalg.cond(normal) < 1e12) & (count >= 3)
     normal = np.where(proper[..., None, None], normal, np.eye(3))
     solution = np.linalg.solve(normal, right[..., None])[..., 0]
     left = np.maximum(square - (solution * right).sum(-1), 0.0)

@@ -90,7 +90,7 @@ def _noisy(values: np.ndarray, rig: Rig, quantity: str, rng: np.random.Generator
     return values if rng is None else values + noise_sd(rig, quantity) * rng.standard_normal(values.shape)
 
 
-BATCH = 16  # numerics: trials integrated side by side
+BATCH, SMALL = 16, 4  # numerics: trials integrated side by side: so many, or few
 MOVING = 2e-3  # physics: a definition: m/s; a slide begins and ends where the block's speed passes this
 
 
@@ -185,12 +185,13 @@ def simulate_plans(task: BlockTask, rig: Rig, plans: Sequence[Plan], properties:
 
 def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physics], length: int,
                  substeps: int) -> list[Record]:  # fmt: skip
-    """Records of one batch; a batch of several is filled up to BATCH, so that one program serves all."""
+    """Records of one batch; one of several is filled up to SMALL or BATCH, so that two programs serve all."""
     hands = [Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
     commands = [np.pad(p.command, ((0, length - len(p.command)), (0, 0)), "edge") for p in plans]
     starts = [_start(scene, task, p) for scene, p in zip(scenes, plans, strict=True)]
     rows = list(zip(scenes, hands, commands, starts, strict=True))
-    rows += [rows[-1]] * (BATCH - len(rows) if len(rows) > 1 else 0)
+    whole = 1 if len(rows) == 1 else SMALL if len(rows) <= SMALL else BATCH
+    rows += [rows[-1]] * (whole - len(rows))
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     batch = jax.tree.map(np.asarray, _perform_batch(*stacked, substeps=substeps))
     return [jax.tree.map(lambda a, j=j: a[j], batch) for j in range(len(plans))]

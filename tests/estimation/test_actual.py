@@ -72,11 +72,11 @@ def test_a_wrong_measurement_is_remarked_on():
     assert compared["block1"]["weight"]["disagrees"] and not compared["block1"]["width"]["disagrees"]
     assert compared["block1"]["height"] == {"value": 0.026, "sd": 1e-4}
     (line,) = disagreements(FOUND, compared)
-    assert line.startswith("block1.weight: the recordings say 0.4639 +- 0.0015 N, 9.5 % below")
+    assert line.startswith("block1.weight: the recordings say 0.4639 ± 0.0015 N, 9.5 % below")
     assert not compare(FOUND, measured, smallest=0.2)["block1"]["weight"]["disagrees"]  # [tolerance] property
 
 
 def test_a_friction_below_what_held_is_remarked_on():
     compared = compare(FOUND, {"block1": {"friction": (0.3, 0.02)}})
-    assert disagreements(FOUND, compared)[0].startswith("block1.friction: measured as 0.300 +- 0.020, but")
+    assert disagreements(FOUND, compared)[0].startswith("block1.friction: measured as 0.300 ± 0.020, but")
     assert disagreements(FOUND, compare(FOUND, {"block1": {"friction": (0.45, 0.02)}})) == []

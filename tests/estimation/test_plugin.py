@@ -152,12 +152,6 @@ def test_heights_that_only_sums_reveal_are_not_guessed():
     assert "together with the height of c" in out.reasons["b.height"]
 
 
-def test_trials_and_segmentations_must_pair():
-    signals, segmentation = make(STACK, RESTS["stack"])
-    with pytest.raises(ValueError, match="zip"):
-        estimate_plugin([signals], [segmentation, segmentation], STACK)
-
-
 def test_the_paper_s_blocks_within_the_paper_s_own_accuracy(shared):
     folder = shared / "recordings/paper_blocks"
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")

@@ -125,14 +125,6 @@ def test_toml_bombs(tmp_path):
         told(read_task, path)
 
 
-def test_a_symlink_out_of_a_data_set_is_read_as_the_file_it_is(tmp_path):
-    outside = tmp_path / "outside.csv"
-    outside.write_text("t,x\n" + "".join(f"{k},{k}\n" for k in range(20)))
-    link = tmp_path / "link.csv"
-    link.symlink_to(outside)
-    assert read_trial(link, None, read_task_of(["a"])).t.size == 20
-
-
 def read_task_of(sequence):
     from hmmseg.io.task import parse_task
 

@@ -15,8 +15,6 @@ from hmmseg.segmentation.boundaries import (
     UNIFORM,
     BoundaryPosterior,
     Crossing,
-    _hermite,
-    _hermite_slopes,
     _minimum_jerk,
     _minimum_jerk_slope,
     combine,
@@ -76,18 +74,6 @@ def test_without_noise_the_root_is_found(kind, root):
     assert quantiles(density, 0.5) == pytest.approx(root, abs=0.001 + 0.5 * sd[kind])
 
 
-def test_hermite_slopes_are_the_derivatives_of_the_cubic():
-    u = np.linspace(0.1, 0.9, 7)
-    numeric = [(a - b) / 2e-6 for a, b in zip(_hermite(u + 1e-6), _hermite(u - 1e-6), strict=True)]
-    np.testing.assert_allclose(_hermite_slopes(u), numeric, atol=1e-8)
-
-
-def test_the_cubic_passes_through_values_and_velocities():
-    ends = np.array([0.0, 1.0])
-    np.testing.assert_allclose(_hermite(ends), [[1, 0], [0, 0], [0, 1], [0, 0]], atol=1e-12)
-    np.testing.assert_allclose(_hermite_slopes(ends), [[0, 0], [1, 0], [0, 0], [0, 1]], atol=1e-12)
-
-
 def test_last_and_first_of_two_against_monte_carlo():
     # Broad enough that the grid of nodes resolves them.
     ends = ((-1.2e-3, 8e-4), (-7e-4, 1.3e-3))
@@ -99,12 +85,6 @@ def test_last_and_first_of_two_against_monte_carlo():
         expected = np.bincount(chosen(*drawn), minlength=POINTS) / num
         found = combined(pair, WIDTH)
         np.testing.assert_allclose(found, (1 - UNIFORM) * expected + UNIFORM / POINTS, atol=5e-3)
-
-
-def test_known_needs_every_number():
-    assert SOME[0].known
-    for name in ("left", "right", "v_left", "v_right", "sd_left", "sd_right", "sd_v"):
-        assert not replace(SOME[0], **{name: np.nan}).known
 
 
 def test_quantiles_and_moments_of_a_known_distribution():

@@ -201,12 +201,6 @@ def test_weight_of_a_carried_block_includes_its_inertia():
     assert rising > still + 5
 
 
-def test_an_unknown_state_is_refused():
-    other = replace(step(FREE)[0], state="in-orbit", object="block")
-    with pytest.raises(ValueError, match="no emission for the contact state 'in-orbit'"):
-        log_likelihoods(features(2), (other,), PARAMETERS, 0)
-
-
 def test_what_strays_on_its_support_stays_near_it():
     """A bounce or a slip by 3 mm may be; a rise by 25 mm is neither, however its forces ring."""
     ring = PARAMETERS.bias + np.array([2.0, -0.05, -2.0, -0.05])

@@ -168,12 +168,6 @@ def test_interpolation_by_hand():
     assert marked.tolist() == [False, True, False, True, False, False, False]
 
 
-def test_all_columns_of_a_log_have_names(tmp_path):
-    table = read_table(write_mcap(tmp_path / "a.mcap"))
-    assert {"t", "/wrench.wrench.torque.z", "/joints.velocity.a", "/pose.pose.orientation.w",
-            "/opening.data"} <= set(table.names)  # fmt: skip
-
-
 def test_robomimic_demonstrations(tmp_path):
     path = write_robomimic(tmp_path / "demos.hdf5")
     assert parts_of(path) == ["demo_0", "demo_1"]

@@ -15,7 +15,6 @@ from fault_scene import CARTESIAN, FOLDER, FREE, JOINT, JOINTED, mended
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
-from hmmseg.io.trial import JOINT_CHANNELS
 
 
 def changed(table, **factors):
@@ -112,6 +111,12 @@ def test_the_hands_own_weight_is_told():
     np.testing.assert_allclose(again.channels["fy1"], JOINT["fy1"], atol=0.05)
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "mN"), (1e-3, "kN")])
+def test_forces_of_another_size_are_remarked_on(factor, unit):
+    warnings = read_trial(changed(JOINT, fx=factor, fy=factor), JOINTED).warnings
+    assert any(f'unit = "{unit}"' in warning for warning in warnings), warnings
+
+
 def test_y_that_points_down_is_told():
     (line,) = read_trial(changed(CARTESIAN, y=-1, vy=-1, fy=-1), FREE).warnings
     assert re.search("column y1 every hold first goes down .*y points down; expected y1 = ", line)
@@ -144,7 +149,3 @@ def test_quiet_on_everything_shared(shared):
         if read_trial(file, read_rig(rig_file)).warnings
     ]
     assert {Path(name).parent.name for name in warned} == {"wrist_untared"}  # and it should be
-
-
-def test_joint_channels_are_all_there():
-    assert set(JOINT_CHANNELS) < set(JOINT)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments.score_recordings import first_change_order
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
@@ -21,7 +22,6 @@ from hmmseg.segmentation.thresholds import (
     NUMBERS,
     StateLabels,
     agreement,
-    first_change_order,
     label_states,
     monotone_order,
     segment_qualitative,
@@ -74,23 +74,16 @@ def test_states_in_the_paper_s_numbering():
     np.testing.assert_array_equal(labels.sliding, [False, False, False, True, False])
 
 
-def test_free_motion_asks_for_both_components_of_both_fingers():
-    for name in ("fx1", "fy1", "fx2", "fy2"):
-        signals = replace(make_signals("1"), **{name: np.array([-0.06])})
-        assert label_states(signals).state[0] == 0, name
-
-
-def test_hold_on_ground_asks_for_vertical_rest_and_no_upward_force():
-    signals = make_signals("3")
-    still, up = np.array([0.04]), np.array([0.06])
-    assert label_states(replace(signals, vy1=still, vy2=still)).state[0] == 3
-    assert label_states(replace(signals, vy1=up, vy2=up)).state[0] == 0
-    assert label_states(replace(signals, fy2=np.array([0.3]))).state[0] == 2
-
-
-def test_thresholds_decide():
-    assert label_states(make_signals("2"), force_threshold=0.5).state[0] == 0  # it moves upwards
-    assert label_states(make_signals("2"), force_threshold=0.5, velocity_threshold=0.15).sliding[0]
+@pytest.mark.parametrize(("state", "change", "options", "expected"), [
+    ("1", {"fx1": -0.06}, {}, 0), ("1", {"fy1": -0.06}, {}, 0), ("1", {"fx2": -0.06}, {}, 0),
+    ("1", {"fy2": -0.06}, {}, 0), ("3", {"vy1": 0.04, "vy2": 0.04}, {}, 3),
+    ("3", {"vy1": 0.06, "vy2": 0.06}, {}, 0), ("3", {"fy2": 0.3}, {}, 2),
+    ("2", {}, {"force_threshold": 0.5}, 0),
+    ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
+])  # fmt: skip
+def test_rules_ask_for_every_component_beyond_its_threshold(state, change, options, expected):
+    signals = replace(make_signals(state), **{name: np.array([value]) for name, value in change.items()})
+    assert label_states(signals, **options).state[0] == expected
 
 
 @pytest.mark.parametrize("state, name, expected", [
@@ -126,7 +119,7 @@ def test_dropouts_between_subtasks_widen_their_boundary():
 def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
     # The grip flickers to hold-above-ground and back before it lifts, as real grips do.
     states = "11111" + "3233333" + "22222222" + "33333" + "1111"
-    monotone, first = segment(states, PICK), segment(states, PICK, rule="first-change")
+    monotone, first = segment(states, PICK), segment(states, PICK, order=first_change_order)
     np.testing.assert_allclose(starts(monotone)[1:], (np.array([5, 12, 20, 25]) - 0.5) * 0.05)
     # The plain rule takes the flicker for the carry, and the rest of the pickup for the place.
     np.testing.assert_allclose(starts(first)[1:4], (np.array([5, 6, 7]) - 0.5) * 0.05)
@@ -144,7 +137,7 @@ def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
     assert [s.subtask for s in slid.spans] == ["pregrasp", "pickup", "slide", "place", "release"]
     np.testing.assert_allclose(starts(slid)[1:], (np.array([3, 5, 9, 11]) - 0.5) * 0.05)
     np.testing.assert_allclose(
-        starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE, rule="first-change")), starts(slid)
+        starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE, order=first_change_order)), starts(slid)
     )
 
 

@@ -1,6 +1,5 @@
 """A gripper with a wrist sensor: recordings made with known blocks, tools and mountings."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
-from hmmseg.contact.decompose import decompose, revealed_by
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.tool import applied_force, free_tool, pose_of
@@ -187,20 +185,6 @@ def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):
         read_trial(columns, wrist_rig(setup, reaction=True))
 
 
-def test_the_line_for_a_flipped_opening_mends_it(performed):
-    columns = wrist_recording(performed[0], PLAIN)
-    columns["gap"] = 0.085 - columns["gap"]
-    with pytest.raises(InputError) as told:
-        read_trial(columns, wrist_rig(PLAIN))
-    import tomllib
-
-    entry = str(told.value).split("expected ")[1].split(" under [columns]")[0]
-    table = wrist_rig(PLAIN).model_dump(exclude_none=True, exclude_defaults=True)
-    mended = parse_rig(table | {"columns": tomllib.loads(entry)})
-    trial = read_trial(columns, mended)
-    assert len(trial.touches) == 4
-
-
 def test_a_touch_in_free_motion_is_told(performed):
     columns = wrist_recording(performed[0], PLAIN)
     pressed = (columns["t"] > 1.2) & (columns["t"] < 1.5)
@@ -248,14 +232,3 @@ def test_an_arm_of_another_simulator(shared):
         assert properties.of(obj, "height").mean() == pytest.approx(actual["height"], abs=1e-4)
         low, high = np.percentile(properties.of(obj, "width"), [2.5, 97.5])
         assert low < actual["width"] < high
-
-
-def test_decompose_leaves_out_what_this_hand_cannot_reveal():
-    found = revealed_by(decompose(TASK), wrist_rig(PLAIN))
-    assert found.properties["a"]["friction"].evidence == ()
-    assert "wrist" in found.properties["a"]["friction"].reason
-    assert found.properties["a"]["weight"].kind == "value"
-    assert "opening" in found.properties["a"]["width"].evidence[0].condition
-    known = revealed_by(decompose(TASK), wrist_rig(PLAIN, grip_force=20.0))
-    assert known.properties["a"]["friction"].evidence
-    assert dataclasses.replace(known) == decompose(TASK)

@@ -67,7 +67,7 @@ def make_segmentation() -> Segmentation:
 
 
 def make_signals() -> Signals:
-    channels = set(Signals.__dataclass_fields__) - {"t", "sd_force", "derived", "touches", "coupled"}
+    channels = set(Signals.__dataclass_fields__) - {"t", "sd_force", "derived", "touches"}
     values = {name: np.sin(T) for name in channels}
     return Signals(t=T, **values, sd_force=0.01)
 
@@ -130,11 +130,6 @@ def test_estimates_with_null_and_bounded_properties(tmp_path, texts, actual):
     assert ("0.350 ± 0.010 N" if actual is None else "0.350 ± 0.010 N  (0.3430)") in texts
 
 
-def test_estimates_of_nothing_at_all(tmp_path):
-    draw_estimates({"block1": {"weight": None}}, None, tmp_path / "none.png")
-    check_picture(tmp_path / "none.png")
-
-
 def test_row_lies_at_the_relative_residual(tmp_path, monkeypatch):
     drawn = {}
     draw_row = plots._draw_row
@@ -155,7 +150,7 @@ def test_row_lies_at_the_relative_residual(tmp_path, monkeypatch):
 
 def test_predictive_band_and_its_coverage(tmp_path, texts):
     low = np.where(T > 2.5, np.nan, -0.5)
-    prediction = Prediction("Net $f_y$ [N]", np.sin(T), low, low + 0.5, low + 1.0)
+    prediction = Prediction("Net $f_y$ [N]", np.sin(T), low, low + 1.0)
     there = T <= 2.5
     assert prediction.coverage == pytest.approx(np.mean(np.sin(T[there]) <= 0.5))
     nothing = replace(prediction, low=np.full(100, np.nan))

@@ -151,7 +151,7 @@ def test_an_unknown_gap_says_what_moves():
                      "in 2 trials.")  # fmt: skip
     assert second.startswith("The net vertical force moves otherwise while you press block1 down: under 1 %")
     assert "what acts there" in to_do(found)[-1]
-    assert remains(found) == ["70 % of the gap is left when every likely cause has had its part."]
+    assert remains(found) == ["70 % of the gap is left after every likely cause."]
 
 
 def test_a_small_gap_is_no_gap_that_matters():

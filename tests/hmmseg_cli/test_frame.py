@@ -123,15 +123,6 @@ def test_help_groups_commands_and_gives_examples(capsys):
             assert ("--seed" in shown) == random
 
 
-def test_any_other_exception_is_a_bug(monkeypatch, task):
-    def broken(found):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr("hmmseg.contact.tables.decomposition_table", broken)
-    with pytest.raises(ZeroDivisionError):
-        frame.main(["decompose", str(task)])
-
-
 def test_a_process_with_a_bug_shows_its_traceback(task):
     code = """if True:
         import sys
@@ -206,18 +197,6 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path):
     assert os.listdir(tmp_path) == ["a.json"]
 
 
-def test_a_full_disk_leaves_no_half_written_file(tmp_path, monkeypatch):
-    def full(source, target):
-        Path(target).write_text("ha")
-        raise OSError(28, "No space left on device", str(target))
-
-    monkeypatch.setattr("hmmseg_cli.console.shutil.copyfile", full)
-    with (pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"),
-          Output("test", json=str(tmp_path / "a.json"), quiet=True) as out):  # fmt: skip
-        out.finish({})
-    assert os.listdir(tmp_path) == []
-
-
 def test_links_and_devices_are_written_through(tmp_path):
     (tmp_path / "real.json").write_text("old")
     (tmp_path / "link.json").symlink_to("real.json")
@@ -250,11 +229,6 @@ def test_quiet(capsys):
         out.warn("beware")
         out.finish({})
     assert tuple(capsys.readouterr()) == ("", "")
-
-
-def test_a_figure_needs_a_folder():
-    with Output("test") as out, pytest.raises(ValueError, match="no folder for figures"):
-        out.figure("one.png")
 
 
 def test_strict_json():

@@ -205,10 +205,3 @@ def test_plain_ordered_task_fits_saves_and_segments(tmp_path):
         assert [s["end"] for s in trial["segments"][:-1]] == pytest.approx([a, b], abs=0.06)
         assert trial["segments"][0]["object"] is None and trial["segments"][1]["state"] == "push"
         assert math.isfinite(trial["log_evidence"])
-
-
-def test_a_trial_twice_is_refused(tmp_path, capsys):
-    copy = tmp_path / "copy.csv"
-    shutil.copyfile(NONE / "trial_01.csv", copy)
-    assert main(["segment", str(NONE / "trial_01.csv"), str(copy), *RIG_AND_TASK]) == 2
-    assert "the same trial as" in capsys.readouterr().err

@@ -125,7 +125,7 @@ def test_ctrl_c_in_a_callback_is_heard(capsys):
     """What C calls can raise nothing; the interrupt comes when it has returned."""
     import ctypes
 
-    from hmmseg_cli.process import heard
+    from hmmseg_cli.main import heard
 
     @ctypes.CFUNCTYPE(None)
     def called():

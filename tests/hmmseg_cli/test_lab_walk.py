@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pandas as pd
-import polars as pl
 import pytest
 from fault_scene import CARTESIAN
 from file_writers import lerobot_of, robomimic_of
@@ -108,18 +107,6 @@ def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
         np.testing.assert_allclose(
             trial.channels[name], expected.channels[name], atol=1e-3 * (name[0] == "f") + 2e-5
         )
-
-
-@pytest.mark.parametrize("frame", [pd.DataFrame, pl.DataFrame])
-def test_frames_read_with_the_mapping_of_a_file(frame):
-    columns = {theirs: FINGERS[name] * size for name, (theirs, size) in FINGER_NAMES.items()}
-    entries = {name: {"from": theirs, "unit": "mm" if size == 1e3 else "N"} for name, (theirs, size) in
-               FINGER_NAMES.items()}  # fmt: skip
-    rig = parse_rig({"columns": entries | {"t": {"from": "stamp", "unit": "ns"}}})
-    stamp = np.round(FINGERS["t"] * 1e9).astype(np.int64)
-    trial = read_trial(frame({"stamp": stamp, **columns}), rig)
-    for name in FINGERS.keys() - {"t"}:
-        np.testing.assert_allclose(trial.channels[name], FINGERS[name], atol=1e-12)
 
 
 @pytest.mark.parametrize("hand", ["fingers", "wrist"])

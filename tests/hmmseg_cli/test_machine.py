@@ -11,7 +11,6 @@ import io
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -265,10 +264,6 @@ def test_a_page_watched_in_the_terminal_leaves_standard_output_alone(lab):
     assert run.wait(120) == 0
     lines = [json.loads(line) for line in Path("answers.jsonl").read_text().splitlines()]
     assert len(lines) == len(rows) and lines[-1]["final"]
-
-
-def test_signals_are_left_as_they_were():
-    assert signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)
 
 
 MOVES = 'objects = {a = {on = "ground"}}\nmoves = [' + '{object = "a", to = "ground"},' * 20_000 + "]"

@@ -104,4 +104,4 @@ def test_the_live_picture_shows_where_the_task_is():
     console.print(picture(watcher, answer, list(live._kept), ["a note"]))
     text = console.file.getvalue()
     assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
-    assert spark([0.0, float("nan"), 2.0]) == " ?█ 2.00 N at most"
+    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"

@@ -341,6 +341,9 @@ def test_a_cause_is_not_known_where_other_trials_show_no_gap_that_it_could_shrin
         found = _examined(f, (0,), np.full(f.count.size, variance), rng, others)
         assert found.causes == (0,)
         assert (found.known > 0.5) == likely
+        for share in (0.1, 0.9):  # of the evidence for a gap, where squares say nothing
+            found = _examined(f, (0,), np.full(f.count.size, variance), rng, others, lambda _, s=share: s)
+            assert (found.known > 0.5) == (likely or share == 0.9)
 
 
 def test_the_level_of_the_noise_is_that_of_its_mean_square_in_small_groups_too():

@@ -7,11 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from experiments.gap_generic import made as pairs_of_experiment
 from experiments.generic_ensembles import PLANTED, TASK, ensemble
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from simgap.generic.diagnose import detect, diagnose, gap_of, whitening
+from simgap.generic.diagnose import detect, diagnose, diagnosed, gap_of, whitening
 from simgap.generic.effects import (
     Ring,
     effects,
@@ -169,6 +170,13 @@ def test_a_planted_effect_is_named_with_its_parameters(name):
     assert body["shrinkage"]["fraction"] > 0.5
     assert {row["channel"] for row in body["where"]} <= {"fa", "fb", "duration"}
     assert sum(row["share"] for row in body["where"]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("pair", [("force_gain", "force_lag"), ("force_bias", "force_gain")])
+def test_two_planted_effects_are_both_named(pair):
+    """What a gain does to noise, and a lag by parts of a sample, must not stand in for one of them."""
+    ensembles = pairs_of_experiment(101, {name: PLANTED[name] for name in pair}, False)
+    assert diagnosed(ensembles).body["causes"] == list(pair)
 
 
 def test_an_effect_can_be_forced_and_an_unknown_one_is_refused():

@@ -121,7 +121,7 @@ def test_a_command_that_jumps_between_two_samples_is_no_gap(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     from simgap.robots.linear import linearise
     from simgap.robots.model import Composed
-    from simgap.robots.noise import noises
+    from simgap.robots.rows import noises
     from simgap.robots.whiten import covariances
     from simgap.robots.windows import JUMPS
     from simgap.simulators.mjcf.load import load_mjcf

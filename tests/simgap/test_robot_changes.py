@@ -13,7 +13,7 @@ from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Change, Changes, by_chance, changes, jackknife, widened
+from simgap.robots.changes import Change, Changes, _unlike, by_chance, changes, jackknife, widened
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -81,7 +81,28 @@ def test_a_gain_doubled_is_named_with_its_ratio():
     size = found.sizes()["gain"]
     low, high = size["ratio_90"]
     assert low <= 2.0 <= high and size["ratio"] == pytest.approx(2.0, rel=0.03)
-    assert found.body()["changes"][0].startswith("gain +")
+    body = found.body()
+    assert body["changes"][0].startswith("gain +") and body["effects"]["gain"]["parameters"].keys() == {
+        "gain"
+    }
+    pair = replace(found.best, effects=("gain", "mass"), **{n: np.repeat(getattr(found.best, n), 2) for n in
+                   ("x", "sd", "freedom")})  # fmt: skip
+    both = replace(found, best=pair).body()["effects"]
+    assert {n: {*e["parameters"]} for n, e in both.items()} == {
+        "gain+mass": {"gain.gain", "mass.mass"}, "gain": {"gain"}, "mass": {"mass"},
+    }  # fmt: skip
+
+
+def test_the_next_experiment_is_the_motion_by_which_a_set_differs_most():
+    found = compared(gain=5.2)
+    apart = 0.1 * np.arange(found.best.left.size)
+    other = replace(found.best, effects=("mass",), left=found.best.left + apart)
+    asked = replace(found, verdict="set", others=(other,)).body()["next_experiment"]
+    unit = found.runs.units[-1]
+    rows = found.runs.unit == unit
+    assert asked["log"] == found.composed.recordings[int(found.runs.log[rows][0])].name
+    assert asked["expected_gain_nats"] == pytest.approx(apart[-1] * rows.sum() / found.old.dependence)
+    assert asked["separates"] == ["gain", "mass"]
 
 
 @pytest.mark.slow
@@ -168,6 +189,12 @@ def test_a_size_takes_in_what_a_second_small_change_would_do_to_it():
 def test_gains_from_motion_to_motion_are_judged_by_student():
     gains = np.array([0.3, 0.1, 0.5, -0.1])
     assert by_chance(gains) == pytest.approx(ttest_1samp(gains, 0, alternative="greater").pvalue)
+
+
+def test_motions_missed_by_factors_are_called_unlike_as_often_as_stated():
+    rng = np.random.default_rng(0)
+    found = np.array([_unlike(np.exp(rng.normal(size=2)), np.exp(rng.normal(size=3))) for _ in range(2000)])
+    assert np.mean(found < 0.1) == pytest.approx(0.1, abs=0.02)
 
 
 def test_of_one_unit_nothing_is_sure():

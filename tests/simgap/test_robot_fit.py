@@ -12,7 +12,7 @@ from simgap.robot_effects.base import Setting
 from simgap.robots.fit import _prior, _slope, moved_to
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.noise import noises
+from simgap.robots.rows import noises
 from simgap.robots.search import BETTER, Search
 from simgap.robots.whiten import covariances
 from simgap.simulators.recording import Recording

@@ -11,10 +11,10 @@ from simgap_swing import Swing, log
 from simgap.channels import delayed, lowpass
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
-from simgap.robots.identifiable import identifiability
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.noise import noises, resolution
+from simgap.robots.rows import noises, resolution
+from simgap.robots.sets import identifiability
 from simgap.robots.whiten import NONE, covariances
 from simgap.robots.windows import REACH, smoothed
 from simgap.simulators.user import checked

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simgap.robots.noise import learned
+from simgap.robots.rows import learned
 from simgap.simulators.recording import Recording
 
 

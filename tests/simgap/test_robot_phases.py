@@ -10,9 +10,8 @@ from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, SequenceTask, parse_task
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.noise import noises
-from simgap.robots.rows import rows_of
-from simgap.robots.task_phases import phases_by_task
+from simgap.robots.phases import phases_by_task
+from simgap.robots.rows import noises, rows_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.user import checked
 

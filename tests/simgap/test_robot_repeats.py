@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from simgap.robots.linear import linearise
-from simgap.robots.model import Composed
-from simgap.robots.repeats import motions
+from simgap.robots.model import Composed, motions
 from simgap.robots.sets import Sets
 from simgap.robots.whiten import TAU, Discrepancy, covariances
 from simgap.simulators.recording import Recording

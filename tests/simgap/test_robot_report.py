@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from hmmseg_cli.console import Output
+from hmmseg_cli.diagnose_robot import _stages
 from hmmseg_cli.main import main
 from hmmseg_cli.pages import Setting, _parameters
 from simgap.report.robot import Course, Own, compared, history, intervals, motion_csv, write_rerun
@@ -55,12 +57,16 @@ def test_a_history_that_is_none_names_its_line(tmp_path):
         history(file)
 
 
-def test_what_was_found_stands_over_what_was_calibrated():
+def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_told():
     body = {
-        "causes": ["f"], "effects": {"f": {"parameters": {"f": told(2.0)}}},
-        "calibrated": {"parameters": {"f": told(1.0), "g": told(3.0)}},
+        "verdict": "named", "causes": ["joint:a.f"], "indistinguishable": [],
+        "effects": {"joint:a.f": {"parameters": {"f": told(2.0)}},
+                    "s": {"parameters": {"v": told(1.0), "w": told(4.0)}}},
+        "calibrated": {"parameters": {"joint:a.f": told(1.0), "g": told(3.0)}},
     }  # fmt: skip
-    assert {n: p["mean"] for n, p in intervals(body).items()} == {"f": 2.0, "g": 3.0}
+    assert {n: p["mean"] for n, p in intervals(body).items()} == {"joint:a.f": 2.0, "g": 3.0}
+    found = intervals(body | {"verdict": "set", "indistinguishable": ["s"]})
+    assert {n: p["mean"] for n, p in found.items()} == {"joint:a.f": None, "g": 3.0, "s.v": None, "s.w": None}
 
 
 def test_a_motion_is_written_as_its_log_has_it():
@@ -97,6 +103,15 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
     assert [e for e, *_ in sent] == [f"a.csv/q/{n}" for n in ("recorded", "simulated", "corrected")]
     assert [list(v) for _, _, v in sent] == [[0, 1], [1, 2], [2, 3]]
     assert all(list(index) == [0, 1] for _, index, _ in sent)
+
+
+def test_a_model_that_flies_off_is_one_line():
+    with (
+        Output("diagnose", quiet=True) as out,
+        pytest.raises(InputError, match="runs far away from the logs"),
+        _stages(out, "diagnosing", 1),
+    ):
+        np.linalg.cholesky(-np.eye(2))
 
 
 @pytest.mark.parametrize(

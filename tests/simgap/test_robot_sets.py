@@ -93,10 +93,11 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
 def test_the_gradient_of_the_likelihood_is_its_slope():
     smooth = Covariances(tuple(block(k) for k in range(3)))._smooth
     left, x = np.random.default_rng(2).standard_normal(smooth.plain.shape[:2]), np.array([-0.5, 0.3])
-    slope = smooth.cost(x, left, [0, 1])[1]
+    rest = np.random.default_rng(5).standard_normal(smooth.share.size)
+    slope = smooth.cost(x, left, rest, [0, 1])[1]
     for k in (0, 1):
         step = 1e-5 * (np.arange(2) == k)
-        change = smooth.cost(x + step, left, [0, 1])[0] - smooth.cost(x - step, left, [0, 1])[0]
+        change = smooth.cost(x + step, left, rest, [0, 1])[0] - smooth.cost(x - step, left, rest, [0, 1])[0]
         assert slope[k] == pytest.approx(change / 2e-5, rel=1e-5)
 
 

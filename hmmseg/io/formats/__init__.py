@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -63,14 +64,22 @@ def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
     """The table of a file; InputError for whatever a parser makes of one it cannot parse."""
     file, part = split_part(path)
     kind = kind_of(file)
-    try:
+    with _parsing(path, "a table with a header row"):
         return checked_width(_module(kind, path).read(file, part, wanted))
+
+
+@contextmanager
+def _parsing(path: str | Path, expected: str = "") -> Iterator[None]:
+    """Within it whatever a parser raises becomes an InputError: those of hostile files raise anything."""
+    try:
+        yield
     except InputError:
         raise
-    except Exception as error:  # parsers of hostile files raise anything
-        raise InputError(
-            str(path), f"cannot be read ({_told(error)})", "a table with a header row"
-        ) from error
+    except Exception as error:
+        from hmmseg.io.table import shown  # loads NumPy, which `hmmseg --help` does without
+
+        problem = f"cannot be read ({shown(error) or type(error).__name__})"
+        raise InputError(str(path), problem, expected) from error
 
 
 def checked_width(table: Table) -> Table:
@@ -94,7 +103,7 @@ def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) ->
 
     file, _ = split_part(path)
     waiting: Table | None = None
-    try:
+    with _parsing(path):
         for piece in _module(kind_of(file), path).read_pieces(file, wanted, rows):
             if waiting is not None and len(piece.rows) < least:
                 waiting = appended(waiting, piece)
@@ -102,10 +111,6 @@ def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) ->
             if waiting is not None:
                 yield waiting
             waiting = piece
-    except InputError:
-        raise
-    except Exception as error:  # parsers of hostile files raise anything
-        raise InputError(str(path), f"cannot be read ({_told(error)})") from error
     if waiting is not None:
         yield waiting
 
@@ -116,12 +121,8 @@ def parts_of(path: str | Path) -> list[str]:
     module = _module(kind_of(file), path)
     if part is not None or not hasattr(module, "parts"):
         return []
-    try:
+    with _parsing(path):
         return module.parts(file)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(str(path), f"cannot be read ({_told(error)})") from error
 
 
 def _module(kind: str, path: str | Path) -> ModuleType:
@@ -133,10 +134,3 @@ def _module(kind: str, path: str | Path) -> ModuleType:
             raise InputError(str(path), f"needs {library}, which is not installed",
                              f"pip install 'hmmseg[{extra}]'") from None  # fmt: skip
     return importlib.import_module(f"hmmseg.io.formats.{'logs' if kind in LOGS else kind}")
-
-
-def _told(error: Exception) -> str:
-    from hmmseg.io.table import shown  # loads NumPy, which `hmmseg --help` does without
-
-    text = shown(error)
-    return text if text else type(error).__name__

@@ -15,13 +15,18 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.laws import FADE, joint_law, most_of
 from simgap.simulators.mjcf.model import MjcfSimulator
-from simgap.simulators.mjcf.motion import Motion, motion_of
 from simgap.simulators.mjcf.play import played
 from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
-from simgap.simulators.mjcf.settable import setting_of
-from simgap.simulators.mjcf.settable_parts import body_setting, payload_place
+from simgap.simulators.mjcf.settable import body_setting, payload_place, setting_of
 from simgap.simulators.mjcf.setting import Setting, name_of, names_of, object_id
-from simgap.simulators.mjcf.transmission import SHARE, elasticity, gravity_compensation, sizes_of
+from simgap.simulators.mjcf.transmission import (
+    SHARE,
+    Motion,
+    elasticity,
+    gravity_compensation,
+    motion_of,
+    sizes_of,
+)
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 

@@ -12,12 +12,11 @@ import numpy as np
 
 from hmmseg.robust import bridged
 from simgap.latest import latest
-from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, HOLD, LATE, Runs
-from simgap.simulators.mjcf.setting import Setting
+from simgap.simulators.mjcf.setting import Changed, Setting
 from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from simgap.latest import latest
-from simgap.simulators.mjcf.changed import Changed
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.laws import MOTOR
 from simgap.simulators.mjcf.runs import Runs
 from simgap.simulators.mjcf.settable import setting_of
-from simgap.simulators.mjcf.setting import Setting
+from simgap.simulators.mjcf.setting import Changed, Setting
 from simgap.simulators.mjcf.signals import Held
 from simgap.simulators.protocol import Channels, Job
 from simgap.simulators.recording import Recording

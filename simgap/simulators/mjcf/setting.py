@@ -1,8 +1,8 @@
-"""One thing of a MuJoCo model that can be set, and objects by name."""
+"""One thing of a MuJoCo model that can be set, objects by name, and a model with some of it changed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,3 +66,54 @@ def array_setting(name: str, unit: str, array: str, at: Any, derived: bool, xml)
 def name_of(model: Any, kind: str, number: int) -> str:
     """The name of a joint, body, geom or actuator; empty where it has none."""
     return mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), number) or ""
+
+
+class Changed:
+    """The model with some settings changed, for as long as it is entered."""
+
+    def __init__(
+        self, model: Any, settings: Mapping[str, Setting], changed: Sequence[tuple[str, float]]
+    ) -> None:
+        self.model, self.settings, self.changed = model, settings, changed
+
+    def __enter__(self) -> None:
+        if not self.changed:
+            return
+        self.kept = {n: np.array(getattr(self.model, n)) for n in FIELDS}
+        opt = self.model.opt
+        self.options = (np.array(opt.gravity), opt.timestep, opt.integrator, opt.iterations)
+        for name, value in self.changed:
+            self.settings[name].put(self.model, value)
+        if any(self.settings[n].derived for n, _ in self.changed):
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+    def __exit__(self, *exception: object) -> None:
+        if not self.changed:
+            return
+        for name, values in self.kept.items():
+            getattr(self.model, name)[:] = values
+        opt = self.model.opt
+        opt.gravity[:], opt.timestep, opt.integrator, opt.iterations = self.options
+        if any(self.settings[n].derived for n, _ in self.changed):
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+
+FIELDS = (
+    "dof_damping",
+    "dof_frictionloss",
+    "dof_armature",
+    "jnt_stiffness",
+    "qpos_spring",
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_pos",
+    "geom_friction",
+    "geom_solref",
+    "geom_solimp",
+    "geom_size",
+    "geom_rbound",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+)
