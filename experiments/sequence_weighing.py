@@ -27,7 +27,7 @@ from hmmseg.sequence.courses import (
 from hmmseg.sequence.features import feature_map, features
 from hmmseg.sequence.fit import shares
 
-START = (4.0, -3.0, 0.1, -5.0, -3.0)  # numerics: where the search begins, as `weighing_of` takes it
+START = (4.0, -3.0, 0.1, -5.0, -3.0, -2.0)  # numerics: where the search begins, as `weighing_of` takes it
 
 Known = tuple[
     list[Course], np.ndarray, np.ndarray
@@ -70,6 +70,7 @@ def weighing_of(x: np.ndarray) -> Weighing:
     return Weighing(
         independent=float(np.exp(x[0])), settled=float(x[1]), shares=float(x[2]),
         lag=float(np.exp(x[3])), labelled=float(np.exp(x[3])), elsewhere=float(expit(x[4])),
+        unseen=float(expit(x[5])),
     )  # fmt: skip
 
 

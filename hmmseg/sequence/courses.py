@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
 
 from hmmseg.sequence.features import filled
 from hmmseg.sequence.learner import FLOORS, Learner
@@ -92,13 +91,15 @@ class Course:
     `probability` [(num_cells, num_stretches), ...]: of stretches, on the coarse grid. `ends` (num_trials,
     num_stretches - 1): where they end, as shares of the trial. `cost` [a, b] (num_stretches + 1, ...): of
     stretches a <= k < b as one state, nats as if each cell were one independent observation. `share`: of
-    independent observations in what the stretches leave.
+    independent observations in what the stretches leave. `seen` (num_stretches - 1,): log probability that
+    a change is there and no stretch of one level cut in two.
     """
 
     probability: list[np.ndarray]
     ends: np.ndarray
     cost: np.ndarray
     share: float
+    seen: np.ndarray
 
     @property
     def observations(self) -> float:
@@ -148,8 +149,38 @@ def _taught(
     emissions, probability = learner.run(
         [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
-    cost = merged_costs(values, [p.argmax(1) for p in probability], number, MERGE_FLOOR) / features
-    return Course(probability, ends, cost, learner.independent_share(emissions, probability) * features)
+    paths = [p.argmax(1) for p in probability]
+    cost = merged_costs(values, paths, number, MERGE_FLOOR) / features
+    share = learner.independent_share(emissions, probability) * features
+    return Course(probability, ends, cost, share, seen(values, paths, number, share))
+
+
+def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:
+    """Log probability (number - 1,) of each change against one state on either side of it.
+
+    Of as many independent observations as both stretches have: each side has a mean and a variance of its
+    own for each channel (Schwarz), and the change is as likely between any two cells of a trial.
+    """
+    bridged = [np.arcsinh(filled(v)) for v in values]
+    stacked, path = np.vstack(bridged), np.concatenate(paths)
+    features = stacked.shape[1]
+    out = np.zeros(number - 1)
+    for j in range(number - 1):
+        laws = [stacked[np.isin(path, of)] for of in ((j,), (j + 1,), (j, j + 1))]
+        if not (len(laws[0]) and len(laws[1])):
+            out[j] = -np.inf
+            continue
+        left, right, both = ((x.mean(0), np.log(x.var(0) + FLOORS[-1] ** 2)) for x in laws)
+        gain = -features / 2 * np.log(max(share * len(laws[2]), 1.0))
+        for x, own in zip(bridged, paths, strict=True):
+            here = x[(own == j) | (own == j + 1)]
+            cost = [share / (2 * features) * (log + (here - mean) ** 2 / np.exp(log)).sum(1)
+                    for mean, log in (left, right, both)]  # fmt: skip
+            before, after, whole = (np.r_[0.0, c.cumsum()] for c in cost)
+            changed = -before - (after[-1] - after)
+            gain += np.logaddexp.reduce(changed) - np.log(changed.size) + whole[-1]
+        out[j] = -np.logaddexp(0.0, -gain)
+    return out
 
 
 def _alike(one: Course, other: Course) -> bool:
@@ -188,7 +219,8 @@ class Weighing:
     state that nobody named after the last event. `shares`: exponent of the share of its trial that each state
     but the last takes. `lag`: scale of the Laplace law by which boundaries lie off the change they are, as a
     share of the trial; `labelled`: the same where labels say by how much. `elsewhere`: probability that a
-    boundary is at no change at all.
+    boundary is at no change at all; `unseen`: how probable a change that the channels do not show is, against
+    one that they do.
     """
 
     independent: float
@@ -197,15 +229,17 @@ class Weighing:
     lag: float
     labelled: float
     elsewhere: float
+    unseen: float
 
 
 WEIGHING = Weighing(
-    independent=64.0,  # learned: by `experiments.sequences learn --worlds 70`
-    settled=-2.98,  # learned: by `experiments.sequences learn --worlds 70`
-    shares=0.146,  # learned: by `experiments.sequences learn --worlds 70`
-    lag=0.0071,  # learned: by `experiments.sequences learn --worlds 70`
-    labelled=0.0049,  # learned: by `experiments.sequences learn --worlds 70`
-    elsewhere=0.047,  # learned: by `experiments.sequences learn --worlds 70`
+    independent=80.4,  # learned: by `experiments.sequences learn --worlds 40`
+    settled=-3.84,  # learned: by `experiments.sequences learn --worlds 40`
+    shares=0.035,  # learned: by `experiments.sequences learn --worlds 40`
+    lag=0.0074,  # learned: by `experiments.sequences learn --worlds 40`
+    labelled=0.0050,  # learned: by `experiments.sequences learn --worlds 40`
+    elsewhere=0.009,  # learned: by `experiments.sequences learn --worlds 40`
+    unseen=0.015,  # learned: by `experiments.sequences learn --worlds 40`
 )
 
 
@@ -247,6 +281,8 @@ def naming(
     """
     groups, tail, end = _weights(course, weighing)
     at = label_weights(course, labels, weighing)
+    change = _change_weights(course, weighing)
+    at[:, 1:-1] += change
     ahead = [groups[0] + at[0]]
     for b in range(1, num_states - 1):
         ahead.append(_sum(ahead[-1][:, None] + groups, 0) + at[b])
@@ -257,8 +293,20 @@ def naming(
     joint = np.array([one + other for one, other in zip(ahead, behind[::-1], strict=True)])[:, 1:number]
     total = float(np.logaddexp.reduce(joint[0]))
     last = np.exp(ahead[-1][:, None] + end - total)[:, 1:number].sum(0)
-    choices = gammaln(number) - gammaln(num_states) - gammaln(number - num_states + 1)
-    return Naming(total - choices, np.exp(joint - total), last)
+    return Naming(total - _choices(change, num_states - 1), np.exp(joint - total), last)
+
+
+def _change_weights(course: Course, weighing: Weighing) -> np.ndarray:
+    """Log weight (num_changes,) of each change as an end of a state: that it is seen, or is one unseen."""
+    return np.logaddexp(np.log1p(-weighing.unseen) + course.seen, np.log(weighing.unseen))
+
+
+def _choices(weights: np.ndarray, count: int) -> float:
+    """Log of the sum over all choices of `count` changes of the product of their weights, given as logs."""
+    total = np.r_[0.0, np.full(count, -np.inf)]
+    for each in weights:
+        total[1:] = np.logaddexp(total[1:], total[:-1] + each)
+    return float(total[-1])
 
 
 def _weights(course: Course, weighing: Weighing) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -269,7 +317,7 @@ def _weights(course: Course, weighing: Weighing) -> tuple[np.ndarray, np.ndarray
     edges = np.column_stack([np.zeros(len(course.ends)), course.ends, np.ones(len(course.ends))])
     durations = np.maximum(edges[:, None] - edges[:, :, None], LEAST_SHARE)
     groups = evidence + weighing.shares * np.log(durations).mean(0)
-    end = evidence + evidence[:, -1] + weighing.settled
+    end = evidence + evidence[:, -1] + weighing.settled + np.r_[0.0, _change_weights(course, weighing), 0.0]
     return groups, np.logaddexp(evidence[:, -1], _sum(end, 1)), end
 
 

@@ -201,9 +201,10 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
         found.append((median, sd, interval))
     starts: list[_Boundary] = [(first, 0.0, (first, first))]
     elsewhere: list[tuple[Place, ...]] = [()]
-    for number, (k, (median, sd, (low, high))) in enumerate(zip(kept[1:], found, strict=True), 1):
-        if model.courses and not any(course.shift[k - 1].any() for course in model.courses):
-            median = _jump(trial, model, median, starts[-1][0], [*found, (last,)][number][0])
+    dated = [each[0] for each in found]
+    if model.courses and not any(course.shift[k - 1].any() for course in model.courses for k in kept[1:]):
+        dated = _jumps(trial, data, model, dated)
+    for number, (k, median, (_, sd, (low, high))) in enumerate(zip(kept[1:], dated, found, strict=True), 1):
         # A state that is there lasts a cell at least, as in every alignment: medians of places need not.
         median = max(starts[-1][0] + step, min(median, last - step * (len(kept) - number)))
         starts.append((median, sd, (min(low, median), max(high, median))))
@@ -215,20 +216,73 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     )
 
 
-def _jump(trial: Trial, model: SequenceModel, time: float, before: float, after: float) -> float:
-    """When [s] the channels jump near a change that the features place at `time`, between its neighbours.
+def _jumps(trial: Trial, data: SequenceFeatures, model: SequenceModel, times: list[float]) -> list[float]:
+    """When [s] the channels jump near the changes `times` that the features give.
 
-    Slopes look across a window, so that they know of an abrupt change half a window before it comes. The
-    samples themselves do not: a level on either side with normal noise, and a change that lies off `time` by
-    the law of `Weighing.lag`, no farther than NEAR, anywhere between two samples. The median.
+    Each is off the features' by the law of `Weighing.lag`, NEAR at most, and between them, as far as that
+    reaches, levels are constant with normal noise: all together on the cells, as changes that are near each
+    other share what they see, then each by itself between two samples.
     """
-    length, window = float(trial.t[-1] - trial.t[0]), model.mapping.window * model.mapping.step
-    farthest = max(NEAR * length, model.mapping.step)
-    reach = farthest + window
+    step, cells = model.mapping.step, len(data.values)
+    farthest = max(round(NEAR * cells), 1)
+    reach, channels = farthest + model.mapping.window, len(model.mapping.channels)
+    at = np.clip(((np.array(times) - data.edges[0]) / step).astype(int), 1, cells - 2)
+    found: list[int] = []
+    for group in np.split(np.arange(at.size), np.flatnonzero(np.diff(at) > 2 * reach) + 1):
+        if group.size:
+            low = max(at[group[0]] - reach, found[-1] + 1 if found else 0)
+            high = min(at[group[-1]] + reach, *at[group[-1] + 1 :], cells)
+            x = data.values[low:high, :channels]
+            found += (low + _levels(x, at[group] - low, farthest, WEIGHING.lag * cells, model)).tolist()
+    middle = [float(data.edges[n] + step / 2) for n in found]
+    ends = [float(trial.t[0]), *middle, float(trial.t[-1])]
+    return [_jump(trial, model, *ends[b : b + 3]) for b in range(len(found))]
+
+
+def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: SequenceModel) -> np.ndarray:
+    """The cells, each within `farthest` of one of `at`, in which the level of `x` likeliest changes.
+
+    `x` (num_cells, num_channels). A cell in which it changes is of neither level.
+    """
+    there = np.isfinite(x)
+    x = np.where(there, x - np.nanmean(x, axis=0, where=there), 0.0)
+    sums = [np.concatenate([np.zeros((1, x.shape[1])), v.cumsum(axis=0)]) for v in (there, x, x**2)]
+
+    def rest(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Squares that a level leaves from cell low + 1 up to high."""
+        count, first, second = (v[high] - v[np.minimum(low + 1, high)] for v in sums)
+        return second - first**2 / np.maximum(count, 1)
+
+    every = [np.arange(max(n - farthest, 1), min(n + farthest, len(x) - 2) + 1) for n in at]
+    if not all(each.size for each in every):
+        return at
+    for _ in range(2):  # noise is what the changes of before leave
+        ends = np.r_[-1, at, len(x)]
+        noise = np.maximum(rest(ends[:-1], ends[1:]).sum(axis=0), 1e-9 * sums[2][-1]) / sums[0][-1]
+        weight = model.emissions.temper / (2 * noise + np.finfo(float).tiny)
+        total, source = rest(np.full_like(every[0], -1), every[0]) @ weight, []
+        for b, each in enumerate(every):
+            if b:
+                low, high = np.meshgrid(every[b - 1], each, indexing="ij")
+                cost = np.where(high > low + 1, rest(low, high) @ weight, np.inf) + total[:, None]
+                source.append(cost.argmin(axis=0))
+                total = cost.min(axis=0)
+            total = total + np.abs(each - at[b]) / lag
+        path = [int((total + rest(every[-1], np.full_like(every[-1], len(x))) @ weight).argmin())]
+        for back in reversed(source):
+            path.append(int(back[path[-1]]))
+        at = np.array([each[n] for each, n in zip(every, path[::-1], strict=True)])
+    return at
+
+
+def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after: float) -> float:
+    """The jump [s] within a cell of `time`, anywhere between two samples: the median."""
+    step = model.mapping.step
+    reach = model.mapping.window * step
     inside = slice(*np.searchsorted(trial.t, [max(before, time - reach), min(after, time + reach)]))
     x = np.stack([trial.channels[name][inside] for name in model.mapping.channels], axis=1)
     between = (trial.t[inside][1:] + trial.t[inside][:-1]) / 2
-    open_ = np.abs(between - time) <= farthest
+    open_ = np.abs(between - time) <= 1.5 * step
     if not open_.any():
         return time
     there = np.isfinite(x)
@@ -238,8 +292,7 @@ def _jump(trial: Trial, model: SequenceModel, time: float, before: float, after:
     explained = first[:-1] ** 2 / np.maximum(left, 1) + (first[-1] - first[:-1]) ** 2 / np.maximum(right, 1)
     total = (x**2).sum(axis=0)
     rest = np.maximum(total - explained, 1e-9 * total) + np.finfo(float).tiny
-    cost = model.emissions.temper * (count[-1] / 2 * np.log(rest)).sum(axis=1)
-    cost = (cost + np.abs(between - time) / (WEIGHING.lag * length))[open_]
+    cost = model.emissions.temper * (count[-1] / 2 * np.log(rest)).sum(axis=1)[open_]
     weight = np.exp(cost.min() - cost).cumsum()
     return float(between[open_][np.searchsorted(weight, weight[-1] / 2)])
 

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import most_telling
-from hmmseg.sequence.courses import NEAR, WEIGHING, Course, best_choice, naming, probabilities
+from hmmseg.sequence.courses import NEAR, WEIGHING, Course, best_choice, naming, probabilities, seen
 from hmmseg.sequence.emissions import StudentEmissions
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import NamedCourse, load_model, save_model
@@ -39,7 +38,8 @@ def drawn_course(rng, stretches, trials=2):
     later = np.arange(stretches + 1)[None] > np.arange(stretches + 1)[:, None]
     cost = np.where(later, 20 * rng.random((stretches + 1, stretches + 1)), np.inf)
     ends = np.sort(rng.uniform(0.05, 0.95, (trials, stretches - 1)), axis=1)
-    return Course([np.zeros((50, stretches))] * trials, ends, cost, share=0.5)
+    seen = np.log(rng.uniform(0.01, 1.0, stretches - 1))
+    return Course([np.zeros((50, stretches))] * trials, ends, cost, 0.5, seen)
 
 
 def enumerated(course, states, labels):
@@ -54,6 +54,8 @@ def enumerated(course, states, labels):
             log = -temper * sum(course.cost[a, b] for a, b in itertools.pairwise(bounds))
             for a, b in itertools.pairwise([0, *cuts]):
                 log += w.shares * np.log(edges[:, b] - edges[:, a]).mean()
+            changes = [*cuts] if settles is None else [*cuts, settles]
+            log += sum(np.log(w.unseen + (1 - w.unseen) * np.exp(course.seen[j - 1])) for j in changes)
             log += 0.0 if settles is None else w.settled
             for i, known in enumerate(labels):
                 for b in np.flatnonzero(np.isfinite(known)):
@@ -81,7 +83,18 @@ def test_naming_is_the_sum_over_all_choices(labelled):
         found = naming(course, states, labels)
         np.testing.assert_allclose(found.probability, probability, atol=1e-12)
         np.testing.assert_allclose(found.settled, settled, atol=1e-12)
-        assert found.log_evidence == pytest.approx(total - np.log(math.comb(6, states - 1)))
+        weight = WEIGHING.unseen + (1 - WEIGHING.unseen) * np.exp(course.seen)
+        choices = sum(np.prod(weight[list(cuts)]) for cuts in itertools.combinations(range(6), states - 1))
+        assert found.log_evidence == pytest.approx(total - np.log(choices))
+
+
+def test_a_jump_is_seen_and_a_level_cut_in_two_is_not():
+    rng = np.random.default_rng(5)
+    level = np.repeat([0.0, 0.0, 1.5], 60)
+    values = [level[:, None] + 0.3 * rng.normal(size=(180, 2)) for _ in range(3)]
+    found = np.exp(seen(values, [np.repeat([0, 1, 2], 60)] * 3, 3, share=2.0))
+    assert found[0] < 0.01
+    assert found[1] > 0.999
 
 
 def test_the_best_choice_has_most_boundaries_right():

@@ -8,7 +8,7 @@ import pytest
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.courses import partition
 from hmmseg.sequence.emissions import from_weights, independent_share, learn, transitions
-from hmmseg.sequence.features import cell_means, feature_map, features, without_old
+from hmmseg.sequence.features import cell_means, edge_preserving_slopes, feature_map, features, without_old
 
 
 def test_cells_average_samples_and_stay_empty_where_there_are_none():
@@ -49,6 +49,12 @@ def test_slope_of_a_ramp():
     mapping = feature_map([trial], ("a",))
     slope = features(trial, mapping).values[:, 1] * mapping.scale[1] + mapping.center[1]
     np.testing.assert_allclose(slope[5:-5], 3.0, rtol=1e-6)
+
+
+def test_no_slope_looks_across_a_jump():
+    x = np.concatenate([0.5 * np.arange(60), 40 - 0.2 * np.arange(60)])[:, None]
+    slope = edge_preserving_slopes(x, 9)[:, 0]
+    np.testing.assert_allclose(slope, np.repeat([0.5, -0.2], 60), atol=1e-9)
 
 
 @pytest.mark.parametrize("num_stretches", [1, 2, 3])
