@@ -25,17 +25,16 @@ def table() -> str | None:
             if not s:
                 continue
             sure = "" if s["sure_right"] is None else percent(s["sure_right"], 0)
-            rows.append([
-                group, label, f"{s['boundaries']}", percent(s["median"]), percent(s["right"], 0),
-                percent(s["within_a_sample"], 0), percent(s["listed"], 0), percent(s["coverage_90"], 0), percent(s["width"]),
-                percent(s["sure"], 0), sure,
-            ])  # fmt: skip
+            shares = [percent(s[k], 0) for k in ("right", "within_a_sample", "listed", "coverage_90")]
+            cells = [f"{s['boundaries']}", percent(s["median"]), *shares, percent(s["width"])]
+            rows.append([group, label, *cells, percent(s["sure"], 0), sure])
     _draw(found["groups"], FIGURE)
-    head = ["cases", "known", "boundaries", "median error", "right", "within a sample", "truth at a listed place",
-            "90 % intervals hold", "their width", "one place only", "of these right"]  # fmt: skip
+    head = ["cases", "known", "boundaries", "median error", "right", "within a sample",
+            "truth at a listed place", "90 % intervals hold", "their width", "one place only",
+            "of these right"]  # fmt: skip
     note = (
-        f"{found['worlds']} worlds drawn of many kinds, as many of levels that jump in white noise (abrupt). Errors and widths as shares of the trial. "
-        "The labelled trial is not scored."
+        f"{found['worlds']} worlds drawn of many kinds, as many of levels that jump in white noise (abrupt). "
+        "Errors and widths as shares of the trial. The labelled trial is not scored."
     )
     return f"{markdown(head, rows)}\n\n{note}"
 

@@ -15,9 +15,9 @@ from hmmseg_cli.diagnose_robot import (
     OwnSimulator,
     PatchOption,
     SimulatorOption,
-    _read,
-    _stages,
-    _warn_of_engine,
+    read_logs,
+    show_stages,
+    warn_of_engine,
 )
 
 ModelOption = Annotated[
@@ -47,14 +47,14 @@ def calibrate(
         from simgap.robots.calibrate import calibrate as fitted
         from simgap.robots.patch import write_patch
 
-        robot, recordings, loaded = _read(out, distinct_trials(logs), own)
+        robot, recordings, loaded = read_logs(out, distinct_trials(logs), own)
         more = () if loaded is None else loaded.effects(recordings)
         length = getattr(robot, "window", None) if loaded is None else loaded.map.length
         wanted = (*UNMEASURED, *getattr(robot, "sd", ())) if loaded is not None else ()
         effects = effects_of(robot, recordings, more, wanted)
-        with _stages(out, "calibrating", STAGES) as tell:
+        with show_stages(out, "calibrating", STAGES) as tell:
             found = fitted(robot, recordings, effects, length=length, tell=tell)
-        _warn_of_engine(out, own)
+        warn_of_engine(out, own)
         document = found.body()
         out.print(*tables(document))
         for name, reason in document["reasons"].items():

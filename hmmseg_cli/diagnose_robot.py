@@ -115,7 +115,7 @@ class OwnSimulator:
                 raise InputError("--rerun", "needs rerun-sdk", "pip install rerun-sdk")
 
 
-def _read(
+def read_logs(
     out: Output, paths: Sequence[Path], own: OwnSimulator
 ) -> tuple[Simulator, list[Recording], Loaded | None]:
     """The simulator, the logs of its channels, and what was loaded of an MJCF."""
@@ -138,7 +138,7 @@ def _read(
 
 
 @contextmanager
-def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
+def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
     """Progress by stages, with what a long one is at; yields what is told of each stage that begins.
 
     InputError where the model runs so far from its logs that no equation can be solved.
@@ -162,7 +162,7 @@ def _stages(out: Output, text: str, total: int) -> Iterator[Progress]:
             raise InputError("simulator", f"runs far away from the logs ({stage})", near) from None
 
 
-def _warn_of_engine(out: Output, own: OwnSimulator) -> None:
+def warn_of_engine(out: Output, own: OwnSimulator) -> None:
     """What MuJoCo warned of, each once."""
     if own.mjcf is not None:
         from simgap.simulators.mjcf.engine import warned
@@ -182,7 +182,7 @@ def diagnose_robot(
     from simgap.robots.describe import body
     from simgap.robots.diagnose import STAGES, diagnose
 
-    at_risk, recordings, loaded = _read(out, paths, own)
+    at_risk, recordings, loaded = read_logs(out, paths, own)
     more = [] if loaded is None else loaded.effects(recordings)
     length = None if loaded is None else loaded.map.length
     phases = None
@@ -191,7 +191,7 @@ def diagnose_robot(
         from simgap.robots.phases import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
-    with _stages(out, "diagnosing", STAGES) as tell:
+    with show_stages(out, "diagnosing", STAGES) as tell:
         found = diagnose(
             at_risk,
             recordings,
@@ -204,7 +204,7 @@ def diagnose_robot(
             warn=out.warn,
         )
     document = body(found)
-    _warn_of_engine(out, own)
+    warn_of_engine(out, own)
     said, left = sentence(document), document["remainder"]["rms_over_noise"]
     size = [] if "times the noise" in said else [f"What is left is {left:.3g} times the noise."]
     out.print(said, *size, *tables(document, found))
@@ -224,14 +224,14 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
     from simgap.robot_effects import UNMEASURED, effects_of
     from simgap.robots.changes import STAGES, changes
 
-    simulator, logs, loaded = _read(out, [*paths, *healthy], own)
+    simulator, logs, loaded = read_logs(out, [*paths, *healthy], own)
     if loaded is None:
         effects = effects_of(simulator, logs)
     else:
         effects = effects_of(simulator, logs, loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
-    with _stages(out, "comparing", STAGES) as tell:
+    with show_stages(out, "comparing", STAGES) as tell:
         found = changes(simulator, logs[len(paths) :], logs[: len(paths)], effects, tell=tell)
-    _warn_of_engine(out, own)
+    warn_of_engine(out, own)
     document = found.body()
     for b in document["broken"]:
         out.warn(f"{b['trial']}: {b['channel']} is {b['value']:.4g} at {b['time']:.3f} s, left out")

@@ -11,7 +11,7 @@ import pytest
 
 from hmmseg.errors import InputError
 from hmmseg_cli.console import Output
-from hmmseg_cli.diagnose_robot import _stages
+from hmmseg_cli.diagnose_robot import show_stages
 from hmmseg_cli.main import main
 from hmmseg_cli.pages import Setting, _parameters
 from simgap.report.robot import Course, Own, compared, history, intervals, motion_csv, write_rerun
@@ -109,7 +109,7 @@ def test_a_model_that_flies_off_is_one_line():
     with (
         Output("diagnose", quiet=True) as out,
         pytest.raises(InputError, match="runs far away from the logs"),
-        _stages(out, "diagnosing", 1),
+        show_stages(out, "diagnosing", 1),
     ):
         np.linalg.cholesky(-np.eye(2))
 
