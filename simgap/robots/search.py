@@ -127,7 +127,18 @@ class Search:
             better = self._better(best, best) or self._exchanged(best)
             if better is None:
                 break
-            best = better
+            best = better if number else self._from_other_ends(better)
+        return best
+
+    def _from_other_ends(self, best: Settled) -> Settled:
+        """The same set begun with the simulator's numbers at their other ends: commands in steps are nearly
+        those in lines that come later, and no small step leads from one to the other."""
+        for name in filter(self.composed.numeric, self.along):
+            for short, known in self.composed.effects[name].parameters.items():
+                if np.isfinite([known.low, known.high]).all():
+                    near_low = best.point[name][short] < 0.5 * (known.low + known.high)
+                    other = {**best.point[name], short: known.high if near_low else known.low}
+                    best = self.settled(best.names, {**best.point, name: other}, [best.whiten], best.score)
         return best
 
     def _calibrated(self) -> Settled | None:
