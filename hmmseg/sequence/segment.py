@@ -29,6 +29,7 @@ LISTED = 0.05  # chosen: least probability of a place that is listed
 SURE = 0.95  # chosen: from here on one place is the answer and no other is listed
 FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
 LEAST = 1e-3  # numerics: probability of a naming that makes no difference
+EXACT = 1e-6  # numerics: of a feature's spread: what is nearer to a level than that is at it
 
 
 @dataclass(frozen=True)
@@ -244,8 +245,7 @@ def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: Seq
 
     `x` (num_cells, num_channels). A cell in which it changes is of neither level.
     """
-    there = np.isfinite(x)
-    x = np.where(there, x - np.nanmean(x, axis=0, where=there), 0.0)
+    there, x = _about_mean(x)
     sums = [np.concatenate([np.zeros((1, x.shape[1])), v.cumsum(axis=0)]) for v in (there, x, x**2)]
 
     def rest(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -256,10 +256,11 @@ def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: Seq
     every = [np.arange(max(n - farthest, 1), min(n + farthest, len(x) - 2) + 1) for n in at]
     if not all(each.size for each in every):
         return at
+    found = at
     for _ in range(2):  # noise is what the changes of before leave
-        ends = np.r_[-1, at, len(x)]
-        noise = np.maximum(rest(ends[:-1], ends[1:]).sum(axis=0), 1e-9 * sums[2][-1]) / sums[0][-1]
-        weight = model.emissions.temper / (2 * noise + np.finfo(float).tiny)
+        ends = np.r_[-1, found, len(x)]
+        noise = rest(ends[:-1], ends[1:]).sum(axis=0) / np.maximum(sums[0][-1], 1) + EXACT**2
+        weight = model.emissions.temper / (2 * noise)
         total, source = rest(np.full_like(every[0], -1), every[0]) @ weight, []
         for b, each in enumerate(every):
             if b:
@@ -268,11 +269,20 @@ def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: Seq
                 source.append(cost.argmin(axis=0))
                 total = cost.min(axis=0)
             total = total + np.abs(each - at[b]) / lag
+        if not np.isfinite(total).any():  # no room for all states
+            return at
         path = [int((total + rest(every[-1], np.full_like(every[-1], len(x))) @ weight).argmin())]
         for back in reversed(source):
             path.append(int(back[path[-1]]))
-        at = np.array([each[n] for each, n in zip(every, path[::-1], strict=True)])
-    return at
+        found = np.array([each[n] for each, n in zip(every, path[::-1], strict=True)])
+    return found
+
+
+def _about_mean(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where values (n, k) are, and they about their means by column; 0 where they are missing."""
+    there = np.isfinite(x)
+    x = np.where(there, x, 0.0)
+    return there, np.where(there, x - x.sum(axis=0) / np.maximum(there.sum(axis=0), 1), 0.0)
 
 
 def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after: float) -> float:
@@ -285,8 +295,7 @@ def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after:
     open_ = np.abs(between - time) <= 1.5 * step
     if not open_.any():
         return time
-    there = np.isfinite(x)
-    x = np.where(there, x - np.nanmean(x, axis=0, where=there), 0.0)
+    there, x = _about_mean(x)
     count, first = there.cumsum(axis=0), x.cumsum(axis=0)
     left, right = count[:-1], count[-1] - count[:-1]
     explained = first[:-1] ** 2 / np.maximum(left, 1) + (first[-1] - first[:-1]) ** 2 / np.maximum(right, 1)

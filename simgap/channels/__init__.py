@@ -15,7 +15,6 @@ from functools import cache
 
 import numpy as np
 
-from hmmseg.online.compiled import compiled
 from simgap.effect import Array, Effect, Parameter
 
 Theta = Mapping[str, float]  # an effect's parameters by name
@@ -95,30 +94,15 @@ def lowpass(t: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarr
     """
     if time_constant < SHORTEST or len(values) < 3:
         return values
+    from simgap.recursions import smoothed
+
     slope, bend = onset(t, values)
     start = values[0] - time_constant * slope + time_constant**2 * bend
-    return _smoothed(np.asarray(t, float), np.asarray(values, float), float(time_constant), float(start))
+    return smoothed(np.asarray(t, float), np.asarray(values, float), float(time_constant), float(start))
 
 
-@compiled
-def _smoothed(t: np.ndarray, values: np.ndarray, tau: float, start: float) -> np.ndarray:
-    out = np.empty_like(values)
-    out[0] = start
-    for i in range(values.size - 1):
-        step = t[i + 1] - t[i]
-        late = tau * (values[i + 1] - values[i]) / step
-        # On each piece y = u - tau slope + decaying rest.
-        out[i + 1] = values[i + 1] - late + np.exp(-step / tau) * (out[i] - values[i] + late)
-    return out
-
-
-@compiled
 def play(values: np.ndarray, width: float) -> np.ndarray:
     """The play operator: the output (n,) follows the input only where that pushes a side of the gap."""
-    out = np.empty_like(values)
-    at = values[0]
-    for i in range(values.size):
-        if np.isfinite(values[i]):
-            at = min(max(at, values[i] - width / 2), values[i] + width / 2)
-        out[i] = at
-    return out
+    from simgap.recursions import play
+
+    return play(values, width)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -144,12 +145,27 @@ def history(path: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         try:
             entry = json.loads(line)
-            assert isinstance(entry["date"], str) and isinstance(entry["parameters"], dict)
-        except (ValueError, KeyError, TypeError, AssertionError):
+        except ValueError:
+            entry = None
+        if not _is_run(entry):
             where = f"--history {path}: line {number}"
-            raise InputError(where, "is no run of a history", '{"date": .., "parameters": ..}') from None
+            raise InputError(where, "is no run of a history", '{"date": .., "parameters": ..}')
         out.append(entry)
     return out
+
+
+def _is_run(entry: Any) -> bool:
+    """Whether a history's line names a date, and of each parameter a mean and an interval, or null."""
+    if not (isinstance(entry, dict) and isinstance(entry.get("date"), str)):
+        return False
+    known = entry.get("parameters")
+    number = (int, float, NoneType)
+    return isinstance(known, dict) and all(
+        isinstance(p, dict)
+        and isinstance(p.get("mean"), number)
+        and (p.get("interval_90") is None or np.shape(p["interval_90"]) == (2,))
+        for p in known.values()
+    )
 
 
 def compared(

@@ -378,12 +378,13 @@ class Search:
         return mine - theirs
 
     def _held_out(self, one: Settled, whiten: Whitener) -> np.ndarray:
-        key = frozenset(one.names), id(one), id(whiten)
+        key = id(one), id(whiten)
         if key not in self._densities:
             names = [n for n in one.names if n in one.linear.moved]
             given = one.composed.effects, one.linear, [whiten], names, self.fold, self.log_odds
-            self._densities[key] = Sets.of(*given).held_out(one.names, 0)
-        return self._densities[key]
+            # Both are kept with it: what is freed may leave its id to another.
+            self._densities[key] = Sets.of(*given).held_out(one.names, 0), one, whiten
+        return self._densities[key][0]
 
     def _is_better(self, one: Settled, best: Settled) -> bool:
         """Whether to go on from a set: likelier, and so by logs that took no part, unless it only does

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -256,3 +257,17 @@ def test_the_shortest_interval_holds_nine_tenths_and_none_on_a_fine_grid_is_shor
         ends = np.searchsorted(of, of + 0.9 - 1e-9)
         lengths = [fine[end] - start for start, end in zip(fine, ends, strict=True) if end < fine.size]
         assert high - low < min(lengths) + 1e-9
+
+
+def test_a_channel_that_ends_early_or_is_constant_dates_no_jump():
+    trials, truth = ambiguous(3, events=(3.0, 6.0), levels=(0.0, 2.0, -1.0), noise=0.1)
+    more = {
+        "flat": np.full(trials[0].t.size, 3.0),
+        "ends": np.where(trials[0].t < 4, np.sin(1e3 * trials[0].t), np.nan),
+    }
+    both = [replace(t, channels=t.channels | more) for t in trials]
+    task = SequenceTask(("a", "b", "c"))
+    alone = [[s.start for s in found.spans] for found in segment_sequence(trials, task)]
+    with_them = [[s.start for s in found.spans] for found in segment_sequence(both, task)]
+    np.testing.assert_allclose(np.array(alone)[:, 1:], truth, atol=0.011)
+    np.testing.assert_allclose(np.array(with_them)[:, 1:], truth, atol=0.011)

@@ -49,10 +49,19 @@ def test_nothing_moves_more_often_than_stated():
     assert moved <= 10  # of 400, 1 % of runs; more than 10 once in 300
 
 
-def test_a_history_that_is_none_names_its_line(tmp_path):
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"date": 3}',
+        '"text"',
+        '{"date": "2026-01-01", "parameters": {"a": {"mean": "1"}}}',
+        '{"date": "2026-01-01", "parameters": {"a": {"mean": 1, "interval_90": 2}}}',
+    ],
+)
+def test_a_history_that_is_none_names_its_line(tmp_path, line):
     file = tmp_path / "h.jsonl"
     assert history(file) == []
-    file.write_text('{"date": "2026-01-01", "parameters": {}}\n{"date": 3}\n')
+    file.write_text('{"date": "2026-01-01", "parameters": {}}\n' + line)
     with pytest.raises(InputError, match="line 2: is no run of a history"):
         history(file)
 
