@@ -122,6 +122,7 @@ REFUSED = [
     (written(";", ",").replace("1234,5", "1234.5"),
      r"row 2, column f: 1234.5 has a decimal point, others have commas; expected one kind"),
     (written(";", ",").replace("1234,5", "1.234,5"), r"row 2, column f: 1.234,5 has a decimal point"),
+    (written(";", ",") + "0,6;abc;1,5\n", r"row 14, column x: abc is not a finite number"),
     (written(before=["# one", "# two"], comment_after=3).replace("0.2,", "0.2.1,", 1),
      r"row 9, column t: 0.2.1 is not a finite number"),
     (written() + '0.6,"1\n2",3\n', r"row 14: a quoted cell does not end; expected one line a row"),

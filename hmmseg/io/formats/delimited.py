@@ -67,6 +67,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     rows = layout.rows[kept] + 1
     if layout.decimal == ",":
         _no_points(columns, rows, str(path))
+        columns = {name: _with_points(values) for name, values in columns.items()}
     return Table(str(path), tuple(names), columns, rows, layout.units, notes=layout.notes)
 
 
@@ -84,6 +85,16 @@ def _no_points(columns: dict[str, np.ndarray], rows: np.ndarray, where: str) -> 
             if isinstance(cell, str) and "." in cell and NUMBER.fullmatch(cell.replace(",", "").strip()):
                 raise InputError(f"{where}: row {rows[i]}, column {name}",
                                  f"{cell} has a decimal point, others have commas", "one kind")  # fmt: skip
+
+
+def _with_points(values: np.ndarray) -> np.ndarray:
+    """Numbers with points, in columns where some cell is none: so that this cell is named, and not they."""
+    if values.dtype.kind != "O":
+        return values
+    commas = (isinstance(c, str) and COMMA_NUMBER.fullmatch(c.strip()) for c in values)
+    return np.array(
+        [c.replace(",", ".") if yes else c for c, yes in zip(values, commas, strict=True)], object
+    )
 
 
 def find_layout(path: Path) -> Layout:
