@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -90,10 +90,6 @@ bench-batch: $(INSTALLED)  ## a thousand trials from CSV to segments; fills docs
 
 bench-haptic: $(INSTALLED)  ## a minute of the virtual model at 4 kHz beside loops that do nothing (real-time priority: as root); fills docs/virtual_model.md
 	$(BIN)/python -m experiments.benchmarks.haptic_loop --seconds 60 --realtime
-	$(BIN)/python -m experiments.write_tables
-
-bench-long: $(INSTALLED)  ## time and memory over four decades of samples; fills docs/benchmarks.md
-	$(BIN)/python -m experiments.benchmarks.long_recordings $(or $(RECORDINGS),recordings/paper_blocks)
 	$(BIN)/python -m experiments.write_tables
 
 gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from experiments.table_text import load, markdown, percent
 
-LENGTHS = Path(__file__).parents[1] / "docs" / "figures" / "long_recordings.png"
 OTHERS = ("hmmlearn's kernel", "dynamax")
 
 
@@ -120,50 +117,6 @@ def haptic() -> str | None:
         f"steps: {rate['grown_bytes_in_10000_steps']} (the interpreter's own)."
     )
     return markdown(["loop", "median", "99.9 %", "worst", "late"], rows) + f"\n\n{told}"
-
-
-def lengths() -> str | None:
-    """docs/benchmarks.md: long recordings."""
-    found = load("benchmark_long")
-    if found is None:
-        return None
-    rows = [
-        [f"{row['rows']:,}", row["from"], f"{row['found']} of {row['rounds']}", _wall(row),
-         f"{row['processor']:.1f} s", f"{1e6 * row['processor'] / row['rows']:.1f} µs",
-         f"{row['memory_mb']:.0f} MB", {True: "yes", False: "NO", None: ""}[row.get("same_answer")]]
-        for row in found["lengths"]
-    ]  # fmt: skip
-    head = ["rows", "read from", "rounds found", "time", "processor", "a row", "peak memory",
-            "as in one piece"]  # fmt: skip
-    _draw_lengths(found["lengths"])
-    return markdown(head, rows)
-
-
-def _wall(row: dict) -> str:
-    """Time on the clock, with the load beside which it means little."""
-    busy = row.get("load", 0.0) > row.get("cores", 1)
-    return f"{row['wall']:.1f} s" + (f" (load {row['load']:.0f})" if busy else "")
-
-
-def _draw_lengths(rows: list[dict]) -> None:
-    """Time and peak memory against rows."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
-    for kind in dict.fromkeys(row["from"] for row in rows):
-        mine = [row for row in rows if row["from"] == kind]
-        for ax, key in zip(axes, ("processor", "memory_mb"), strict=True):
-            ax.loglog([r["rows"] for r in mine], [r[key] for r in mine], "o-", ms=3.5, lw=1, label=kind)
-    for ax, label in zip(axes, ("processor time [s]", "peak memory of the process [MB]"), strict=True):
-        ax.set_xlabel("rows")
-        ax.set_ylabel(label)
-        ax.grid(lw=0.3, which="both")
-    axes[0].legend(fontsize=8)
-    figure.savefig(LENGTHS, dpi=110)
-    plt.close(figure)
 
 
 def watch() -> str | None:

@@ -114,7 +114,6 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
     ("docs/benchmarks.md", "batch", table_speed.batch, "bench-batch"),
     ("docs/virtual_model.md", "haptic", table_speed.haptic, "bench-haptic"),
-    ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
     ("docs/robots_results.md", "minute", table_robots.minute, "bench-robot"),
     ("docs/robots_results.md", "robots_check_given", table_robots.given, "robots-given"),
