@@ -39,7 +39,6 @@ def rows_of(folder: Path, rig: str, pooled: int | None, seed: int = 0) -> Iterat
         found = identify(list(case.trials[group]), case.task, hand, seed)
         same = {
             "case": case.name, "effect": label, "start": start, "trials": size,
-            "sampler": None if found.sampled is None else found.sampled.method,
             "warnings": list(found.warnings), **_boundaries(found.segmentations, case.truth[group]),
         }  # fmt: skip
         for obj, known in case.blocks.items():
