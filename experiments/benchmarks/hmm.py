@@ -112,8 +112,10 @@ def many(num: int) -> Functions:
         into[: len(x)] = x
     together = jnp.asarray(padded)
     batch = jax.jit(jax.vmap(lambda x, n: hmm.viterbi(x, chain, n).starts))
-    functions: Functions = {INSIDE: lambda: np.asarray(batch(together, lengths)),
-                            CALLED: lambda: hmm.viterbi(tables, chain).starts}  # fmt: skip
+    functions: Functions = {
+        INSIDE: lambda: np.asarray(batch(together, lengths)),
+        CALLED: lambda: np.stack([hmm.viterbi(x, chain).starts for x in tables]),
+    }
     try:
         from hmmlearn import _hmmc
 
