@@ -48,6 +48,10 @@ SPECIAL: dict[str, tuple[Off, ...]] = {
     "disagreement of force and place": (("hmmseg.segmentation.changes._discrepancy", lambda *a: 0.0),),
     "slopes within grips": (("estimation.observations.slopes_within", lambda *a: {}),),
     "landing": (("estimation.observations.landing", lambda *a: None),),
+    "several motions in a landing": (("hmmseg.segmentation.changes.Penetration.restless", lambda *a: 0.0),),
+    "forces that lead or lag a little": (
+        ("hmmseg.segmentation.posteriors.Contacts._timely", lambda contacts, c, making: c),
+    ),
 }
 
 

@@ -215,18 +215,6 @@ def test_the_sample_before_tells_the_motion_that_a_touch_ends():
     assert error < 0.97 * without
 
 
-def test_fingers_that_come_each_by_itself():
-    rng = np.random.default_rng(6)
-
-    def apart():
-        (one, (a,)), (two, (b,)) = touches(rng, WIDTH), touches(rng, WIDTH)
-        return max(one, two), [a, b]
-
-    (covered, error), (_, without) = _dated(apart)
-    assert 0.84 < covered < 0.98, covered
-    assert error < 0.95 * without
-
-
 @pytest.mark.parametrize("case", [smooth_case, impact_case], ids=["smooth", "impact"])
 def test_ninety_percent_intervals_cover(case):
     share = coverage(case, np.random.default_rng(3))
