@@ -23,8 +23,10 @@ from hmmseg_cli.rows import Rows
 from simgap.world.operator import OperatorSettings, read_operator
 from simgap.world.properties import read_properties
 
-SOME = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-MANY = settings(SOME, max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "3000")))
+SOME = settings(
+    max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "60")), deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)  # fmt: skip
 CARTESIAN = ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
 CELLS = st.one_of(
     st.floats().map(repr), st.integers().map(str),
@@ -68,7 +70,9 @@ def tables(draw):
     return "\n".join(separator.join(row) for row in [names, *rows])
 
 
-def check_csv(folder, text):
+@SOME
+@given(text=tables())
+def test_tables(folder, text):
     path = folder / "made.csv"
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
     trial = one_line(read_trial, path, parse_rig({}))
@@ -81,12 +85,24 @@ KEYS = ("rate", "gravity", "fingertip", "noise", "systematic", "tolerance", "col
         "fingers", "effects", "objects", "moves", "repeat", "sequence", "channels", "optional")  # fmt: skip
 
 
-def check_toml(table):
+@SOME
+@given(table=st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5))
+def test_descriptions(table):
     for parse in (parse_rig, parse_task):
         one_line(parse, table)
 
 
-def check_json(folder, document):
+SETTINGS = st.sampled_from(sorted(OperatorSettings.__dataclass_fields__))
+DOCUMENTS = st.one_of(
+    VALUES,
+    st.dictionaries(SETTINGS, VALUES, max_size=3),
+    st.fixed_dictionaries({"properties": st.fixed_dictionaries({"a": VALUES})}),
+)
+
+
+@SOME
+@given(document=DOCUMENTS)
+def test_documents(folder, document):
     path = folder / "made.json"
     path.write_text(json.dumps(document))
     blocks = one_line(read_properties, path, parse_task({"objects": {"a": {"on": "ground"}}, "moves": [
@@ -105,7 +121,9 @@ LINES = st.lists(
 )  # fmt: skip
 
 
-def check_stream(lines):
+@settings(SOME, max_examples=25)
+@given(lines=LINES)
+def test_streams(lines):
     """Rows in any order, some of them anything: every row is answered or refused, and answers are JSON."""
     text = [STREAM[0]]
     for line in lines:
@@ -162,37 +180,6 @@ def check_model(folder, model, edits):
 
 
 EDITS = st.lists(st.tuples(st.integers(0, 40), st.one_of(st.none(), ARRAYS)), min_size=1, max_size=3)
-TABLES = st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5)
-SETTINGS = st.sampled_from(sorted(OperatorSettings.__dataclass_fields__))
-DOCUMENTS = st.one_of(
-    VALUES,
-    st.dictionaries(SETTINGS, VALUES, max_size=3),
-    st.fixed_dictionaries({"properties": st.fixed_dictionaries({"a": VALUES})}),
-)
-
-
-@SOME
-@given(text=tables())
-def test_tables(folder, text):
-    check_csv(folder, text)
-
-
-@SOME
-@given(table=TABLES)
-def test_descriptions(table):
-    check_toml(table)
-
-
-@SOME
-@given(document=DOCUMENTS)
-def test_documents(folder, document):
-    check_json(folder, document)
-
-
-@settings(SOME, max_examples=25)
-@given(lines=LINES)
-def test_streams(lines):
-    check_stream(lines)
 
 
 @SOME
@@ -205,14 +192,3 @@ def test_models(folder, model, edits):
 def test_a_model_with_any_one_number_impossible(folder, model, value):
     for k in range(len(model[1])):
         check_model(folder, model, [(k, value)])
-
-
-@pytest.mark.slow
-@MANY
-@given(text=tables(), table=TABLES, document=DOCUMENTS, lines=LINES, edits=EDITS)
-def test_many(folder, model, text, table, document, lines, edits):
-    check_csv(folder, text)
-    check_toml(table)
-    check_json(folder, document)
-    check_stream(lines)
-    check_model(folder, model, edits)
