@@ -1,7 +1,5 @@
 """docs/architecture.md and what other pages say of files are true of the code."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Imports between the packages run only downwards."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -23,11 +23,6 @@ def test_single_heights_come_first_and_are_taken_out_of_the_rest():
     assert simplest_combinations(rises, NAMES) == [{"c": 1}, {"a": 1, "b": 1}]
 
 
-def test_nothing_recorded_determines_nothing():
-    assert simplest_combinations([], NAMES) == []
-    assert simplest_combinations([{}], NAMES) == []
-
-
 def test_coefficients_are_coprime_with_the_first_positive():
     assert simplest_combinations([{"a": -2, "b": -4}], NAMES) == [{"a": 1, "b": 2}]
 

@@ -9,12 +9,10 @@ import pytest
 
 from estimation.paper_formulas import Estimate, FrictionBound, estimate_plugin
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, subtasks
-from hmmseg.hand.read import read_trial
-from hmmseg.hand.signals import Signals, task_space
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import BlockTask, Move, read_task
+from hmmseg.hand.signals import Signals
+from hmmseg.io.task import BlockTask, Move
 from hmmseg.segmentation.spans import Segmentation, Span
-from hmmseg.segmentation.thresholds import StateLabels, segment_qualitative
+from hmmseg.segmentation.thresholds import StateLabels
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
@@ -77,13 +75,6 @@ def test_exact_signals_give_the_planted_properties(task, rests):
         bound = out.properties[name]["friction"]
         assert isinstance(bound, FrictionBound) and bound.lower_bound == pytest.approx(0.3)  # 0.6 / 2
     assert out.reasons == {}
-
-
-def test_height_comes_from_the_other_block():
-    signals, segmentation = make(STACK, RESTS["stack"])
-    out = estimate_plugin([signals], [segmentation], STACK)
-    assert out.properties["block2"]["height"].subtasks == ("pickup block1", "place block1")
-    assert out.properties["block1"]["height"].subtasks == ("pickup block2", "place block2")
 
 
 def test_trim_leaves_out_five_percent_at_either_end():
@@ -150,21 +141,3 @@ def test_heights_that_only_sums_reveal_are_not_guessed():
     out = estimate_plugin([signals], [segmentation], reversal)
     assert [out.properties[name]["height"] for name in "abc"] == [None] * 3
     assert "together with the height of c" in out.reasons["b.height"]
-
-
-def test_the_paper_s_blocks_within_the_paper_s_own_accuracy(shared):
-    folder = shared / "recordings/paper_blocks"
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    trials = [read_trial(file, rig) for file in sorted(folder.glob("trial_*.csv"))]
-    signals = [task_space(trial, rig) for trial in trials]
-    spans = [segment_qualitative(trial, s, task) for trial, s in zip(trials, signals, strict=True)]
-    out = estimate_plugin(signals, spans, task)
-    for name in ("block1", "block2"):
-        for key, planted, within in (
-            ("weight", WEIGHT, 0.03),
-            ("width", WIDTH, 0.1),  # the pads give
-            ("height", HEIGHT, 0.1),
-        ):
-            estimate = out.properties[name][key]
-            assert estimate.mean == pytest.approx(planted[name], rel=within)
-            assert estimate.sd > 0

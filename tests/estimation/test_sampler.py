@@ -131,12 +131,6 @@ def test_the_same_seed_draws_the_same(post, draws):
     assert not np.array_equal(other.chain[:, :10], draws.chain[:, :10])
 
 
-def test_progress_is_told(post):
-    told = []
-    sample(post, 0, lambda steps, of: told.append((steps, of)))
-    assert [s for s, _ in told] == sorted(s for s, _ in told) and told[0][0] > 0
-
-
 def test_density_of_the_proposal_integrates_to_one(post, mode):
     """The mean of p / q over q's draws, p a Gaussian narrower than q, is 1."""
     found = proposal(post, mode)

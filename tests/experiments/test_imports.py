@@ -1,7 +1,5 @@
 """Names that scripts import, inside functions too, are there: no type checker reads the experiments."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """The real-data cases of the diagnosis: readers refuse, published results hold what they say."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

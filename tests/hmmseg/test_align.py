@@ -10,11 +10,8 @@ import pytest
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, scene, simulated_cases, trials_of
 from hmmseg.io.rig import Fingertip, Noise, Rig
-from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align, segment
-from simgap.world.properties import random_properties
-from simgap.world.simulate import simulate_trials
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 NEAR = 0.05  # s
@@ -108,15 +105,6 @@ def test_pooling_shares_parameters_and_keeps_trials_apart():
         ends = [[s.end for s in x.segmentation.spans] for x in (a, b)]
         np.testing.assert_allclose(*ends, atol=1e-4)
         assert a.segmentation.log_evidence == pytest.approx(b.segmentation.log_evidence, abs=0.5)
-
-
-def test_one_object_picked_and_placed():
-    rig, _ = scene()
-    task = BlockTask({"block": "ground"}, (Move("block", "ground"),))
-    s = simulate_trials(task, rig, [random_properties(task, 20_960)], [20_960])[0]
-    segmentation = segment([s.trial], task, rig)[0]
-    starts = np.array([span.start for span in segmentation.spans[1:]])
-    assert np.abs(starts - s.boundaries).max() < NEAR
 
 
 def test_the_later_of_two_touches_is_dated_wherever_the_first_has_pushed_the_block():

@@ -113,12 +113,6 @@ def test_combine_weighs_intervals_and_keeps_their_shapes():
     assert posterior.sd == pytest.approx(np.sqrt(variance), rel=0.01)
 
 
-def test_combined_posteriors_stay_inside_the_recording():
-    t = np.array([0.0, 1e-3, 2e-3])
-    posterior = combine(t, np.array([1.0, 0.0]), {})
-    assert posterior.times.min() >= 0.0 and posterior.times.max() <= 2e-3
-
-
 def coverage(draw, rng, num=600):
     """Share of true roots inside the central 90 % interval, roots drawn by `draw(rng)`."""
     inside = 0

@@ -1,7 +1,5 @@
 """A cache is a convenience: what is damaged, foreign or nowhere to be written counts as nothing."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

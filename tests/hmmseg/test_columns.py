@@ -1,7 +1,5 @@
 """Columns of other labs: the mapping against values planted in SI, and every mapping refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import polars as pl

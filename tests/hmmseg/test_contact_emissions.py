@@ -21,7 +21,6 @@ from hmmseg.segmentation.emissions import (
     Parameters,
     _log_ungripped,
     log_likelihoods,
-    log_student,
 )
 
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
@@ -81,11 +80,6 @@ def own_sample(state: str, num: int, rng) -> Features:
         vx=still[0] if state == ON_GROUND else moving, vy=moving if above else still[1],
         y=rng.uniform(0.015, 0.06, num) if above else 0.01 + fy * 2e-4 + 1e-4 * rng.normal(size=num),
     )  # fmt: skip
-
-
-def test_student_is_scipys_t():
-    x = np.linspace(-3, 3, 13)
-    np.testing.assert_allclose(log_student(x, 0.3), stats.t.logpdf(x, TAIL, scale=0.3), rtol=1e-12)
 
 
 def test_soft_uniform_is_a_density():

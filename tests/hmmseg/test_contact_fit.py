@@ -7,8 +7,6 @@ import pytest
 from contact_scene import LEVELS, PLANTED, STEPS, planted
 from scipy import optimize, stats
 
-from hmmseg.hmm import learn
-from hmmseg.hmm.chain import InfeasibleAlignment
 from hmmseg.levels import TAIL
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.fit import (
@@ -103,43 +101,6 @@ def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
 
     monkeypatch.setattr(contact_fit, "initial_parameters", start)
     check_recovery(fit([f for f, _ in trials], STEPS), trials)
-
-
-def test_evidence_does_not_decrease(monkeypatch):
-    """ECM with 5 inner steps a parameter, floors and weak pulls: small steps back are allowed."""
-    seen = []
-    expectation = learn.expectation
-
-    def recorded(*arguments):
-        alignments = expectation(*arguments)
-        seen.append(sum(a.log_evidence for a in alignments))
-        return alignments
-
-    monkeypatch.setattr(learn, "expectation", recorded)
-    fit([planted(seed)[0] for seed in range(2)], STEPS)
-    # The second pass scores widths and levels for the first time, against narrower densities.
-    gains = np.diff(seen[1:])
-    assert seen[-1] > seen[0] + 100
-    assert gains.min() > -2.0, gains
-
-
-def test_missing_samples_and_channels_do_not_stop_the_fit():
-    rng = np.random.default_rng(5)
-    f, labels = planted(4)
-    lost = rng.uniform(size=f.force.shape) < 0.15
-    holes = {name: np.where(rng.uniform(size=f.t.size) < 0.15, np.nan, getattr(f, name))
-             for name in ("vx", "vy", "ay", "y", "d")}  # fmt: skip
-    found = fit([replace(f, force=np.where(lost, np.nan, f.force), **holes)], STEPS)
-    path = found.posteriors[0].smoothed.argmax(axis=1)
-    assert np.mean(path == labels) > 0.95
-
-
-def test_a_trial_too_short_for_its_task_is_refused():
-    f, _ = planted(6)
-    short = {name: getattr(f, name)[:5] for name in
-             ("t", "force", "vx", "vy", "ay", "y", "d", "sd_y", "sd_d", "sd_vx", "sd_vy")}  # fmt: skip
-    with pytest.raises(InfeasibleAlignment):
-        fit([replace(f, **short)], STEPS)
 
 
 def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():

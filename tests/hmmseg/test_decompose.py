@@ -1,7 +1,5 @@
 """Decomposition against the paper's equation 1 and Table 1, and against numerical null spaces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import null_space
 
 from hmmseg.contact.decompose import VARYING_LOAD, Decomposition, decompose, height_equations, subtasks
-from hmmseg.io.task import GROUND, BlockTask, Move, SequenceTask
+from hmmseg.io.task import GROUND, BlockTask, Move
 
 PAPER = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
 TOWER = BlockTask(
@@ -145,19 +143,6 @@ def test_repeats():
     unknown = decompose(BlockTask({"a": GROUND, "b": GROUND}, moves, repeat="unknown"))
     assert len(unknown.subtasks) == 9
     assert unknown.notes == ("the moves repeat as often as the recording shows; one round is decomposed",)
-
-
-def test_plain_ordered_task():
-    found = decompose(SequenceTask(("approach", "mating")))
-    assert [(s.name, s.object, s.state, s.move) for s in found.subtasks] == [
-        ("approach", None, "approach", None), ("mating", None, "mating", None)]  # fmt: skip
-    assert found.properties == {}
-    assert found.minimal() == found.subtasks
-
-
-def test_minimal_sequence():
-    found = decompose(PAPER)
-    assert found.minimal() == found.subtasks
 
 
 @st.composite

@@ -1,7 +1,5 @@
 """Text tables as labs write them, against the same numbers; and those refused with their line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The EM driver against enumeration of all alignments and a grid over the one free parameter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

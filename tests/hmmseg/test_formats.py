@@ -1,7 +1,5 @@
 """Every kind of file against the recording planted in it; files cut, mislabelled or of no kind."""
 
-from __future__ import annotations
-
 import sqlite3
 import sys
 

@@ -1,7 +1,5 @@
 """What balances determine, against a forward model and numerical null spaces."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

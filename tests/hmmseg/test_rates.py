@@ -1,7 +1,5 @@
 """Velocities that are late differences of positions: found, replaced, and taken from the right side."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

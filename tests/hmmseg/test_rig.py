@@ -1,7 +1,5 @@
 """The nominal hand: what is read, and every rig that is refused, with its message."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -11,16 +9,6 @@ from hmmseg.io.rig import Rig, parse_rig, read_rig
 
 FINGER = {"base": [0.05, 0.17], "links": [0.12, 0.12]}
 HAND = {"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.21, 0.17]}}}
-
-
-def test_reads_the_papers_hand(shared):
-    rig = read_rig(shared / "recordings/paper_blocks/rig.toml")
-    assert rig.jointed
-    assert rig.rate == 20.0
-    assert rig.finger(2).base == (0.21, 0.17)
-    assert rig.fingertip.normal_stiffness == 4000.0
-    assert (rig.noise.angle, rig.noise.velocity, rig.noise.force) == (0.0002, 0.03, 0.012)
-    assert rig.systematic.force_bias == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_what_is_left_out_has_its_default():

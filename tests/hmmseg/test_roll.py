@@ -1,7 +1,5 @@
 """Hands that roll: against planted angles, in every stage that reads a recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Task space of a hand: kinematics and noise, against numerical derivatives and samples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -24,23 +22,6 @@ def cartesian(samples=12) -> pd.DataFrame:
     return pd.DataFrame(
         {"t": np.arange(samples) * 0.05} | dict(zip(CARTESIAN_CHANNELS, values.T, strict=True))
     )
-
-
-def test_kinematics_agree_with_a_numerical_derivative():
-    t = np.arange(4001) * 1e-4
-    frame = pd.DataFrame({"t": t})
-    for k, (finger, joint) in enumerate([(1, 1), (1, 2), (2, 1), (2, 2)]):
-        frame[f"q{finger}{joint}"] = 0.3 * k + np.sin(3 * t + k)
-        frame[f"dq{finger}{joint}"] = 3 * np.cos(3 * t + k)
-    for name in ("fx1", "fy1", "fx2", "fy2"):
-        frame[name] = 0.1
-    signals = task_space(read_trial(frame, JOINTED), JOINTED)
-    q11, q12 = frame["q11"].to_numpy(), frame["q12"].to_numpy()
-    np.testing.assert_allclose(signals.x1, 0.05 + 0.12 * np.cos(q11) + 0.11 * np.cos(q12), rtol=1e-12)
-    np.testing.assert_allclose(signals.y1, 0.17 + 0.12 * np.sin(q11) + 0.11 * np.sin(q12), rtol=1e-12)
-    for axis in ("x1", "y1", "x2", "y2", "x", "y"):
-        speed = np.gradient(getattr(signals, axis), t)[1:-1]
-        np.testing.assert_allclose(getattr(signals, f"v{axis}")[1:-1], speed, atol=1e-7)
 
 
 def test_noise_of_a_position_agrees_with_samples():

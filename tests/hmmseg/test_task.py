@@ -1,7 +1,5 @@
 """Task descriptions: what is read, and every description that is refused, with its message."""
 
-from __future__ import annotations
-
 import pytest
 
 from hmmseg.errors import InputError
@@ -41,11 +39,6 @@ def test_reads_a_plain_sequence():
     table = {"sequence": ["a", "b", "a"], "channels": ["fx"], "optional": ["b"]}
     assert parse_task(table) == SequenceTask(("a", "b", "a"), ("fx",), ("b",))
     assert parse_task({"sequence": ["a"]}) == SequenceTask(("a",))
-
-
-def test_the_stack_of_the_paper_is_accepted(shared):
-    task = read_task(shared / "recordings/paper_blocks/task.toml")
-    assert task == parse_task({"objects": STACK, "moves": SWAP})
 
 
 def blocks(objects=STACK, moves=SWAP, **more):
@@ -121,13 +114,6 @@ def test_refused_with_its_message(table, message):
     with pytest.raises(InputError, match=f"^{message}") as caught:
         parse_task(table)
     assert "\n" not in str(caught.value)
-
-
-def test_unknown_repeats_may_go_on_as_long_as_the_moves_do():
-    task = parse_task({"objects": {"a": {"on": "ground"}, "b": {"on": "ground"}}, "moves": BACK,
-                       "repeat": "unknown"})  # fmt: skip
-    assert isinstance(task, BlockTask)
-    assert task.repeat == "unknown"
 
 
 def test_a_file_that_is_absent_or_malformed(tmp_path):

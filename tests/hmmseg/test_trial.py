@@ -1,7 +1,5 @@
 """Reading trials of every kind, every trial refused with its message, and task-space signals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS
 
@@ -226,13 +224,3 @@ def test_files_refused(tmp_path):
         InputError, match=r"one\.npz: holds one array without a name; expected one array a column"
     ):
         read_trial(tmp_path / "one.npz", JOINTED)
-
-
-def test_recordings_are_read(shared):
-    for case in sorted((shared / "recordings").iterdir()):
-        if case.is_dir():
-            rig = read_rig(case / "rig.toml")
-            for path in sorted(case.glob("trial_*.csv")):
-                signals = task_space(read_trial(path, rig), rig)
-                assert np.isfinite(signals.fy).all()
-                assert 0.0 < np.median(signals.distance) < 0.08

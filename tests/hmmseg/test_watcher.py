@@ -14,7 +14,7 @@ from hmmseg.io.task import Task
 from hmmseg.io.trial import Trial
 from hmmseg.online import hypothesis as one
 from hmmseg.online.hypotheses import Table, absorb
-from hmmseg.online.hypothesis import HYPOTHESIS, RANGES, READING, SLOPE, WINDOW
+from hmmseg.online.hypothesis import HYPOTHESIS, RANGES, READING
 from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, features, log_likelihoods
@@ -216,10 +216,6 @@ def test_memory_and_hypotheses_do_not_grow():
         sizes.append((len(watcher.filter.rows), watcher.filter._state.count))
     assert len({rows for rows, _ in sizes[1:]}) == 1
     assert max(count for _, count in sizes) < 100
-
-
-def test_windows_are_those_off_line():
-    assert (WINDOW, SLOPE) == (6e-3, 1 / 40)
 
 
 def test_what_cannot_be_watched_is_refused():

@@ -86,27 +86,6 @@ def test_a_gripper_that_only_pauses_has_gripped_nothing(performed):
     assert watcher.crossings[0].t > 1.9
 
 
-def test_late_rows_are_put_in_their_place(performed, watched):
-    _, columns = performed
-    order = np.arange(columns["t"].size)
-    order[[100, 101]] = order[[101, 100]]
-    order = np.insert(order, 50, 49)
-    mixed = {name: c[order] for name, c in columns.items()}
-    watcher, lines, final = follow(mixed, wrist_rig(SETUP))
-    assert watcher.counts["late"] == 1 and watcher.counts["repeated"] == 1
-    assert sum("note" in line for line in lines) == 2
-    for span, straight in zip(final["segments"], watched[2]["segments"], strict=True):
-        assert span["start"] == pytest.approx(straight["start"], abs=0.01)
-
-
-def test_missing_samples_are_bridged_or_left_out(performed):
-    _, columns = performed
-    holed = columns | {name: columns[name].copy() for name in ("gap", "pz", "Fz")}
-    for name in ("gap", "pz", "Fz"):
-        holed[name][60:62] = np.nan
-    assert follow(holed, wrist_rig(SETUP))[2]["fits"]
-
-
 def test_a_drifting_sensor_is_told_as_an_uncertain_weight(performed):
     simulated, _ = performed
     setup = Setup(rate=20.0, drift=0.02)
@@ -114,20 +93,6 @@ def test_a_drifting_sensor_is_told_as_an_uncertain_weight(performed):
     for obj, block in BLOCKS.items():
         found = final["properties"][obj]["weight"]
         assert abs(found["mean"] - block.weight) < 3 * found["sd"]
-
-
-@pytest.mark.parametrize(
-    ("said", "change", "line"),
-    [
-        ({}, {"Fx": 0, "Fy": 0, "Fz": 0}, "do not show the hand's own mass in free motion"),
-        ({"reaction": False, "sensor_axes": ["y", "x", "-z"]}, {}, "reaction = true under"),
-    ],
-)
-def test_what_cannot_be_is_told_in_one_line(performed, said, change, line):
-    _, columns = performed
-    columns = columns | {name: columns[name] * factor for name, factor in change.items()}
-    with pytest.raises(InputError, match=line):
-        follow(columns, wrist_rig(SETUP, **said))
 
 
 def test_a_first_grip_without_free_motion_is_told(performed):

@@ -1,7 +1,5 @@
 """Labelled copies: every sample's subtask by hand, read back with the field's own libraries."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """`hmmseg decompose`: its JSON, its table and the paper's equation 1 as text."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

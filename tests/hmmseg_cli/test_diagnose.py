@@ -1,12 +1,8 @@
 """`hmmseg diagnose` and `hmmseg effects`: documents, refusals, figures and the page."""
 
-from __future__ import annotations
-
 import io
 import json
-import re
 
-import pytest
 from rich.console import Console
 
 from hmmseg_cli.diagnose import tables
@@ -23,37 +19,6 @@ def test_effects_are_listed_with_priors(tmp_path, capsys):
     assert "force_bias" in capsys.readouterr().out
 
 
-def test_an_unknown_effect_is_refused(shared, capsys):
-    folder = shared / "recordings/none_1"
-    args = [
-        "diagnose",
-        str(folder / "trial_01.csv"),
-        "--task",
-        str(folder / "task.toml"),
-        "--rig",
-        str(folder / "rig.toml"),
-        "--effect",
-        "force_bais",
-    ]
-    assert main(args) == 2
-    assert "force_bias" in capsys.readouterr().err
-
-
-def test_a_plain_task_is_refused(tmp_path, shared, capsys):
-    (tmp_path / "task.toml").write_text('sequence = ["approach", "mating"]\n')
-    folder = shared / "recordings/none_1"
-    args = [
-        "diagnose",
-        str(folder / "trial_01.csv"),
-        "--task",
-        str(tmp_path / "task.toml"),
-        "--rig",
-        str(folder / "rig.toml"),
-    ]
-    assert main(args) == 2
-    assert "virtual model" in capsys.readouterr().err
-
-
 def test_healthy_recordings_do_not_go_with_simulated_ones(shared, capsys):
     folder = shared / "recordings/none_1"
     one, two, three = (str(folder / f"trial_{k:02d}.csv") for k in (1, 2, 3))
@@ -61,49 +26,6 @@ def test_healthy_recordings_do_not_go_with_simulated_ones(shared, capsys):
             "--against", two, "--healthy", three]  # fmt: skip
     assert main(args) == 2
     assert "does not go with --against" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "verdict", "cause"),
-    [
-        ("none_1", "none", []),
-        ("cable_force_1", "named", ["cable_force"]),
-        ("force_lag_1", "named", ["force_lag"]),
-    ],
-)
-def test_recordings_are_diagnosed(shared, tmp_path, case, verdict, cause):
-    folder = shared / "recordings" / case
-    trials = sorted(str(p) for p in folder.glob("trial_*.csv"))[:3]
-    args = [
-        "diagnose",
-        *trials,
-        "--task",
-        str(folder / "task.toml"),
-        "--rig",
-        str(folder / "rig.toml"),
-        "--json",
-        str(tmp_path / "d.json"),
-        "--figures",
-        str(tmp_path / "figures"),
-        "--report",
-        str(tmp_path / "page.html"),
-        "--quiet",
-    ]
-    assert main(args) == 0
-    document = json.loads((tmp_path / "d.json").read_text())
-    assert document["verdict"] == verdict
-    assert document["causes"] == cause
-    assert sum(document["probabilities"].values()) == pytest.approx(1.0)
-    assert all(
-        (tmp_path / "figures" / name).stat().st_size > 5000 for name in ("gap_where.png", "gap_signal.png")
-    )
-    page = (tmp_path / "page.html").read_text()
-    assert 'id="verdict"' in page
-    assert not re.search(r"(src|href)=\"(?!data:)", page)  # nothing is fetched from anywhere
-    if cause:
-        assert document["shrinkage"]["fraction"] > 0.9
-        assert document["where"]
 
 
 def test_the_next_experiment_says_what_it_promises():

@@ -1,7 +1,5 @@
 """`hmmseg diagnose --patch` writes what held-out trials bear out, and says where."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from types import SimpleNamespace as NS

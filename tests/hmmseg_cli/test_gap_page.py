@@ -1,7 +1,5 @@
 """The page of a diagnosis, opened in a real browser (skipped where none is installed)."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 

@@ -1,7 +1,5 @@
 """`hmmseg inspect` and `hmmseg new`: what is found, proposed, laid out; every refusal with its line."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,11 +1,6 @@
 """The way of somebody with another lab's files: inspect, write the mapping, read what was recorded."""
 
-from __future__ import annotations
-
-import json
-
 import numpy as np
-import pandas as pd
 import pytest
 from fault_scene import CARTESIAN
 from file_writers import lerobot_of, robomimic_of
@@ -19,8 +14,6 @@ from hmmseg_cli.main import main
 
 FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
 RATE = 20
-ONE_MOVE = b'[objects.a]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n'
-GRIPPER = '[gripper]\nposition = {y = "ee_y", z = "ee_z"}\nopening = "width"\nwrench = ["Fx", "Fy", "Fz"]\n'
 SIDES = {"1": "links", "2": "rechts"}
 FINGER_NAMES = {
     name: (f"Finger_{SIDES[name[1]]}_{name[0]}_mm", 1e3) if len(name) == 2
@@ -107,42 +100,3 @@ def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
         np.testing.assert_allclose(
             trial.channels[name], expected.channels[name], atol=1e-3 * (name[0] == "f") + 2e-5
         )
-
-
-@pytest.mark.parametrize("hand", ["fingers", "wrist"])
-def test_an_arms_log_gives_what_its_table_gives(tmp_path, shared, hand):
-    """inspect, identify and segment --write on MCAP logs of an arm, against the tables they were made of."""
-    folder = shared / "panda" / ("foam_restack_1" if hand == "fingers" else "wrist_restack_1")
-    stem, topics = ("trial", finger_topics) if hand == "fingers" else ("wrist", wrist_topics)
-    rig = tmp_path / "rig.toml"
-    rig.write_text("gravity = 9.81\n[fingertip]\nnormal_stiffness = 3735.0\nshear_stiffness = 2500.0\n")
-    plain = tmp_path / "plain.toml"
-    plain.write_text(rig.read_text() + GRIPPER * (hand == "wrist"))
-    tables, logs = [], []
-    for k in (1, 2):
-        frame = pd.read_csv(folder / f"{stem}_0{k}.csv")
-        frame = frame[[name for name in frame if name[0] != "v"]]
-        tables.append(tmp_path / f"{k}.csv")
-        frame.to_csv(tables[-1], index=False)
-        logs.append(mcap_of(tmp_path / f"{k}.mcap", topics({name: frame[name].to_numpy() for name in frame})))
-    assert main(["inspect", str(logs[0]), "--write", str(rig), "--quiet"]) == 0
-    found = []
-    for files, how, out in ((tables, plain, "a.json"), (logs, rig, "b.json")):
-        args = ["--task", str(folder / "task.toml"), "--rig", str(how), "--quiet"]
-        assert main(["identify", *map(str, files), *args, "--json", str(tmp_path / out)]) == 0
-        found.append(json.loads((tmp_path / out).read_text()))
-    truth = json.loads((folder / "truth.json").read_text())
-    for obj, expected in found[0]["properties"].items():
-        for prop in ("weight", "width", "height"):
-            same = expected[prop]["mean"], found[1]["properties"][obj][prop]["mean"]
-            assert same[1] == pytest.approx(same[0], abs=2.5 * expected[prop]["sd"])
-        assert same[1] == pytest.approx(truth[obj]["height"], rel=0.01)
-    for old, new in zip(found[0]["trials"], found[1]["trials"], strict=True):
-        start = pd.read_csv(tables[0])["t"].iloc[0]  # a log's zero is its first message
-        for a, b in zip(old["segments"], new["segments"], strict=True):
-            assert a["subtask"] == b["subtask"]
-            assert b["end"] == pytest.approx(a["end"] - start, abs=0.03)
-    assert main(["segment", str(logs[0]), "--task", str(folder / "task.toml"), "--rig", str(rig), "--quiet",
-                 "--write", str(tmp_path / "out.mcap")]) == 0  # fmt: skip
-    again = read_trial(tmp_path / "out.mcap", read_rig(rig))
-    np.testing.assert_array_equal(again.t, read_trial(logs[0], read_rig(rig)).t)

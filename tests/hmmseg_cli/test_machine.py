@@ -3,8 +3,6 @@
 Always one line and exit 2 (or 130), or the whole result; never a traceback or half a file.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import io
