@@ -1,17 +1,30 @@
-"""Whole segmentations against the truth: recordings, and simulated trials under hard conditions."""
+"""Whole segmentations against the truth: hard conditions, repeated tasks, recordings that stay on disk."""
 
 import itertools
+import json
+import time
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from experiments.misfit_edits import join, let_go
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, scene, simulated_cases, trials_of
-from hmmseg.io.rig import Fingertip, Noise, Rig
+from hmmseg import example_folder
+from hmmseg.contact.decompose import subtasks
+from hmmseg.errors import InputError
+from hmmseg.hand import read as long
+from hmmseg.hand.read import LongRecording, read_trial
+from hmmseg.io.rig import Fingertip, Noise, Rig, read_rig
+from hmmseg.io.task import BlockTask, Move, Task
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.align import align, segment
+from hmmseg.segmentation.align import align, segment, segment_long
+from hmmseg.segmentation.rounds import round_tasks
+from hmmseg_cli.main import app
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 NEAR = 0.05  # s
@@ -37,10 +50,30 @@ def simulated(rate, trials=1, seed=20_950):
     return list(case.trials), [np.array(t) for t in case.truth], case.task, case.rig
 
 
-@pytest.mark.parametrize("name", ["none_1", "none_2"])
-def test_recordings_are_segmented_within_50_ms(name):
-    case = read_case(RECORDINGS / name)
-    found = residuals(list(case.trials[:2]), case.truth[:2], case.task, case.rig)
+def cartesian(case):
+    """The first trial of a case as a hand without joints and velocities has it."""
+    signals, names = case.signals[0], ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
+    noise = Noise(position=2.5e-5, velocity=4e-3, force=0.012)
+    trial = Trial("cartesian.csv", signals.t, {name: getattr(signals, name) for name in names})
+    return [trial], Rig(rate=20.0, fingertip=case.rig.fingertip, noise=noise)
+
+
+HANDS = {
+    "as stated": lambda case: (list(case.trials[:2]), case.rig),
+    "noise unstated": lambda case: (list(case.trials[:2]), case.rig.model_copy(update={"noise": Noise()})),
+    "rigid pads": lambda case: (
+        list(case.trials[:2]),
+        case.rig.model_copy(update={"fingertip": Fingertip()}),
+    ),
+    "Cartesian": cartesian,
+}
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_recordings_are_segmented_within_50_ms(hand):
+    case = read_case(RECORDINGS / "none_2")
+    trials, rig = HANDS[hand](case)
+    found = residuals(trials, case.truth[: len(trials)], case.task, rig)
     assert np.abs(found).max() < NEAR and np.median(np.abs(found)) < 0.015
 
 
@@ -67,32 +100,6 @@ def irregular(trial, rng, share=0.25):
 def test_missing_samples_and_irregular_times(change):
     trials, truth, task, rig = simulated(50.0)
     found = residuals([change(t, np.random.default_rng(0)) for t in trials], truth, task, rig)
-    assert np.abs(found).max() < NEAR
-
-
-def test_a_cartesian_hand_without_velocities():
-    case = read_case(RECORDINGS / "none_1")
-    signals = case.signals[0]
-    names = ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
-    trial = Trial("cartesian.csv", signals.t, {name: getattr(signals, name) for name in names})
-    rig = Rig(
-        rate=20.0, fingertip=case.rig.fingertip, noise=Noise(position=2.5e-5, velocity=4e-3, force=0.012)
-    )
-    found = residuals([trial], case.truth[:1], case.task, rig)
-    assert np.abs(found).max() < NEAR
-
-
-def test_noise_that_the_rig_does_not_state():
-    case = read_case(RECORDINGS / "none_2")
-    rig = case.rig.model_copy(update={"noise": Noise()})
-    found = residuals(list(case.trials[:2]), case.truth[:2], case.task, rig)
-    assert np.abs(found).max() < NEAR
-
-
-def test_pads_taken_as_rigid():
-    case = read_case(RECORDINGS / "none_2")
-    rig = case.rig.model_copy(update={"fingertip": Fingertip()})
-    found = residuals(list(case.trials[:2]), case.truth[:2], case.task, rig)
     assert np.abs(found).max() < NEAR
 
 
@@ -126,3 +133,203 @@ def test_at_high_rates_a_block_has_not_moved_yet_as_the_later_finger_touches():
         (found,) = segment([judged.trial], task, judged.rig)
         off += [span.start - t for span, t in zip(found.spans[1::4], judged.boundaries[::4], strict=False)]
     assert abs(np.median(off)) < 1e-3  # 1.6 ms early where it is taken to follow at once
+
+
+STACK = Path(__file__).parents[1] / "data" / "stack"
+RIG = read_rig(STACK / "rig.toml")
+TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
+TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
+PICK = BlockTask({"block1": "ground"}, (Move("block1", "ground"),), repeat="unknown")
+BACK = BlockTask({"a": "ground", "b": "ground"}, (Move("a", "ground"), Move("b", "ground")), repeat="unknown")
+BEFORE, AFTER = 0.6, 0.5  # s of free motion kept about a move
+
+
+def pieces(moves: tuple[int, ...], number: int, dropped: int | None = None):
+    """A session of `number` rounds, each the given moves of one of three trials, and its boundaries [s].
+
+    The block of the last move of round `dropped` (from 0) is let go in mid-air.
+    """
+    parts, truth, clock = [], [], 0.0
+    for r in range(number):
+        for m in moves:
+            trial, b = TRIALS[r % 3], TRUTH[r % 3]
+            part = join(trial, (b[4 * m] - BEFORE, b[4 * m + 3] + AFTER))
+            at = np.array(b[4 * m : 4 * m + 4]) - trial.t[trial.t >= b[4 * m] - BEFORE][0]
+            if r == dropped and m == moves[-1]:
+                quiet = Trial(part.file, part.t, part.channels)
+                part, at = let_go(quiet, at, (at[1] + at[2]) / 2, np.inf), at[:2]
+            parts.append(part)
+            truth.append(clock + at)
+            clock += part.t.size * 0.05
+    channels = {k: np.concatenate([p.channels[k] for p in parts]) for k in parts[0].channels}
+    t = 0.05 * np.arange(len(next(iter(channels.values()))))
+    return Trial("session.csv", t, channels), truth
+
+
+@cache
+def aligned_session(moves: tuple[int, ...], number: int, repeat, dropped: int | None = None):
+    session, truth = pieces(moves, number, dropped)
+    task = replace(PICK if len(moves) == 1 else BACK, repeat=repeat)
+    aligned = align([session], task, RIG)
+    return aligned, truth
+
+
+@pytest.mark.parametrize("repeat", ["unknown", 6])
+@pytest.mark.parametrize("moves", [(0,), (0, 1)])
+def test_every_round_is_aligned(moves, repeat):
+    aligned, truth = aligned_session(moves, 6, repeat)
+    found = aligned.trials[0].segmentation
+    assert found.complete and found.repetitions == 6 and aligned.task.repeat == 6
+    assert len(found.spans) == len(aligned.subtasks) == 1 + 4 * len(moves) * 6
+    assert [(s.subtask, s.object) for s in found.spans] == [(s.name, s.object) for s in aligned.subtasks]
+    starts = np.array([s.start for s in found.spans[1:]])
+    assert np.abs(starts - np.concatenate(truth)).max() < 0.05
+    assert len(aligned.trials[0].boundaries) == starts.size and aligned.trials[0].present.all()
+
+
+@pytest.mark.parametrize(
+    ("repeat", "number", "at"), [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56), (100, 100, 56)]
+)
+def test_a_drop_in_one_round_leaves_the_others(repeat, number, at):
+    aligned, truth = aligned_session((0,), number, repeat, dropped=at)
+    trial, steps = aligned.trials[0], aligned.subtasks
+    found = trial.segmentation
+    assert found.repetitions == number
+    (failure,) = found.failures
+    assert found.failed == failure and failure.repetition == at + 1
+    assert failure.index == 4 * at + 3 and "let go in mid-air" in failure.reason
+    assert str(failure).startswith(f"does not fit its task at place block1: repetition {at + 1}: ")
+    assert np.flatnonzero(~trial.present).tolist() == [4 * at + 3]
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert document["failed"]["repetition"] == at + 1 and len(document["failures"]) == 1
+    starts = np.array([b.quantile(0.5) for b in trial.boundaries])
+    others = [k for k in range(len(steps) - 1) if k // 4 != at]
+    known = np.concatenate([t for r, t in enumerate(truth) if r != at])
+    assert np.abs(starts[others] - known).max() < 0.05
+
+
+def test_a_block_gripped_again_makes_no_further_round():
+    """Ten rounds by the task, and one drop after which the block was gripped again."""
+    aligned, _ = aligned_session((0,), 11, 10, dropped=6)
+    found = aligned.trials[0].segmentation
+    assert [f.repetition for f in found.failures] == [7]
+    assert "let go in mid-air" in found.failures[0].reason and "gripped again" in found.failures[0].reason
+
+
+@pytest.mark.parametrize(("shown", "asked"), [(5, 6), (6, 5)])
+def test_too_few_or_too_many_rounds(shown, asked):
+    aligned, _ = aligned_session((0,), shown, asked)
+    found = aligned.trials[0].segmentation
+    assert found.repetitions == shown and found.failed is not None
+    assert found.failed.repetition == 6
+    words = "ends before it" if shown < asked else "goes on after the task's end with another grip at "
+    assert words in found.failed.reason
+
+
+def test_recordings_may_show_different_numbers_of_rounds():
+    sessions = [pieces((0,), n)[0] for n in (3, 5)]
+    aligned = align(sessions, PICK, RIG)
+    assert aligned.task.repeat == 5 and len(aligned.subtasks) == 21
+    assert [t.segmentation.repetitions for t in aligned.trials] == [3, 5]
+    assert [t.segmentation.complete for t in aligned.trials] == [True, True]
+    assert [int(t.present.sum()) for t in aligned.trials] == [13, 21]
+    assert [len(t.boundaries) for t in aligned.trials] == [20, 20]
+
+
+def test_rounds_start_where_the_last_one_left_the_blocks():
+    task = BlockTask({"a": "b", "b": "ground"}, (Move("a", "ground"),), repeat=3)
+    tasks = round_tasks(task, 3)
+    assert [t.initial["a"] for t in tasks] == ["b", "ground", "ground"]
+    assert [s.state for s in subtasks(tasks[1])] == [s.state for s in subtasks(tasks[0])]
+
+
+@pytest.mark.slow
+def test_hundreds_of_rounds_cost_no_more_each():
+    seconds = {}
+    for number in (40, 40, 320):  # the first compiles
+        session, _ = pieces((0,), number)
+        began = time.process_time()
+        aligned = align([session], PICK, RIG)
+        seconds[number] = (time.process_time() - began) / number
+        assert aligned.trials[0].segmentation.repetitions == number
+        assert aligned.trials[0].segmentation.complete
+    assert seconds[320] < 1.6 * seconds[40]
+
+
+ROUNDS = 3
+
+
+@pytest.fixture(scope="module")
+def repeated():
+    """A recording of the example, performed again and again, and its description."""
+    import dataclasses
+
+    folder = example_folder()
+    rig, task = Rig.read(folder / "rig.toml"), Task.read(folder / "task.toml")
+    trial = Trial.read(folder / "trial_01.csv", rig)
+    length = trial.t[-1] - trial.t[0] + np.median(np.diff(trial.t))
+    t = np.concatenate([trial.t + k * length for k in range(ROUNDS)])
+    columns = {"t": t} | {name: np.tile(values, ROUNDS) for name, values in trial.channels.items()}
+    return columns, dataclasses.replace(task, repeat="unknown"), rig
+
+
+def write(columns, path):
+    if path.suffix == ".npz":
+        (np.savez_compressed if "packed" in path.name else np.savez)(path, **columns)
+    else:
+        pytest.importorskip("pandas").DataFrame(columns).to_parquet(path, row_group_size=200)
+    return path
+
+
+@pytest.mark.parametrize("name", ["long.npz", "packed.npz", "long.parquet"])
+@pytest.mark.parametrize("piece", [53, 10_000])
+def test_the_same_answer_from_disk_as_from_memory(repeated, tmp_path, name, piece):
+    columns, task, rig = repeated
+    path = write(columns, tmp_path / name)
+    whole = segment([Trial.read(path, rig)], task, rig)[0]
+    assert whole.repetitions == ROUNDS
+    found = segment_long(LongRecording(path, rig, piece), task, rig)
+    assert found.spans == whole.spans
+    assert (found.repetitions, found.failures, found.log_evidence, found.rate) == (
+        whole.repetitions, whole.failures, whole.log_evidence, whole.rate
+    )  # fmt: skip
+
+
+def test_rows_are_those_of_the_file_in_any_order(repeated, tmp_path):
+    columns, _, rig = repeated
+    recording = LongRecording(write(columns, tmp_path / "long.npz"), rig, piece=40)
+    np.testing.assert_array_equal(recording.t, columns["t"])
+    for start, stop in ((0, 10), (35, 130), (120, 121), (30, 50), (len(recording.t) - 5, len(recording.t))):
+        trial = recording.rows(start, stop)
+        np.testing.assert_array_equal(trial.t, columns["t"][start:stop])
+        for channel, values in trial.channels.items():
+            np.testing.assert_array_equal(values, columns[channel][start:stop])
+
+
+def test_a_fault_far_into_a_long_recording_is_named_with_its_row(repeated, tmp_path):
+    columns, _, rig = repeated
+    back = columns | {"t": columns["t"].copy()}
+    back["t"][300] = back["t"][299]
+    with pytest.raises(InputError, match="row 301, column t"):
+        LongRecording(write(back, tmp_path / "back.npz"), rig, piece=300)
+    odd = columns | {"fx1": columns["fx1"].copy()}
+    odd["fx1"][310] = np.inf
+    with pytest.raises(InputError, match="row 311, column fx1"):
+        LongRecording(write(odd, tmp_path / "odd.npz"), rig, piece=100)
+
+
+def test_the_command_keeps_long_recordings_on_disk(repeated, tmp_path, monkeypatch):
+    columns, task, _ = repeated
+    path = write(columns, tmp_path / "long.npz")
+    monkeypatch.setattr("hmmseg_cli.segment.read_task", lambda _: task)
+    folder = example_folder()
+    command = ["segment", str(path), "--task", str(folder / "task.toml"), "--rig", str(folder / "rig.toml")]
+    documents = []
+    for rows in (10**9, 100):
+        monkeypatch.setattr(long, "LONG", rows)
+        out = tmp_path / f"{rows}.json"
+        result = CliRunner().invoke(app, [*command, "--json", str(out)])
+        assert result.exit_code == 0, result.output
+        documents.append(json.loads(out.read_text()))
+    assert documents[0]["trials"] == documents[1]["trials"]
+    assert documents[0]["trials"][0]["repetitions"] == ROUNDS

@@ -1,6 +1,8 @@
-"""Bad input: each gives its one line, and nothing is half-written."""
+"""Whatever a reader is given, it gives a result or one line, and nothing is half-written."""
 
 import io
+import json
+import math
 import os
 import pickle
 import zipfile
@@ -8,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from experiments.fuzz import run
 from hmmseg.errors import InputError
@@ -15,9 +19,13 @@ from hmmseg.example import example_folder
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import parse_task, read_task
-from hmmseg.sequence.model import load_model
+from hmmseg.io.trial import Trial
+from hmmseg.online.watcher import Watcher
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.model import load_model, save_model
 from hmmseg_cli.main import main
-from simgap.world.operator import read_operator
+from hmmseg_cli.rows import Rows
+from simgap.world.operator import OperatorSettings, read_operator
 from simgap.world.properties import read_properties
 
 TASK = parse_task({"objects": {"a": {"on": "ground"}}, "moves": [{"object": "a", "to": "ground"}]})
@@ -174,3 +182,174 @@ def test_a_hostile_archive_is_refused_and_runs_nothing(read, make, tmp_path, mon
     make(path)
     told(READERS[read], path)
     assert [each.name for each in tmp_path.iterdir()] == ["t.npz"]
+
+
+SOME = settings(
+    max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "60")), deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)  # fmt: skip
+CARTESIAN = ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
+CELLS = st.one_of(
+    st.floats().map(repr), st.integers().map(str),
+    st.sampled_from(["", " ", "nan", "-inf", "1,5", "0x1", "1e400", '"', "\x00", "٣", "9" * 400]),
+    st.text(max_size=6),
+)  # fmt: skip
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=12,
+)  # fmt: skip
+
+
+def one_line(call, *arguments):
+    """The result of a call, or None where it is refused in one line."""
+    try:
+        return call(*arguments)
+    except InputError as error:
+        line = str(error)
+        assert line and "\n" not in line and len(line) < 20_000
+        return None
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("hostile")
+
+
+@st.composite
+def tables(draw):
+    """A CSV of a Cartesian hand, a few of its cells, columns and separators anything."""
+    names = list(draw(st.permutations(("t", *CARTESIAN))))
+    rows = [[str(0.02 * k), *["0.1"] * len(CARTESIAN)] for k in range(draw(st.integers(0, 14)))]
+    for _ in range(draw(st.integers(0, 5))):
+        if rows:
+            row = draw(st.sampled_from(rows))
+            row[draw(st.integers(0, len(row) - 1))] = draw(CELLS)
+    if draw(st.booleans()):
+        names[draw(st.integers(0, len(names) - 1))] = draw(CELLS)
+    separator = draw(st.sampled_from([",", ";", "\t", ", "]))
+    return "\n".join(separator.join(row) for row in [names, *rows])
+
+
+@SOME
+@given(text=tables())
+def test_tables(folder, text):
+    path = folder / "made.csv"
+    path.write_text(text, encoding="utf-8", errors="surrogatepass")
+    trial = one_line(read_trial, path, parse_rig({}))
+    if trial is not None:
+        assert isinstance(trial, Trial) and (np.diff(trial.t) > 0).all()
+        assert all(c.shape == trial.t.shape and not np.isinf(c).any() for c in trial.channels.values())
+
+
+KEYS = ("rate", "gravity", "fingertip", "noise", "systematic", "tolerance", "columns", "topics", "gripper",
+        "fingers", "effects", "objects", "moves", "repeat", "sequence", "channels", "optional")  # fmt: skip
+
+
+@SOME
+@given(table=st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5))
+def test_descriptions(table):
+    for parse in (parse_rig, parse_task):
+        one_line(parse, table)
+
+
+SETTINGS = st.sampled_from(sorted(OperatorSettings.__dataclass_fields__))
+DOCUMENTS = st.one_of(
+    VALUES,
+    st.dictionaries(SETTINGS, VALUES, max_size=3),
+    st.fixed_dictionaries({"properties": st.fixed_dictionaries({"a": VALUES})}),
+)
+
+
+@SOME
+@given(document=DOCUMENTS)
+def test_documents(folder, document):
+    path = folder / "made.json"
+    path.write_text(json.dumps(document))
+    blocks = one_line(read_properties, path, parse_task({"objects": {"a": {"on": "ground"}}, "moves": [
+        {"object": "a", "to": "ground"}]}))  # fmt: skip
+    if blocks is not None:
+        assert all(math.isfinite(v) and v > 0 for v in (blocks["a"].weight, blocks["a"].width))
+    one_line(read_operator, path)
+
+
+LAB = example_folder()
+STREAM = (LAB / "trial_01.csv").read_bytes().splitlines()
+LINES = st.lists(
+    st.one_of(st.integers(1, 60).map(lambda k: STREAM[k]), st.binary(max_size=40),
+              st.tuples(st.integers(1, 60), st.integers(0, 12), CELLS)),
+    max_size=25,
+)  # fmt: skip
+
+
+@settings(SOME, max_examples=25)
+@given(lines=LINES)
+def test_streams(lines):
+    """Rows in any order, some of them anything: every row is answered or refused, and answers are JSON."""
+    text = [STREAM[0]]
+    for line in lines:
+        if isinstance(line, tuple):
+            cells = STREAM[line[0]].split(b",")
+            cells[line[1]] = line[2].encode("utf-8", "surrogatepass")
+            line = b",".join(cells)
+        text.append(line)
+    watcher = Watcher(read_task(LAB / "task.toml"), read_rig(LAB / "rig.toml"), 0.1)
+    rows = Rows(io.BytesIO(b"\n".join(text)), watcher)
+    for _ in range(len(text) + 50):  # bytes may hold line ends
+        row = one_line(rows.next)
+        if row is not None:
+            strict(watcher.update(*row).line())
+    if watcher.counts["rows"]:
+        strict(watcher.finish().line())
+
+
+def strict(line):
+    def refuse(constant):
+        raise AssertionError(f"{constant} in {line[:200]}")
+
+    return json.loads(line, parse_constant=refuse)
+
+
+@pytest.fixture(scope="module")
+def model(folder):
+    task = parse_task({"sequence": ["a", "b"], "channels": ["x"]})
+    t = np.arange(60) / 20
+    trial = read_trial({"t": t, "x": np.where(t < 1.5, 0.0, 1.0) + 0.01 * np.sin(9 * t)}, None, task)
+    path = folder / "model.npz"
+    save_model(fit_sequence([trial], task), path)
+    with np.load(path) as file:
+        return task, dict(file)
+
+
+ARRAYS = st.one_of(st.floats(), st.integers(-5, 5), st.text(max_size=4),
+                   st.lists(st.floats(), max_size=3), st.just(np.zeros((2, 0))))  # fmt: skip
+
+
+def check_model(folder, model, edits):
+    task, table = model
+    table = dict(table)
+    names = sorted(table)
+    for k, value in edits:
+        name = names[k % len(names)]
+        if value is None:
+            table.pop(name, None)
+        else:
+            table[name] = np.asarray(value)
+    path = folder / "edited.npz"
+    np.savez(path, **table)
+    one_line(load_model, path, task)
+
+
+EDITS = st.lists(st.tuples(st.integers(0, 40), st.one_of(st.none(), ARRAYS)), min_size=1, max_size=3)
+
+
+@SOME
+@given(edits=EDITS)
+def test_models(folder, model, edits):
+    check_model(folder, model, edits)
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e300])
+def test_a_model_with_any_one_number_impossible(folder, model, value):
+    for k in range(len(model[1])):
+        check_model(folder, model, [(k, value)])
