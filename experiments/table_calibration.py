@@ -84,7 +84,7 @@ def boundaries() -> str | None:
     rows = []
     for name, entry in found["rows"].items():
         every = entry["all"]
-        cells = [milliseconds(every[k]) for k in ("median", "percentile_95")]
+        cells = [f"{every[k]:.1f} ms" for k in ("median", "percentile_95")]  # saved in ms
         cells += [percent(every["coverage_90"], 0), f"{every['half_width']:.1f} ms"]
         rows.append([name, f"{entry['trials']} ({entry['misfits']})", *cells])
     head = ["world", "trials (misfits)", "median error", "95 % of errors below", "90 % cover", "half width"]
