@@ -13,10 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from experiments import (
-    ablation,
-    gap_arm,
     gap_drawn,
-    patch_heldout,
     table_calibration,
     table_gap,
     table_robots,
@@ -24,7 +21,7 @@ from experiments import (
     table_speed,
     wrist,
 )
-from experiments.table_real import real
+from experiments.real import hiro_snap
 from experiments.table_text import as_csv, covered, load, markdown, milliseconds, percent
 from hmmseg.contact.decompose import PROPERTIES
 
@@ -107,32 +104,18 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("README.md", "results", headline, "results"),
     ("docs/results.md", "results", results, "results"),
     ("docs/results.md", "rivals", rivals, "results"),
-    ("docs/results.md", "real", real, "real"),
+    ("docs/results.md", "real", hiro_snap.table, "real"),
     ("docs/tables/calibration.csv", "", table_calibration.calibration, "results"),
-    ("docs/tables/identified.csv", "", table_calibration.identified, "identified"),
-    ("docs/tables/identified_boundaries.csv", "", table_calibration.identified_boundaries, "identified"),
-    ("docs/tables/boundaries.csv", "", table_calibration.boundaries, "boundaries"),
-    ("docs/tables/boundaries_by_kind.csv", "", table_calibration.boundaries_by_kind, "boundaries"),
     ("docs/tables/worlds.csv", "", table_calibration.worlds, "calibrate"),
     ("docs/tables/sbc.csv", "", table_calibration.sbc, "calibrate"),
-    ("docs/tables/reference.csv", "", table_calibration.reference, "calibrate"),
-    ("docs/tables/moves.csv", "", table_calibration.moves, "results"),
     ("docs/results.md", "gap", table_gap.summary, "gap-results"),
     ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
-    ("docs/gap_results.md", "patch", patch_heldout.table, "gap-results"),
     ("docs/gap_results.md", "drawn", gap_drawn.table, "gap-drawn"),
     ("docs/gap_results.md", "labs", gap_drawn.labs_table, "gap-labs"),
-    ("docs/gap_results.md", "arm", gap_arm.table, "gap-arm"),
     ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
     ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),
-    ("docs/tables/special_cases.csv", "", ablation.table, "ablation"),
-    ("docs/benchmarks.md", "alignment", table_speed.alignment, "bench"),
-    ("docs/benchmarks.md", "accelerator", table_speed.accelerator, "bench-accelerator"),
-    ("docs/benchmarks.md", "samplers", table_speed.samplers, "results"),
     ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
-    ("docs/benchmarks.md", "batch", table_speed.batch, "bench-batch"),
     ("docs/virtual_model.md", "haptic", table_speed.haptic, "bench-haptic"),
-    ("docs/benchmarks.md", "lengths", table_speed.lengths, "bench-long"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),
     ("docs/robots_results.md", "minute", table_robots.minute, "bench-robot"),
     ("docs/robots_results.md", "robots_check_given", table_robots.given, "robots-given"),
