@@ -347,8 +347,9 @@ def _detection(body: Body) -> str:
         text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
-    fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"
-    return f"{text}; {fewer}, and what is below follows from the sensors' noise."
+    twins = round(1 / fineness) - 1
+    few = "one healthy twin was" if twins == 1 else f"{twins} healthy twins were"
+    return f"{text}. This follows from the sensors' noise: {few} simulated, too few to count."
 
 
 def _far(body: Body) -> str:

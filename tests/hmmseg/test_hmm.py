@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from path_enumeration import brute, random_problem
-from scipy.stats import chisquare
 
 import hmmseg.hmm as hmm
 from hmmseg.hmm.dense import log_evidence as dense_evidence
@@ -42,21 +41,6 @@ def test_every_quantity_matches_enumeration(size, single):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
     np.testing.assert_allclose(hmm.log_evidence(ll, chain), log_evidence, rtol=1e-12)
 
-    ranked = hmm.k_best(ll, chain, 7)
-    order = np.argsort(-weights)[:7]
-    np.testing.assert_allclose(ranked.log_prob, weights[order], rtol=1e-12)
-    assert [a.path.tolist() for a in ranked] == paths[order].tolist()
-
-
-@pytest.mark.parametrize("num_skips", [0, 1])
-def test_filtered_probabilities_are_posteriors_of_every_prefix(num_skips):
-    ll, bands = random_problem(7, 3, seed=3, num_skips=num_skips)
-    found = hmm.filter(ll, chain_of(bands))
-    np.testing.assert_allclose(found.log_evidence, brute(ll, bands)[2])
-    for t in range(7):
-        smoothed = brute(ll[: t + 1], tuple(band[:t] for band in bands), final=np.zeros(3))[3]
-        np.testing.assert_allclose(found.filtered[t], smoothed[-1], atol=1e-12)
-
 
 def test_open_ends_and_transitions_that_do_not_vary():
     ll, bands = random_problem(6, 3, seed=4)
@@ -69,25 +53,6 @@ def test_open_ends_and_transitions_that_do_not_vary():
         np.testing.assert_allclose(posterior.log_evidence, log_evidence)
         np.testing.assert_allclose(posterior.smoothed, smoothed, atol=1e-12)
         assert hmm.viterbi(ll, each).path.tolist() == paths[weights.argmax()].tolist()
-
-
-@pytest.mark.parametrize("num_skips", [0, 1])
-def test_draws_have_the_exact_path_probabilities(num_skips):
-    # Transitions vary strongly in time: a sampler off by one in t fails by a wide margin.
-    ll, bands = random_problem(5, 3, seed=11, num_skips=num_skips)
-    bands = tuple(2.0 * band for band in bands)
-    ends = {"initial": np.array([0.0, 0.5, -1.0]), "final": np.array([-1.0, 0.5, 0.0])}
-    paths, weights, log_evidence, *_ = brute(ll, bands, **ends)
-    chain = chain_of(bands, log_initial=ends["initial"], log_final=ends["final"])
-    num_draws = 20_000
-    drawn = np.array([a.path for a in hmm.sample(ll, chain, num_draws, seed=5)])
-    expected = np.exp(weights - log_evidence) * num_draws
-    counts = np.array([(drawn == path).all(1).sum() for path in paths])
-    assert counts.sum() == num_draws
-    common = expected >= 5
-    observed = np.append(counts[common], counts[~common].sum())
-    wanted = np.append(expected[common], expected[~common].sum())
-    assert chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(("num_states", "num_skips", "varying"), [(1, 0, False), (5, 0, True), (9, 1, False)])
@@ -117,7 +82,7 @@ def test_missing_samples_are_no_evidence():
         assert hmm.viterbi(gone, chain).starts.tolist() == hmm.viterbi(empty, chain).starts.tolist()
         np.testing.assert_array_equal(hmm.smooth(gone, chain).smoothed, hmm.smooth(empty, chain).smoothed)
         ll[5, 1] = np.nan
-        for function in (hmm.viterbi, hmm.smooth, hmm.filter, hmm.log_evidence):
+        for function in (hmm.viterbi, hmm.smooth, hmm.log_evidence):
             with pytest.raises(ValueError, match=r"log_likelihoods: NaN or \+inf at \[5, 1\]"):
                 function(ll, chain)
 
@@ -222,7 +187,6 @@ def test_optional_states_may_be_passed_over():
         (lambda: hmm.viterbi([np.zeros((3, 1))], [hmm.left_to_right([1])] * 2), "2 given, expected 1"),
         (lambda: hmm.viterbi(np.zeros((1, 3, 1)), hmm.left_to_right([1]), [4]), "4 for recording 0"),
         (lambda: hmm.viterbi(np.zeros((1, 3, 1)), hmm.left_to_right([1]), [3, 3]), "2 given, expected 1"),
-        (lambda: hmm.k_best(np.zeros((3, 1)), hmm.left_to_right([1]), 0), "k: 0, expected"),
         (lambda: hmm.left_to_right([2.0, 3.0], [1.0]), r"presence: shape \(1,\), expected \(2,\)"),
         (lambda: hmm.left_to_right([2.0], [0.0]), r"probabilities in \(0, 1\]"),
         (lambda: hmm.smooth(np.full((3, 1), np.inf), hmm.left_to_right([1])), r"NaN or \+inf at \[0, 0\]"),
@@ -233,7 +197,7 @@ def test_refusals(make, message):
         make()
 
 
-@pytest.mark.parametrize("function", ["viterbi", "smooth", "filter", "log_evidence", "k_best", "sample"])
+@pytest.mark.parametrize("function", ["viterbi", "smooth", "log_evidence"])
 @pytest.mark.parametrize("num_skips", [0, 1])
 def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
     ll, bands = random_problem(6, 3, seed=1, num_skips=num_skips)
@@ -244,9 +208,8 @@ def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
     dead_end[5, 2] = -np.inf
     for table, subtask, reason in [(starved, 1, "no sample is possible under it"),
                                    (dead_end, 2, "cannot be held to the end")]:  # fmt: skip
-        more = {"k_best": (3,), "sample": (3,)}.get(function, ())
         with pytest.raises(hmm.InfeasibleAlignment, match=reason) as caught:
-            getattr(hmm, function)(table, chain_of(bands), *more)
+            getattr(hmm, function)(table, chain_of(bands))
         assert caught.value.subtask == subtask
 
 
@@ -311,8 +274,6 @@ def test_inside_jit_what_is_impossible_is_minus_infinity():
     assert jax.jit(hmm.log_evidence)(ll, chain) == -np.inf
     found, gradient = jax.jit(hmm.smooth)(ll, chain), jax.jit(jax.grad(hmm.log_evidence))(ll, chain)
     assert found.log_evidence == -np.inf and (found.smoothed == 0).all() and (gradient == 0).all()
-    drawn = jax.jit(lambda ll, key: hmm.sample(ll, chain, 4, key))(ll, jax.random.key(0))
-    assert (drawn.log_prob == -np.inf).all()
     ll[2] = [0.0, np.nan, 0.0]  # no missing row: one that is broken
     assert np.isnan(jax.jit(hmm.log_evidence)(ll, chain))
 
@@ -320,9 +281,9 @@ def test_inside_jit_what_is_impossible_is_minus_infinity():
 def test_a_process_in_single_precision_gets_the_same():
     ll, bands = random_problem(8, 3, seed=2)
     chain = chain_of(bands)
-    inside = hmm.smooth(ll, chain), hmm.k_best(ll, chain, 3), hmm.sample(ll, chain, 5, seed=1)
+    inside = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
     with jax.enable_x64(False):
-        outside = hmm.smooth(ll, chain), hmm.k_best(ll, chain, 3), hmm.sample(ll, chain, 5, seed=1)
+        outside = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
     for a, b in zip(jax.tree.leaves(inside), jax.tree.leaves(outside), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from experiments.gap_generic import made as pairs_of_experiment
 from experiments.generic_ensembles import PLANTED, TASK, ensemble
+from experiments.generic_ensembles import made as case_of
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
@@ -173,7 +173,7 @@ def test_a_planted_effect_is_named_with_its_parameters(name):
 @pytest.mark.parametrize("pair", [("force_gain", "force_lag"), ("force_bias", "force_gain")])
 def test_two_planted_effects_are_both_named(pair):
     """What a gain does to noise, and a lag by parts of a sample, must not stand in for one of them."""
-    ensembles = pairs_of_experiment(101, {name: PLANTED[name] for name in pair}, False)
+    ensembles = case_of(101, {name: PLANTED[name] for name in pair}, False)
     assert diagnosed(ensembles).body["causes"] == list(pair)
 
 
