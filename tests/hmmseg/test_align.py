@@ -13,11 +13,10 @@ import pytest
 from experiments.misfit_edits import join, let_go
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, scene, simulated_cases, trials_of
-from hmmseg import example_folder
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import Fingertip, Noise, Rig, read_rig
-from hmmseg.io.task import BlockTask, Move, Task
+from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align, segment
 from hmmseg.segmentation.rounds import round_tasks
@@ -250,20 +249,3 @@ def test_hundreds_of_rounds_cost_no_more_each():
         assert aligned.trials[0].segmentation.repetitions == number
         assert aligned.trials[0].segmentation.complete
     assert seconds[320] < 1.6 * seconds[40]
-
-
-ROUNDS = 3
-
-
-@pytest.fixture(scope="module")
-def repeated():
-    """A recording of the example, performed again and again, and its description."""
-    import dataclasses
-
-    folder = example_folder()
-    rig, task = Rig.read(folder / "rig.toml"), Task.read(folder / "task.toml")
-    trial = Trial.read(folder / "trial_01.csv", rig)
-    length = trial.t[-1] - trial.t[0] + np.median(np.diff(trial.t))
-    t = np.concatenate([trial.t + k * length for k in range(ROUNDS)])
-    columns = {"t": t} | {name: np.tile(values, ROUNDS) for name, values in trial.channels.items()}
-    return columns, dataclasses.replace(task, repeat="unknown"), rig
