@@ -1,17 +1,12 @@
 """The virtual model by steps, driven by a recording, and its smoothed motions."""
 
-import json
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from simgap_scenes import HAND, STACK
 
 from hmmseg.contact.decompose import subtasks
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import read_task
-from simgap.world.properties import PAPER_BLOCKS, read_properties
+from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.replay import replay, residual_summary, smooth
 from simgap.world.simulate import simulate_trial
 from simgap.world.virtual_model import RIGID_PAD, VirtualModel, physics, rollout, standing, substeps_for
@@ -52,13 +47,6 @@ def test_steps_agree_with_the_rollout_and_reset_starts_over(performed):
     np.testing.assert_array_equal(model.step(position[0], velocity[0], 1e-3), forces[0])
 
 
-def test_the_period_may_change_from_step_to_step():
-    model = VirtualModel(HAND, STACK, PAPER_BLOCKS, {"block1": 0.12, "block2": 0.12})
-    still = [[0.10, 0.02], [0.14, 0.02]]
-    for dt in (1e-3, 2.5e-4, 2e-3):
-        np.testing.assert_allclose(model.step(still, np.zeros((2, 2)), dt), 0.0, atol=1e-12)
-
-
 def test_a_step_refuses_what_is_no_motion():
     model = VirtualModel(HAND, STACK, PAPER_BLOCKS, {"block1": 0.12, "block2": 0.12})
     with pytest.raises(ValueError, match="finite"):
@@ -80,18 +68,6 @@ def test_replay_of_a_simulated_trial_leaves_the_sensors_noise(performed):
     assert rest["hold-above-ground"] < 1.5
     end = result.motion.blocks[-1]
     np.testing.assert_allclose(end, performed.motion.blocks[-1], atol=2e-3)
-
-
-@pytest.mark.parametrize("trial", [1, 4])
-def test_replay_of_a_healthy_recording_leaves_little_more_than_the_sensors_noise(shared, trial):
-    folder = shared / "recordings/paper_blocks"
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    truth = json.loads((folder / f"truth/trial_{trial:02d}.json").read_text())["boundaries"]
-    recording = read_trial(folder / f"trial_{trial:02d}.csv", rig)
-    result = replay(recording, task, rig, read_properties(folder / "actual.toml", task), boundaries=truth)
-    rest = residual_summary(result, truth, STATES)
-    assert rest["free-motion"] < 1.5
-    assert rest["hold-above-ground"] < 1.5
 
 
 def test_smoothing_keeps_a_parabola_and_averages_a_rest():
