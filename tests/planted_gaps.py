@@ -1,7 +1,5 @@
 """Small gaps of effects that are linear in their parameters, planted with known sizes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from simgap.attribution.problem import Candidate, Gap, Rows

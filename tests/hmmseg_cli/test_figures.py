@@ -1,7 +1,5 @@
 """Figures are drawn, whole and from awkward results too, and say what they should."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The frame of the commands: exit codes, one line of error, strict JSON, all files or none."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

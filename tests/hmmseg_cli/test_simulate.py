@@ -1,7 +1,5 @@
 """hmmseg simulate: trials in the input format, a replay, an animation, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Attribution against enumeration, closed forms, quadrature and planted effects."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The dynamics against closed forms, conservation laws and finite differences."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -178,8 +176,3 @@ def test_gradients_are_finite_exactly_at_touch():
 
     for value in jax.grad(total, argnums=(0, 1))(jnp.asarray(0.4), jnp.asarray(0.01)):
         assert np.isfinite(value)
-
-
-def test_blocks_refuse_impossible_numbers():
-    with pytest.raises(ValueError, match="weight"):
-        dataclasses.replace(Block(0.4, 0.02, 0.016), weight=-1.0)

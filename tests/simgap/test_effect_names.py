@@ -1,7 +1,5 @@
 """An effect is a plug-in: what it does stands in `simgap/effects`, and no other file lists it by its name."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What corrections leave in doubt: slides, dead bands, forces between samples, rings; against oracles."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

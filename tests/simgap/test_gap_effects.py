@@ -1,7 +1,5 @@
 """Effects: gradients, neutrality, composition, and that a planted effect is taken out again."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """`hmmseg diagnose --against`: document, figures, page and refusals."""
 
-from __future__ import annotations
-
 import json
 import re
 

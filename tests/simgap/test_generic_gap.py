@@ -1,7 +1,5 @@
 """The generic diagnosis: features with known values, planted effects named, alike ensembles called alike."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether an effect is of one size everywhere: the random-effects likelihood, and intervals that hold."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from planted_gaps import gap_of, linear, rows_of

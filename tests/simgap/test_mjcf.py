@@ -1,7 +1,5 @@
 """MuJoCo models as simulators: maps, rollouts against closed forms, what is set and taken back, patches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

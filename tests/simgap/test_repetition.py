@@ -1,7 +1,5 @@
 """A recorded performance simulated once more; what a simulator loses and pads' damping does to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Statistics of healthy twins are kept for the code that made them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One reading of a posterior over sets: what it must say where that can be worked out by hand."""
 
-from __future__ import annotations
-
 import pytest
 
 from simgap.attribution.verdict import ALARM, Explanation, acting, alike, conclude, leading, probabilities
