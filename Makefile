@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models bench-long gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -85,19 +85,14 @@ gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS; fills docs/g
 	$(BIN)/python -m experiments.gap_recordings $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
 
-gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn anew (build/gap_drawn); fills docs/gap_results.md
-	$(BIN)/python -m experiments.blind_check open --cases 36 --tiers healthy single --seed 519083 --out build/gap_drawn
-	$(BIN)/python -m experiments.gap_drawn build/gap_drawn --seed 519083
-	$(BIN)/python -m experiments.write_tables
-
-gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in the folder LABS; fills docs/gap_results.md
+gap-labs: $(INSTALLED)  ## diagnoses of open labs in the folder LABS; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
 	$(BIN)/python -m experiments.blind_check diagnose --cases $(SET)/cases --out $(SET)/results
 	$(BIN)/python -m experiments.blind_check score --sealed $(SET) --results $(SET)/results --json experiments/results/blind_check.json
-	$(BIN)/python -m paper_figs.gap_reliability
+	$(BIN)/python -m paper_figs gap_reliability
 	$(BIN)/python -m experiments.write_tables
 
 sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.misfit_edits import join, let_go
 from experiments.recordings import read_case
-from experiments.worlds import WORLDS, scene, simulated_cases, trials_of
+from experiments.worlds import Cell, World, scene, simulated_cases, trials_of
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import Fingertip, Noise, Rig, read_rig
@@ -113,7 +113,7 @@ def test_the_later_of_two_touches_is_dated_wherever_the_first_has_pushed_the_blo
     """At 20 Hz with a finger up to 100 ms late: two of three held by where it stands later."""
     _, task = scene()
     held, off = [], []
-    for judged in trials_of(WORLDS["late finger"], range(78100, 78108)):
+    for judged in trials_of(World("", untidy="late finger"), range(78100, 78108)):
         (found,) = segment([judged.trial], task, judged.rig)
         for span, t in zip(found.spans[1::4], judged.boundaries[::4], strict=False):
             held.append(span.start_90[0] <= t <= span.start_90[1])
@@ -124,7 +124,7 @@ def test_the_later_of_two_touches_is_dated_wherever_the_first_has_pushed_the_blo
 def test_at_high_rates_a_block_has_not_moved_yet_as_the_later_finger_touches():
     _, task = scene()
     off = []
-    for judged in trials_of(WORLDS["1000 Hz"], range(78100, 78104)):
+    for judged in trials_of(World("", Cell(rate=1000.0)), range(78100, 78104)):
         (found,) = segment([judged.trial], task, judged.rig)
         off += [span.start - t for span, t in zip(found.spans[1::4], judged.boundaries[::4], strict=False)]
     assert abs(np.median(off)) < 1e-3  # 1.6 ms early where it is taken to follow at once

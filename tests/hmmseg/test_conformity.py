@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import calibration_worlds
-from experiments.calibration_worlds import ROWS, replicates
 from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import read_case
-from experiments.worlds import WORLDS, Cell, World, scene, trials_of
+from experiments.worlds import WORLDS, Cell, World, replicates, scene, trials_of
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import read_rig
@@ -79,11 +77,8 @@ def test_misfits_are_found_at_the_subtask_that_fails(edit, which):
         ("ringing 1 N", 60028),
     ],
 )
-def test_poor_recordings_are_no_misfits_and_a_fall_in_them_is_told(world, number, monkeypatch):
-    monkeypatch.setattr(calibration_worlds, "FIRST", number)
-    calibration_worlds._performed.cache_clear()
-    (healthy,) = calibration_worlds.replicates(ROWS[world], 1)
-    calibration_worlds._performed.cache_clear()
+def test_poor_recordings_are_no_misfits_and_a_fall_in_them_is_told(world, number):
+    (healthy,) = replicates(WORLDS[world], [number])
     (found,) = segmentation.segment(healthy.trials, healthy.task, healthy.rig)
     assert found.complete, found.failed
     fallen, _ = EDITS["drop_first"](healthy.trials[0], list(healthy.boundaries[0]))
@@ -135,12 +130,16 @@ def test_a_bounce_at_touchdown_is_no_drop():
 
 @pytest.mark.parametrize(
     "way, numbers",
-    [("tapping", [70000, 70001]), ("slipping", [70000, 70001]), ("tapping, 100 Hz", [77000, 77013])],
+    [
+        (World("", untidy="tapping"), [70000, 70001]),
+        (World("", untidy="slipping"), [70000, 70001]),
+        (World("", Cell(rate=100.0), untidy="tapping"), [77000, 77013]),
+    ],
 )
 def test_touches_before_a_grip_and_a_grip_that_slips_are_no_misfit(way, numbers):
     """Nor do they move a boundary by a sample of 50 ms. The last two tap for more than 0.2 s, but lightly."""
     _, task = scene()
-    for judged in trials_of(WORLDS[way], numbers):
+    for judged in trials_of(way, numbers):
         (found,) = segmentation.segment([judged.trial], task, judged.rig)
         assert found.complete
         starts = np.array([span.start for span in found.spans[1:]])
@@ -180,7 +179,7 @@ def test_pads_half_as_stiff_or_twice_as_stiff_as_stated_open_far_enough():
 def test_a_tower_of_six_is_recognised_though_blocks_look_alike():
     """Three of four such towers have two blocks within a millimetre: five look different, and there are
     more ways to call them than can be tried."""
-    found, alike = list(replicates(ROWS["6 blocks"], 2)), []
+    found, alike = list(replicates(WORLDS["6 blocks"], range(116_000, 116_002))), []
     for replicate in found:
         f = features(thin(task_space(replicate.trials[0], replicate.rig), MAX_RATE), replicate.rig)
         (verdict,) = examine([f], [replicate.task])
