@@ -1,4 +1,4 @@
-"""The marginal posterior against brute force: one dense Gaussian over all observations; its mode is a mode."""
+"""The marginal posterior against one dense Gaussian over all observations; its mode is a mode."""
 
 from dataclasses import replace
 

@@ -1,5 +1,7 @@
 """Late, slow and yielding things at contact changes: forces before their sensor, supports that settle."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -43,6 +45,13 @@ def test_smooth_forces_are_found_behind_a_low_pass(time):
     steep = slope > 0.6 * slope.max()
     assert np.sqrt((off[steep] ** 2).mean()) < 0.7 * np.sqrt((plain[steep] ** 2).mean())
     assert off.max() < 0.08  # beside a crest that falls unevenly on its samples
+
+
+def test_a_crest_is_no_corner():
+    t = np.arange(80) * STEP
+    wave = np.sin(2 * np.pi * 3.0 * t)
+    found = np.asarray(shifted(jnp.asarray(wave)[None, :, None], jnp.asarray(0.5)))[0, :, 0]
+    assert np.abs(found - np.sin(2 * np.pi * 3.0 * (t + STEP / 2)))[2:-3].max() < 0.14  # a cubic's own error
 
 
 def test_no_force_before_the_contact_behind_a_low_pass():

@@ -1,13 +1,16 @@
 """Effects: gradients, neutrality, composition, and that a planted effect is taken out again."""
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import FORCE_CHANNELS, Finger, Fingertip, Rig
-from simgap.effects import catalogue, decoys, fitted
+from simgap.effects import catalogue, decoys, effect_named, fitted
 from simgap.effects.base import Performance, World, flat, tips
 from simgap.gap.problem import STEP
 from simgap.gap.residuals import contact
@@ -124,6 +127,11 @@ def test_every_name_of_the_contract_is_an_effect():
 def test_decoys_are_fitted_but_have_no_name():
     assert decoys() and not set(decoys()) & set(catalogue())
     assert set(fitted()) == set(decoys()) | set(catalogue())
+
+
+def test_an_unknown_effect_is_refused_with_the_nearest_name():
+    with pytest.raises(InputError, match="force_bias"):
+        effect_named("force_bais")
 
 
 @pytest.mark.parametrize("name", DETERMINISTIC)

@@ -1,5 +1,7 @@
 """What changes within a sample: fast work is no irregular clock, and brief delays are told with care."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -1,5 +1,7 @@
 """What is nobody's fault: linear unknowns integrated out, the noise's level and colour, blocks that turn."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 
