@@ -1,6 +1,7 @@
 """Noise that effects carry along, taken off the products of columns: closed forms and planted effects."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,8 +98,8 @@ def test_an_effect_has_its_own_size(error):
 
 
 @pytest.fixture(scope="module")
-def given(shared):
-    folder = shared / "recordings/none_1"
+def given():
+    folder = Path(__file__).resolve().parents[2] / "recordings/none_1"
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     assert isinstance(task, BlockTask)
     trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2, 3, 4)]

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from simgap.gap.assemble import gap_of, scatters, together
 from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import Start, derivatives, fit, neutral, problem, slots
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 
 def read(folder, count=2):
@@ -34,8 +37,8 @@ def own(given, found, name):
 
 
 @pytest.fixture(scope="module")
-def healthy(shared):
-    given = problem(read(shared / "recordings/none_1"))
+def healthy():
+    given = problem(read(RECORDINGS / "none_1"))
     return given, double_precision(fit)(given, Start((), neutral(given)))
 
 
@@ -53,9 +56,9 @@ def test_no_force_bias_is_found_in_a_healthy_recording(healthy):
 
 
 @double_precision
-def test_a_force_bias_is_recovered(shared):
-    given = problem(read(shared / "recordings/force_bias_1"))
-    labels = json.loads((shared / "recordings/labels.json").read_text())
+def test_a_force_bias_is_recovered():
+    given = problem(read(RECORDINGS / "force_bias_1"))
+    labels = json.loads((RECORDINGS / "labels.json").read_text())
     truth = next(e for e in labels if e["case"] == "force_bias_1")["params"]["bias"]
     plain, biased = (fit(given, Start(e, neutral(given))) for e in ((), ("force_bias",)))
     np.testing.assert_allclose(list(own(given, biased, "force_bias").values()), truth, atol=0.004)
@@ -90,8 +93,8 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
 
 
 @double_precision
-def test_what_the_rig_admits_is_a_nuisance(shared):
-    frame = read(shared / "recordings/none_1")
+def test_what_the_rig_admits_is_a_nuisance():
+    frame = read(RECORDINGS / "none_1")
     rig = frame.rig.model_copy(
         update={"systematic": frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})}
     )
