@@ -53,7 +53,7 @@ def brute(ll, bands, **ends):
     return paths, weights, log_evidence, smoothed, moves
 
 
-SIZES = [(1, 1, 0), (2, 2, 0), (8, 3, 0), (4, 4, 1), (8, 4, 1), (6, 3, 2)]  # samples, states, skips
+SIZES = [(1, 1, 0), (8, 3, 0), (4, 4, 1), (8, 4, 1), (6, 3, 2)]  # samples, states, skips
 
 
 def chain_of(bands, **ends):
@@ -95,10 +95,10 @@ def test_open_ends_and_transitions_that_do_not_vary():
         assert hmm.viterbi(ll, each).path.tolist() == paths[weights.argmax()].tolist()
 
 
-@pytest.mark.parametrize(("num_states", "num_skips", "varying"), [(1, 0, False), (5, 0, True), (9, 1, False)])
+@pytest.mark.parametrize(("num_states", "num_skips", "varying"), [(1, 0, False), (4, 0, True), (5, 1, False)])
 def test_in_parallel_in_time_is_the_same(num_states, num_skips, varying):
     rng = np.random.default_rng(num_states)
-    n = 700
+    n = 130  # more take longer to compile
     ll = 5 * rng.normal(size=(n, num_states))
     ll[40:60] = np.nan
     ll[100:120, : num_states // 3] = -np.inf
