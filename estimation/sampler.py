@@ -4,7 +4,7 @@ All else is integrated out (`estimation.posterior`), so emcee moves in six dimen
 task. Most proposals are independent draws (`estimation.proposal`), the rest differential evolution
 (ter Braak 2006), which frees walkers that it would hold in a tail. The chain is checked against the
 same proposal's importance-weighted draws, which owe nothing to the chain.
-experiments/benchmarks/moves.py compares them with emcee's stretch move.
+benchmarks/moves.py of commit f82105c compares them with emcee's stretch move.
 
 Draws where it is open whether the rig's pads are as it says: from both possibilities, by their odds.
 

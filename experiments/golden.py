@@ -74,8 +74,7 @@ def diagnosed(name: str) -> Json:
 
 def ensembles(effect: str) -> Json:
     """What the diagnosis of given trials finds where one effect is planted in six made-up ones."""
-    from experiments.gap_generic import made
-    from experiments.generic_ensembles import PLANTED
+    from experiments.generic_ensembles import PLANTED, made
     from simgap.generic.diagnose import diagnosed as diagnose_ensembles
 
     effects = None if effect == "none" else {effect: PLANTED[effect]}

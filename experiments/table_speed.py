@@ -2,67 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from experiments.table_text import load, markdown, percent
-
-LENGTHS = Path(__file__).parents[1] / "docs" / "figures" / "long_recordings.png"
-OTHERS = ("hmmlearn's kernel", "dynamax")
-
-
-def alignment() -> str | None:
-    """README.md, docs/benchmarks.md: paths and posteriors by hmmseg.hmm and by other libraries."""
-    found = load("benchmark_hmm")
-    if found is None:
-        return None
-    rows = []
-    for title, case in found["cases"].items():
-        times = case["seconds"]
-        own = times["inside jit"]
-        others = [f"{times[n] / own:.1f} x" if n in times else "" for n in ("as called", *OTHERS)]
-        rows.append([title, f"{1e3 * own:.3g} ms", *others])
-    versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
-    same = "the same" if all(case["same"] for case in found["cases"].values()) else "NOT the same"
-    table = markdown(["", "`hmmseg.hmm` inside jit", "as called", *OTHERS], rows)
-    return f"{table}\n\nAll paths are {same}. Versions: {versions}."
-
-
-def accelerator() -> str | None:
-    """docs/benchmarks.md: the same recursions in parallel on an accelerator."""
-    found = load("benchmark_hmm_parallel")
-    if found is None:
-        return None
-    peers = ("row by row, processor", "torchaudio.forced_align", "torbi")
-    rows = []
-    for title, case in found["cases"].items():
-        times = case["seconds"]
-        own = times["associative scan"]
-        others = [f"{times[n] / own:.0f} x" if times.get(n) else "" for n in peers]
-        rows.append([title, f"{1e3 * own:.2g} ms", *others])
-    table = markdown(["", "`hmmseg.hmm`, associative scan", *peers], rows)
-    cases = found["cases"].values()
-    same = {n: min(c["same"].get(n, 1.0) for c in cases) for n in ("associative scan", *peers[1:])}
-    shares = ", ".join(f"{n} {percent(share, 2)}" for n, share in same.items())
-    far = max(max(c["largest difference"].values(), default=0.0) for c in cases)
-    return (
-        f"{table}\n\nWall time on one {found['device']}, JAX {found['jax']}. Trials with all starts as "
-        f"found row by row, least of all cases (torchaudio and torbi in single precision): {shares}. "
-        f"Posteriors differ by {far:.0e} at most."
-    )
-
-
-def samplers() -> str | None:
-    """docs/benchmarks.md: effective samples a second on the same log density."""
-    found = load("reference_posteriors")
-    if found is None:
-        return None
-    rows = []
-    for task in found["tasks"]:
-        own, nuts, plain = (task[f"{kind}ess_per_second"] for kind in ("", "nuts_", "stretch_"))
-        rows.append([f"{task['blocks']} x {task['trials']}", f"{own:,.0f}", f"{nuts:,.0f}", f"{plain:,.0f}",
-                     f"{own / max(nuts, plain):.1f}"])  # fmt: skip
-    head = ["blocks x trials", "`identify`", "NumPyro's NUTS", "emcee as it comes", "ahead of the better by"]
-    return markdown(head, rows)
 
 
 def commands() -> str | None:
@@ -84,24 +24,6 @@ def commands() -> str | None:
     return "\n\n".join([*tables, f"Whole commands, processor: {told}."])
 
 
-def batch() -> str | None:
-    """docs/benchmarks.md: many trials, each by itself."""
-    found = load("benchmark_batch")
-    if found is None:
-        return None
-    rows = [
-        [f"{found['trials']:,}", f"{run['workers']}", f"{run['wall']:.0f} s", f"{run['processor']:.0f} s",
-         f"{1e3 * run['processor'] / found['trials']:.0f} ms"]
-        for run in found["runs"]
-    ]  # fmt: skip
-    told = (
-        f"{found['complete']:,} fit their task. Load of the {found['cores']} cores beside it: "
-        f"{found['load']:.0f}. Digits from 1, 2 and 3 workers ({found['compared']} trials): "
-        f"{'the same' if found['same_digits'] else 'NOT the same'}."
-    )
-    return markdown(["trials", "workers", "time", "processor", "a trial"], rows) + f"\n\n{told}"
-
-
 def haptic() -> str | None:
     """docs/virtual_model.md: the haptic loop beside one that does nothing."""
     found = load("haptic_loop")
@@ -120,50 +42,6 @@ def haptic() -> str | None:
         f"steps: {rate['grown_bytes_in_10000_steps']} (the interpreter's own)."
     )
     return markdown(["loop", "median", "99.9 %", "worst", "late"], rows) + f"\n\n{told}"
-
-
-def lengths() -> str | None:
-    """docs/benchmarks.md: long recordings."""
-    found = load("benchmark_long")
-    if found is None:
-        return None
-    rows = [
-        [f"{row['rows']:,}", row["from"], f"{row['found']} of {row['rounds']}", _wall(row),
-         f"{row['processor']:.1f} s", f"{1e6 * row['processor'] / row['rows']:.1f} µs",
-         f"{row['memory_mb']:.0f} MB", {True: "yes", False: "NO", None: ""}[row.get("same_answer")]]
-        for row in found["lengths"]
-    ]  # fmt: skip
-    head = ["rows", "read from", "rounds found", "time", "processor", "a row", "peak memory",
-            "as in one piece"]  # fmt: skip
-    _draw_lengths(found["lengths"])
-    return markdown(head, rows)
-
-
-def _wall(row: dict) -> str:
-    """Time on the clock, with the load beside which it means little."""
-    busy = row.get("load", 0.0) > row.get("cores", 1)
-    return f"{row['wall']:.1f} s" + (f" (load {row['load']:.0f})" if busy else "")
-
-
-def _draw_lengths(rows: list[dict]) -> None:
-    """Time and peak memory against rows."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
-    for kind in dict.fromkeys(row["from"] for row in rows):
-        mine = [row for row in rows if row["from"] == kind]
-        for ax, key in zip(axes, ("processor", "memory_mb"), strict=True):
-            ax.loglog([r["rows"] for r in mine], [r[key] for r in mine], "o-", ms=3.5, lw=1, label=kind)
-    for ax, label in zip(axes, ("processor time [s]", "peak memory of the process [MB]"), strict=True):
-        ax.set_xlabel("rows")
-        ax.set_ylabel(label)
-        ax.grid(lw=0.3, which="both")
-    axes[0].legend(fontsize=8)
-    figure.savefig(LENGTHS, dpi=110)
-    plt.close(figure)
 
 
 def watch() -> str | None:

@@ -1,7 +1,5 @@
 """One planted recording in every kind of file, each written by the field's own library."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

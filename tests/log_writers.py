@@ -1,7 +1,5 @@
 """Messages of ROS in MCAP logs and bags, each written by the field's own library."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

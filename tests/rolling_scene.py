@@ -1,7 +1,5 @@
 """The demo's hand as a gripper in Cartesian space that rolls while it carries, by a planted angle."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One recording as other labs would have it: topics of ROS, LeRobot, robomimic, a spreadsheet's CSV."""
 
-from __future__ import annotations
-
 import numpy as np
 from log_writers import Topic
 

@@ -5,7 +5,7 @@ which a path may leave the chain for good. P(leaving) is small (DEPARTURE), so t
 misfit only where leaving gains more evidence than that (posterior odds above 1); the subtask that the path
 then does not reach is the one that fails. Ending before the last subtask, or starting outside of the first
 one, is leaving as well. Contacts ring and bounce for a while after each change, so every state is entered
-through settling stages (docs/model.md).
+through settling stages (docs/segmentation.md).
 
 Of a trial that fails, the subtasks up to the failing one are reported and, counted back from the end, those
 that the recording's last runs still match (same contact state, same block). What lies between belongs to no

@@ -16,7 +16,7 @@ NOT_THERE = ("backlash", "delay", "spring", "stribeck", "sag", "mass", "length")
 @pytest.mark.slow
 def test_what_a_servo_lacks_is_named(shared):
     """One log a gain: friction by load, the rotor and a fade, and the logs left out are predicted."""
-    found = robot_gap.summary(robot_gap.run("xl330", shared / "real/xl330_pendulum", FOUR))
+    found = robot_gap.summary(robot_gap.run(shared / "real/xl330_pendulum", FOUR))
     assert found["verdict"] in ("named", "set")
     causes = found["causes"]
     assert {"armature", "load_friction"} <= set(causes)

@@ -1,7 +1,5 @@
 """Noise that effects carry along, taken off the products of columns: closed forms and planted effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fit on recordings: healthy ones are noise, a planted effect is found with its parameters."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
