@@ -223,8 +223,8 @@ ANYWHERE = 0.05  # prior: m; sd of where a grip takes its block
 def firmness(grip: np.ndarray, held: np.ndarray, moves: np.ndarray, loose: float = LOOSE) -> np.ndarray:
     """How surely (T, N) a grip's pads hold the block rather than slide on it as they close or let go."""
     mine = moves * held[..., None]
-    usual = np.einsum("tnm,tn->tm", mine, grip) / np.maximum(mine.sum(1), 1.0)
-    least = np.maximum(HELD, loose * np.einsum("tnm,tm->tn", moves, usual))
+    usual = (grip[:, None] @ mine)[:, 0] / np.maximum(mine.sum(1), 1.0)
+    least = np.maximum(HELD, loose * (moves @ usual[..., None])[..., 0])
     return expit((grip / least - 1) * USUAL / (1 / loose - 1))
 
 
@@ -242,9 +242,9 @@ def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray, place: np.
     )
     out = values
     for part in parts:
-        members = part * weight[..., None]
-        members = members / np.maximum(members.sum(1, keepdims=True), 1e-9)
-        out = out - np.einsum("tnm,tm->tn", part, np.einsum("tnm,tn->tm", members, values))
+        total = (weight[:, None] @ part)[:, 0]
+        mean = ((weight * values)[:, None] @ part)[:, 0] / np.maximum(total, 1e-9)
+        out = out - (part @ mean[..., None])[..., 0]
     return out * weight
 
 
@@ -291,9 +291,8 @@ def residuals(
     `properties` (O, 3): weight, width, height. The variance's factor is 1 where the correction of an effect
     leaves nothing in doubt.
     """
-    own = np.einsum("tnm,mo,op->tnp", arrays.onehot, arrays.objects, properties)
-    weight, width = own[..., 0], own[..., 1]
-    rise = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.rises, properties[:, 2])
+    weight, width = np.moveaxis(arrays.onehot @ (arrays.objects @ properties[:, :2]), -1, 0)
+    rise = arrays.onehot @ (arrays.rises @ properties[:, 2])
     position, velocity = tips(world)
     force = contact(world)
     pads = relaxed(world, force)
@@ -360,6 +359,8 @@ def residuals(
 
 def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
     """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of angles and forces."""
+    if not (world.doubt_joints.any() or world.modes[LATE] or world.modes[SMOOTH]):
+        return np.zeros((*firm.shape, 4))
     turn_x, turn_y = (np.where(world.jointed > 0.5, turn, 0.0) for turn in swung(world))
     pads = doubt_between(world)
 
