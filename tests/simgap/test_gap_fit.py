@@ -2,14 +2,11 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from demo_recordings import RECORDINGS, recorded
 
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import BlockTask, read_task
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.effects import effect_named
@@ -18,14 +15,9 @@ from simgap.gap.frame import build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import Start, derivatives, fit, neutral, problem, slots
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
-
-def read(folder, count=2):
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    assert isinstance(task, BlockTask)
-    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in range(1, count + 1)]
-    return build(align(trials, task, rig))
+def read(name):
+    return build(align(*recorded(name, 2)))
 
 
 def own(given, found, name):
@@ -38,7 +30,7 @@ def own(given, found, name):
 
 @pytest.fixture(scope="module")
 def healthy():
-    given = problem(read(RECORDINGS / "none_1"))
+    given = problem(read("none_1"))
     return given, double_precision(fit)(given, Start((), neutral(given)))
 
 
@@ -57,7 +49,7 @@ def test_no_force_bias_is_found_in_a_healthy_recording(healthy):
 
 @double_precision
 def test_a_force_bias_is_recovered():
-    given = problem(read(RECORDINGS / "force_bias_1"))
+    given = problem(read("force_bias_1"))
     labels = json.loads((RECORDINGS / "labels.json").read_text())
     truth = next(e for e in labels if e["case"] == "force_bias_1")["params"]["bias"]
     plain, biased = (fit(given, Start(e, neutral(given))) for e in ((), ("force_bias",)))
@@ -94,7 +86,7 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
 
 @double_precision
 def test_what_the_rig_admits_is_a_nuisance():
-    frame = read(RECORDINGS / "none_1")
+    frame = read("none_1")
     rig = frame.rig.model_copy(
         update={"systematic": frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})}
     )
