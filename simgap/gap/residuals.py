@@ -177,7 +177,7 @@ def doubt_between(world: World) -> jax.Array:
             p0, p1, p2, p3, share = _around(f, steps)
             share = share * (1 - share)
             bend = jnp.maximum(jnp.abs(p2 - 2 * p1 + p0), jnp.abs(p3 - 2 * p2 + p1))
-            # A change that neither side goes on with may have come at any moment between the two samples.
+            # A change that neither side continues may have come at any moment between the two samples.
             jump = jnp.maximum(jnp.abs(p2 - p1) - jnp.maximum(jnp.abs(p1 - p0), jnp.abs(p3 - p2)), 0.0)
             return jnp.square(BETWEEN * share * bend) + share * jnp.square(EITHER * jump)
 
