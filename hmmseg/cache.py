@@ -89,7 +89,7 @@ def _damaged(path: Path) -> None:
         path.unlink(missing_ok=True)
     if path.parent not in _said:
         _said.add(path.parent)
-        warnings.warn(f"{path}: damaged; recomputed", CacheWarning, stacklevel=4)
+        warnings.warn(f"{path}: not as it was written; recomputed", CacheWarning, stacklevel=4)
 
 
 def keep_value(path: Path | None, value: Any) -> None:
