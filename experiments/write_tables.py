@@ -14,13 +14,14 @@ from pathlib import Path
 
 from experiments import (
     gap_drawn,
+    gap_recordings,
     table_calibration,
-    table_gap,
     table_robots,
     table_sequences,
     table_speed,
     wrist,
 )
+from experiments.blind_check import tables as blind_check
 from experiments.real import hiro_snap
 from experiments.table_text import as_csv, covered, load, markdown, milliseconds, percent
 from hmmseg.contact.decompose import PROPERTIES
@@ -108,11 +109,11 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/tables/calibration.csv", "", table_calibration.calibration, "results"),
     ("docs/tables/worlds.csv", "", table_calibration.worlds, "calibrate"),
     ("docs/tables/sbc.csv", "", table_calibration.sbc, "calibrate"),
-    ("docs/results.md", "gap", table_gap.summary, "gap-results"),
-    ("docs/gap_results.md", "recordings", table_gap.recordings, "gap-results"),
+    ("docs/results.md", "gap", gap_recordings.in_short, "gap-results"),
+    ("docs/gap_results.md", "recordings", gap_recordings.table, "gap-results"),
     ("docs/gap_results.md", "labs", gap_drawn.table, "gap-labs"),
-    ("docs/gap_results.md", "blind", table_gap.blind, "blind-check"),
-    ("docs/tables/blind.csv", "", table_gap.blind_by_circumstance, "blind-check"),
+    ("docs/gap_results.md", "blind", blind_check.blind, "blind-check"),
+    ("docs/tables/blind.csv", "", blind_check.by_circumstance, "blind-check"),
     ("docs/benchmarks.md", "commands", table_speed.commands, "bench"),
     ("docs/virtual_model.md", "haptic", table_speed.haptic, "bench-haptic"),
     ("docs/watch.md", "watch", table_speed.watch, "bench-watch"),

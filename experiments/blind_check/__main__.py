@@ -21,7 +21,7 @@ from pathlib import Path
 
 from experiments.blind_check.cases import TIERS
 from experiments.blind_check.sealing import code_digest
-from experiments.blind_check.tables import table
+from experiments.blind_check.tables import everything
 from experiments.saving import save
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "blind_check.json"
@@ -95,7 +95,7 @@ def _score(given: argparse.Namespace) -> int:
     ranges = [(int(a), int(b)) for a, b in (r.split(":") for r in given.only)]
     found = score(given.sealed, given.results, ranges)
     save(given.json, found)
-    print(table(found))
+    print(everything(found))
     print(f"\nSeal {found['seal']['sha256'][:12]} holds; diagnosed by code {found['code'][:12]}.")
     print(_published())
     return 0

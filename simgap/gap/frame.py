@@ -327,9 +327,6 @@ def _there(
     return np.stack([columns[c] for c in CHANNELS], 1).astype(float)
 
 
-TRIALS = 4  # numerics: arrays are padded to multiples of it, so that few programs are compiled
-
-
 class Arrays(NamedTuple):
     """Constants of the contact equations: T trials, N samples, C channels, M moves, O objects.
 
@@ -356,7 +353,7 @@ class Arrays(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """Everything the diagnosis needs of aligned trials; the first `num_trials` rows are real.
+    """Everything the diagnosis needs of aligned trials.
 
     `forces`: each trial's forces (N, 4) [N] as they were read, of which `groups` became one sample here.
     """
@@ -385,17 +382,14 @@ def build(aligned: AlignedTrials) -> Frame:
         raise ValueError("no trial fits its task")
     trials = [a.trial for a in chosen]
     rows = [trial_arrays(a.trial, boundary_quantiles(a), steps, rig) for a in chosen]
-    length = padded_length(max(r["t"].size for r in rows))
-    count = -(-len(rows) // TRIALS) * TRIALS
-    stack = {key: _stacked([r[key] for r in rows], length, count) for key in rows[0] if key != "events"}
+    length = max(r["t"].size for r in rows)
+    stack = {key: _stacked([r[key] for r in rows], length) for key in rows[0] if key != "events"}
     events = np.stack([r["events"] for r in rows])
-    events = np.concatenate([events, np.repeat(events[-1:], count - len(rows), 0)])
-    for r in range(count):
-        end = rows[r]["t"].size if r < len(rows) else 0
+    for r, row in enumerate(rows):
+        end, t = row["t"].size, stack["t"][r]
         stack["there"][r, end:] = 0.0  # padding says nothing
-        t = stack["t"][r]  # time continues evenly, as the sampling interval is read off it
-        last, step = (end, np.median(np.diff(t[:end]))) if end else (1, np.median(np.diff(rows[-1]["t"])))
-        t[last:] = t[last - 1] + step * np.arange(1, t.size - last + 1)
+        # Time continues evenly, as the sampling interval is read off it.
+        t[end:] = t[end - 1] + np.median(np.diff(t[:end])) * np.arange(1, length - end + 1)
     moves = len(task.performed)
     objects, rises = np.zeros((moves, len(task.objects))), np.zeros((moves, len(task.objects)))
     for m, move in enumerate(task.performed):
@@ -431,15 +425,9 @@ def build(aligned: AlignedTrials) -> Frame:
     )
 
 
-def padded_length(samples: int) -> int:
-    """Samples to pad to: 240, 480, 960, .. (ten seconds at 20 Hz fit the first)."""
-    return 240 * 2 ** max(0, int(np.ceil(np.log2(samples / 240))))
-
-
-def _stacked(rows: list[np.ndarray], length: int, count: int) -> np.ndarray:
-    """Rows of different length as one array (count, length, ...), padded with their last entries."""
-    padded = [np.pad(r, [(0, length - len(r)), *[(0, 0)] * (r.ndim - 1)], "edge") for r in rows]
-    return np.stack(padded + [padded[-1]] * (count - len(rows)))
+def _stacked(rows: list[np.ndarray], length: int) -> np.ndarray:
+    """Rows of different length as one array (T, length, ...), padded with their last entries."""
+    return np.stack([np.pad(r, [(0, length - len(r)), *[(0, 0)] * (r.ndim - 1)], "edge") for r in rows])
 
 
 def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:

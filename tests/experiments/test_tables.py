@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.blind_check.tables import fresh
 from experiments.estimates import Estimates, summarise_estimates
 from experiments.real import hiro_snap
-from experiments.table_gap import fresh
 from experiments.table_text import as_csv, covered, markdown
 from experiments.worlds import Deviations, deviated, scene, simulated_cases
 from experiments.write_tables import TABLES, fill
@@ -140,7 +140,7 @@ def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
 
 def test_a_spent_blind_set_is_no_result(monkeypatch):
     seals = {"blind_check": {"seal": {"sha256": "a"}}, "blind_sets": {"sets": [{"seal": "a"}]}}
-    monkeypatch.setattr("experiments.table_gap.load", seals.get)
+    monkeypatch.setattr("experiments.blind_check.tables.load", seals.get)
     assert fresh() is None
     seals["blind_sets"] = {"sets": [{"seal": "b"}]}
     assert fresh() is seals["blind_check"]

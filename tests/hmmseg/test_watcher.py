@@ -1,8 +1,6 @@
 """A task followed while it runs: the same physics as off line, nothing looked ahead, nothing lost."""
 
-import io
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -354,31 +352,6 @@ def test_an_opening_is_read_as_it_comes():
     assert closings.free(0.3, 0.05) and not closings.free(1.0, 0.029)
 
 
-def test_an_arm_of_another_simulator(shared):
-    folder = shared / "panda" / "wrist_restack_1"
-    rig = parse_rig({
-        "gravity": 9.81,
-        "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width", "wrench": ["Fx", "Fy", "Fz"]},
-        "columns": {"width": {"offset": -1.02e-3}},
-        "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
-    })  # fmt: skip
-    blocks = json.loads((folder / "truth.json").read_text())
-    errors = []
-    for k in (1, 2, 3, 4):
-        raw = trial_of(read_table(folder / f"wrist_0{k}.csv", None), rig, None)
-        columns = {"t": raw.t} | raw.channels
-        watcher, lines, final = follow_wrist(columns, rig, read_task(folder / "task.toml"))
-        assert final["fits"] and all(line["fits"] for line in lines)
-        truth = json.loads((folder / "truth" / f"trial_0{k}.json").read_text())["boundaries"]
-        errors += [abs(c.t - b) for c, b in zip(watcher.crossings, truth, strict=True)]
-        for obj, actual in blocks.items():
-            found = final["properties"][obj]
-            assert found["weight"]["mean"] == pytest.approx(actual["weight"], rel=0.02)
-            for prop in ("weight", "width", "height"):
-                assert abs(found[prop]["mean"] - actual[prop]) < 3 * found[prop]["sd"]
-    assert np.median(errors) < 0.03
-
-
 def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
     """As when a block drops out of the grip in mid-air; what is smoothed errs alike, but not so much."""
     folder = shared / "panda" / "wrist_restack_1"
@@ -395,27 +368,3 @@ def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
     assert not final["fits"]
     first = next(line["t"] for line in lines if not line["fits"])
     assert 4.36 < first < 4.86
-
-
-def test_the_command_follows_a_wrist(performed, monkeypatch, capsys, tmp_path):
-    from hmmseg_cli.main import main
-
-    _, columns = performed
-    (tmp_path / "task.toml").write_text(
-        '[objects.a]\non = "b"\n[objects.b]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n'
-        '[[moves]]\nobject = "b"\nto = "a"\n'
-    )
-    (tmp_path / "rig.toml").write_text(
-        '[gripper]\nposition = ["px", "py", "pz"]\nopening = "gap"\nwrench = ["Fx", "Fy", "Fz"]\n'
-        "[fingertip]\nnormal_stiffness = 4000.0\nshear_stiffness = 2500.0\n"
-    )
-    rows = [
-        ",".join(columns),
-        *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True)),
-    ]
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n")))
-    code = main(["watch", "--task", str(tmp_path / "task.toml"), "--rig", str(tmp_path / "rig.toml")])
-    out, err = capsys.readouterr()
-    assert code == 0 and err == ""
-    lines = [json.loads(line) for line in out.splitlines()]
-    assert len(lines) == len(rows) and lines[-1]["fits"]

@@ -28,15 +28,6 @@ def test_effects_are_listed_with_priors(tmp_path, capsys):
     assert "force_bias" in capsys.readouterr().out
 
 
-def test_healthy_recordings_do_not_go_with_simulated_ones(shared, capsys):
-    folder = shared / "recordings/none_1"
-    one, two, three = (str(folder / f"trial_{k:02d}.csv") for k in (1, 2, 3))
-    args = ["diagnose", one, "--task", str(folder / "task.toml"), "--rig", str(folder / "rig.toml"),
-            "--against", two, "--healthy", three]  # fmt: skip
-    assert main(args) == 2
-    assert "does not go with --against" in capsys.readouterr().err
-
-
 def test_the_next_experiment_says_what_it_promises():
     asked = {
         "do": "work twice as fast",

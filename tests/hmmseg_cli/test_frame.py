@@ -29,16 +29,6 @@ def task(tmp_path) -> Path:
     return path
 
 
-def test_process_prints_only_json_on_standard_output(task):
-    done = run("decompose", str(task), "--json", "-", "--seed", "7")
-    assert done.returncode == 0
-    document = json.loads(done.stdout)
-    assert list(document)[:5] == ["format", "version", "seed", "warnings", "figures"]
-    assert document["format"] == "hmmseg.decompose/1"
-    assert (document["version"], document["seed"]) == (hmmseg.__version__, 7)
-    assert "Subtask" in done.stderr
-
-
 def test_process_at_fault_says_one_line_and_exits_with_2(tmp_path):
     (tmp_path / "bad.toml").write_text(TASK.replace('to = "ground"', 'to = "table"'))
     done = run("decompose", "bad.toml", "--json", "out.json", cwd=tmp_path)

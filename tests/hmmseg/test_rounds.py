@@ -1,0 +1,139 @@
+"""Repeated tasks: every round aligned, one that fails leaves the others as they are."""
+
+import json
+import time
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.misfit_edits import join, let_go
+from hmmseg.contact.decompose import subtasks
+from hmmseg.hand.read import read_trial
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, Move
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.align import align
+from hmmseg.segmentation.rounds import round_tasks
+
+STACK = Path(__file__).parents[1] / "data" / "stack"
+RIG = read_rig(STACK / "rig.toml")
+TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
+TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
+PICK = BlockTask({"block1": "ground"}, (Move("block1", "ground"),), repeat="unknown")
+BACK = BlockTask({"a": "ground", "b": "ground"}, (Move("a", "ground"), Move("b", "ground")), repeat="unknown")
+BEFORE, AFTER = 0.6, 0.5  # s of free motion kept about a move
+
+
+def pieces(moves: tuple[int, ...], number: int, dropped: int | None = None):
+    """A session of `number` rounds, each the given moves of one of three trials, and its boundaries [s].
+
+    The block of the last move of round `dropped` (from 0) is let go in mid-air.
+    """
+    parts, truth, clock = [], [], 0.0
+    for r in range(number):
+        for m in moves:
+            trial, b = TRIALS[r % 3], TRUTH[r % 3]
+            part = join(trial, (b[4 * m] - BEFORE, b[4 * m + 3] + AFTER))
+            at = np.array(b[4 * m : 4 * m + 4]) - trial.t[trial.t >= b[4 * m] - BEFORE][0]
+            if r == dropped and m == moves[-1]:
+                quiet = Trial(part.file, part.t, part.channels)
+                part, at = let_go(quiet, at, (at[1] + at[2]) / 2, np.inf), at[:2]
+            parts.append(part)
+            truth.append(clock + at)
+            clock += part.t.size * 0.05
+    channels = {k: np.concatenate([p.channels[k] for p in parts]) for k in parts[0].channels}
+    t = 0.05 * np.arange(len(next(iter(channels.values()))))
+    return Trial("session.csv", t, channels), truth
+
+
+@cache
+def aligned_session(moves: tuple[int, ...], number: int, repeat, dropped: int | None = None):
+    session, truth = pieces(moves, number, dropped)
+    task = replace(PICK if len(moves) == 1 else BACK, repeat=repeat)
+    aligned = align([session], task, RIG)
+    return aligned, truth
+
+
+@pytest.mark.parametrize("repeat", ["unknown", 6])
+@pytest.mark.parametrize("moves", [(0,), (0, 1)])
+def test_every_round_is_aligned(moves, repeat):
+    aligned, truth = aligned_session(moves, 6, repeat)
+    found = aligned.trials[0].segmentation
+    assert found.complete and found.repetitions == 6 and aligned.task.repeat == 6
+    assert len(found.spans) == len(aligned.subtasks) == 1 + 4 * len(moves) * 6
+    assert [(s.subtask, s.object) for s in found.spans] == [(s.name, s.object) for s in aligned.subtasks]
+    starts = np.array([s.start for s in found.spans[1:]])
+    assert np.abs(starts - np.concatenate(truth)).max() < 0.05
+    assert len(aligned.trials[0].boundaries) == starts.size and aligned.trials[0].present.all()
+
+
+@pytest.mark.parametrize(
+    ("repeat", "number", "at"), [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56), (100, 100, 56)]
+)
+def test_a_drop_in_one_round_leaves_the_others(repeat, number, at):
+    aligned, truth = aligned_session((0,), number, repeat, dropped=at)
+    trial, steps = aligned.trials[0], aligned.subtasks
+    found = trial.segmentation
+    assert found.repetitions == number
+    (failure,) = found.failures
+    assert found.failed == failure and failure.repetition == at + 1
+    assert failure.index == 4 * at + 3 and "let go in mid-air" in failure.reason
+    assert str(failure).startswith(f"does not fit its task at place block1: repetition {at + 1}: ")
+    assert np.flatnonzero(~trial.present).tolist() == [4 * at + 3]
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert document["failed"]["repetition"] == at + 1 and len(document["failures"]) == 1
+    starts = np.array([b.quantile(0.5) for b in trial.boundaries])
+    others = [k for k in range(len(steps) - 1) if k // 4 != at]
+    known = np.concatenate([t for r, t in enumerate(truth) if r != at])
+    assert np.abs(starts[others] - known).max() < 0.05
+
+
+def test_a_block_gripped_again_makes_no_further_round():
+    """Ten rounds by the task, and one drop after which the block was gripped again."""
+    aligned, _ = aligned_session((0,), 11, 10, dropped=6)
+    found = aligned.trials[0].segmentation
+    assert [f.repetition for f in found.failures] == [7]
+    assert "let go in mid-air" in found.failures[0].reason and "gripped again" in found.failures[0].reason
+
+
+@pytest.mark.parametrize(("shown", "asked"), [(5, 6), (6, 5)])
+def test_too_few_or_too_many_rounds(shown, asked):
+    aligned, _ = aligned_session((0,), shown, asked)
+    found = aligned.trials[0].segmentation
+    assert found.repetitions == shown and found.failed is not None
+    assert found.failed.repetition == 6
+    words = "ends before it" if shown < asked else "goes on after the task's end with another grip at "
+    assert words in found.failed.reason
+
+
+def test_recordings_may_show_different_numbers_of_rounds():
+    sessions = [pieces((0,), n)[0] for n in (3, 5)]
+    aligned = align(sessions, PICK, RIG)
+    assert aligned.task.repeat == 5 and len(aligned.subtasks) == 21
+    assert [t.segmentation.repetitions for t in aligned.trials] == [3, 5]
+    assert [t.segmentation.complete for t in aligned.trials] == [True, True]
+    assert [int(t.present.sum()) for t in aligned.trials] == [13, 21]
+    assert [len(t.boundaries) for t in aligned.trials] == [20, 20]
+
+
+def test_rounds_start_where_the_last_one_left_the_blocks():
+    task = BlockTask({"a": "b", "b": "ground"}, (Move("a", "ground"),), repeat=3)
+    tasks = round_tasks(task, 3)
+    assert [t.initial["a"] for t in tasks] == ["b", "ground", "ground"]
+    assert [s.state for s in subtasks(tasks[1])] == [s.state for s in subtasks(tasks[0])]
+
+
+@pytest.mark.slow
+def test_hundreds_of_rounds_cost_no_more_each():
+    seconds = {}
+    for number in (40, 40, 320):  # the first compiles
+        session, _ = pieces((0,), number)
+        began = time.process_time()
+        aligned = align([session], PICK, RIG)
+        seconds[number] = (time.process_time() - began) / number
+        assert aligned.trials[0].segmentation.repetitions == number
+        assert aligned.trials[0].segmentation.complete
+    assert seconds[320] < 1.6 * seconds[40]
