@@ -287,7 +287,7 @@ def _values(
 
     model = "" if p.get("nominal") is None else told(lambda u: estimate(p["nominal"], 0.0, u))
     if p["mean"] is None:
-        return model, "not told by these logs", ""
+        return model, "not determined by these logs", ""
     low, high = p["interval_90"] or (None, None)
     ends = "" if low is None or high is None else told(lambda u: interval(low, high, u))
     return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends

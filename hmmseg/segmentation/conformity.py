@@ -147,7 +147,7 @@ def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) 
 
 
 ENDING = 1e-3  # prior: and that its recording stops before the task's end
-# cited: s; nobody grips anew before a slip was felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
+# cited: s; no new grip begins before a slip is felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
 LAPSE = 0.074
 MAX_RATE = 50.0  # chosen: Hz; noise of finer samples is averaged before they are judged
 MAX_ASSIGNMENTS = 24  # numerics: tried at most
@@ -282,7 +282,7 @@ def conformity(
 
 
 def _lapses(c: Conformity) -> list[slice]:
-    """Samples in which a departure has a grip lose its block for too brief a moment to grip anew.
+    """Samples in which a departure has a grip lose its block for too brief a moment to grip again.
 
     From the first of them to the last it was lost for sure. Those that were left out before say nothing.
     """

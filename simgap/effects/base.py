@@ -30,7 +30,7 @@ class World(NamedTuple):
     relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
     `delay`, `smoothing` (4,) [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
     the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
-    yields with that delay (a spring beside a damper). `inertia`: factor of the mass times acceleration.
+    yields with that delay (spring and damper in parallel). `inertia`: factor of the mass times acceleration.
     `couple` [m]: how far the mass lies right of the middle.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.

@@ -15,7 +15,7 @@ from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
 # A hand that is not as its drawing says: angles read with offsets, links longer than nominal, all alike or
-# each by its own, the second finger's base beside its place.
+# each by its own, the second finger's base off its place.
 
 JOINTS = ("q11", "q12", "q21", "q22")
 LINKS = ("link11", "link12", "link21", "link22")
@@ -259,7 +259,7 @@ def _scatter_hand_roll(given, residual: np.ndarray):
     if not (unit > 0).any():
         return None
     found = on_grid("hand_roll", square, unit, ROLLS, rows.cell, VARIED)
-    # How much of it there is in which carry and how fast nobody knows: what lies there has its own variance.
+    # Its size and speed in each carry are unknown: what lies there has its own variance.
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 
 

@@ -102,7 +102,7 @@ FINGERTIP_COMPLIANCE = HandEffect(
 )
 
 
-# A viscoelastic arm on the pad: foam that goes on yielding while held (standard linear solid).
+# A viscoelastic arm on the pad: foam that keeps yielding while held (standard linear solid).
 #
 # Stiff at once by (1 + ratio) k and relaxing to k: with the arm's time constant T, displacement d and
 # force F obey F + T F' = k d + T (1 + ratio) k d'. Solved for d, a share ratio / (1 + ratio) of the

@@ -308,7 +308,7 @@ CLOCK_JITTER = HandEffect(
     shows="noise in proportion to the rate of change",
     mistaken_for=("noise",),
     called="samples that are not taken when their time stamps say",
-    check="Log the acquisition clock beside the time stamps; look for samples stamped on arrival.",
+    check="Log the acquisition clock together with the time stamps; look for samples stamped on arrival.",
     parameters={"sd": Parameter(0.004, 1.0, "s", log=True, low=1e-4, high=0.05)},
     stage=READOUT,
     sampled=lambda t, v, rng: t + rng.normal(0, v["sd"], t.size),

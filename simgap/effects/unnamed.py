@@ -1,4 +1,4 @@
-"""Decoys: fitted to be told from the catalogue's, and never named; where one explains best it is unknown."""
+"""Decoys: fitted as alternatives to the catalogue, never named; where one explains best it is unknown."""
 
 from __future__ import annotations
 

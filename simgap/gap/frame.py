@@ -233,7 +233,7 @@ def trial_arrays(
 
 
 def _struck(force: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Samples (N,) beside a finger's touch or letting go, where its speed jumps as no difference tells."""
+    """Samples (N,) next to a finger's touch or release, where its speed jumps as no difference shows."""
     touches = np.hypot(force[:, ::2], force[:, 1::2]) > SURE * sd[:, None]
     change = np.pad((touches[1:] != touches[:-1]).any(axis=1), (2, 2))
     return change[:-3] | change[1:-2] | change[2:-1] | change[3:]
@@ -249,7 +249,7 @@ def _shaken(
         mine = subtask == s
         weight[mine] = max(float(np.median(force[mine, 1] + force[mine, 3])), 0.0)
     jumps = np.hypot(*(kinks(mean_of(signals, v), sample[v] / root2) for v in ("vx", "vy")))
-    # Differences of speeds have one or the other beside a jump, and what pads hold rings as much again, both
+    # Differences of speeds have one or the other next to a jump, and what pads hold rings as much again, both
     # ways, for it turns in the grip as well.
     return weight * root2 * of_a_kink(group)[1] / step * jumps
 
@@ -262,7 +262,7 @@ def _one_finger(
     boundaries: np.ndarray,
     sd: np.ndarray,
 ) -> np.ndarray:
-    """Samples (N,) of free motion beside a grip at which one finger touches already or still.
+    """Samples (N,) of free motion next to a grip at which one finger touches already or still.
 
     Such a touch is a contact that the task does not list and no gap. One finger presses inwards, compared
     with its own median in that free motion, and the other does not; `sd` (N,) is a force's noise [N].
@@ -332,7 +332,7 @@ class Arrays(NamedTuple):
 
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): how far it
     is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `kind` (T, N):
-    2 * phase, + 1 beside a contact change; `subtask` (T, N);
+    2 * phase, + 1 next to a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
     `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
     forces as they stand in `World`.
@@ -388,7 +388,7 @@ def build(aligned: AlignedTrials) -> Frame:
     for r, row in enumerate(rows):
         end, t = row["t"].size, stack["t"][r]
         stack["there"][r, end:] = 0.0  # padding says nothing
-        # Time goes on evenly, for the sampling interval is read off it.
+        # Time continues evenly, as the sampling interval is read off it.
         t[end:] = t[end - 1] + np.median(np.diff(t[:end])) * np.arange(1, length - end + 1)
     moves = len(task.performed)
     objects, rises = np.zeros((moves, len(task.objects))), np.zeros((moves, len(task.objects)))

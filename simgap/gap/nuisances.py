@@ -1,4 +1,4 @@
-"""What recordings contain that is nobody's fault, as columns that are fitted along with every effect.
+"""What recordings contain that is not a fault, as columns fitted together with every effect.
 
 What rig.toml admits under [systematic]; speeds that a drive takes as differences; and blocks that turn in the
 grip. Each column is per its standard deviation beforehand, so that its prior is N(0, 1).
@@ -105,7 +105,7 @@ def _turning(given: Problem) -> list[np.ndarray]:
     Balance of moments about its middle: what both fingers' shears and the couple of grips at unequal heights
     exert turns a block against the pads, as far as its support does not hold it upright. The support's load
     acts within its feet, so it holds a moment up to the load times half its stance; beyond that the block
-    turns about a foot, and its middle rises. How easily pads turn is nobody's fault.
+    turns about a foot, and its middle rises. How easily pads turn is not a fault.
     """
     world, arrays = given.frame.world, given.frame.arrays
     stiffness = 1 / np.maximum(world.give_normal.mean(), 1e-9)

@@ -382,7 +382,7 @@ def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | No
     """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
 
     Properties have normal priors, an effect's parameters together a Cauchy distribution. `usual`: derivatives
-    by the properties, if `evaluated` need not take them anew.
+    by the properties, if `evaluated` need not recompute them.
     """
     mine, z = columns_of(given, start.effects), given.num_properties
     low, high = (edge[mine] for edge in limits(given))

@@ -154,7 +154,7 @@ def doubt_between(world: World) -> np.ndarray:
         p0, p1, p2, p3, share = _around(world.force, world.delay / sampling_interval(world))
         share = share * (1 - share)
         bend = np.maximum(np.abs(p2 - 2 * p1 + p0), np.abs(p3 - 2 * p2 + p1))
-        # A change that neither side goes on with may have come at any moment between the two samples.
+        # A change that neither side continues may have come at any moment between the two samples.
         jump = np.maximum(np.abs(p2 - p1) - np.maximum(np.abs(p1 - p0), np.abs(p3 - p2)), 0.0)
         out = np.square(BETWEEN * share * bend) + share * np.square(EITHER * jump)
     if world.modes[SMOOTH]:
