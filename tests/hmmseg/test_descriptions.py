@@ -117,11 +117,6 @@ def test_refused_with_its_message(table, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_absent(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.toml: no such file; expected a TOML file"):
-        read_rig(tmp_path / "absent.toml")
-
-
 STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
 SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]
 BACK = [{"object": "a", "to": "b"}, {"object": "a", "to": "ground"}]
@@ -233,14 +228,15 @@ def test_a_task_refused_with_its_message(table, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_absent_or_malformed(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.toml: no such file; expected a TOML file"):
-        read_task(tmp_path / "absent.toml")
+@pytest.mark.parametrize("read", [read_rig, read_task])
+def test_a_file_that_is_absent_or_malformed(read, tmp_path):
     (tmp_path / "bad.toml").write_text("moves = [")
-    with pytest.raises(InputError, match=r"bad\.toml: not valid TOML: "):
-        read_task(tmp_path / "bad.toml")
     (tmp_path / "latin.toml").write_bytes(b'sequence = ["\xe9"]')
-    with pytest.raises(InputError, match=r"latin\.toml: cannot be read"):
-        read_task(tmp_path / "latin.toml")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_task(tmp_path)
+    for name, line in (
+        ("absent.toml", r"absent\.toml: no such file; expected a TOML file"),
+        ("bad.toml", r"bad\.toml: not valid TOML: "),
+        ("latin.toml", r"latin\.toml: cannot be read"),
+        (".", "cannot be read"),
+    ):
+        with pytest.raises(InputError, match=line):
+            read(tmp_path / name)

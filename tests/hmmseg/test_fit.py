@@ -221,6 +221,10 @@ def test_files_that_are_no_models_are_refused(tmp_path):
         ({"trial_0": [1.0, np.nan, 2.0]}, "a boundary that is no number"),
         ({"trial_0": ["x", 1, 2]}, "a list of times in s"),
         ({"other": [1.0, 2.0, 3.0]}, "none is for these trials"),
+        ({"trial_0": [None, None, None]}, "has no boundary"),
+        ({"trial_0": {"lift": 2.0}}, "gives the start of 'lift', which has none in this task"),
+        ({"trial_0": {"wait": 2.0}}, "gives the start of 'wait'"),
+        ({"trial_0": {"pull": 99.0}}, "times between 0 and"),
     ],
 )
 def test_bad_labels_are_refused(labels, message):

@@ -16,16 +16,17 @@ from file_writers import (
     FAST,
     SLOW,
     START,
+    Topic,
     force,
     height,
     joint,
+    mcap_of,
     robomimic_of,
     write_bag,
     write_lerobot,
     write_mcap,
-    write_robomimic,
+    write_robomimic,  # fmt: skip
 )
-from log_writers import Topic, mcap_of
 from mcap.reader import make_reader
 
 from hmmseg.errors import InputError

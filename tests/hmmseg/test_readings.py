@@ -238,20 +238,6 @@ def test_courses_are_saved(tmp_path):
         load_model(tmp_path / "m.npz", TASK)
 
 
-@pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        ({"trial_0": [None, None]}, "has no boundary"),
-        ({"trial_0": {"lift": 2.0}}, "gives the start of 'lift', which has none in this task"),
-        ({"trial_0": {"wait": 2.0}}, "gives the start of 'wait'"),
-        ({"trial_0": {"pull": 99.0}}, "times between 0 and"),
-    ],
-)
-def test_labels_that_do_not_fit_are_refused(labels, message):
-    with pytest.raises(InputError, match=message):
-        fit_sequence(ambiguous(1)[0], TASK, labels)
-
-
 def test_the_shortest_interval_holds_nine_tenths_and_none_on_a_fine_grid_is_shorter():
     rng = np.random.default_rng(0)
     for _ in range(50):

@@ -12,9 +12,20 @@ import numpy as np
 import pandas as pd
 import pytest
 from fault_scene import CARTESIAN
-from file_writers import lerobot_of, robomimic_of, write_mcap, write_robomimic
-from log_writers import bag_of, mcap_of
-from walk_scene import finger_columns, finger_topics, finger_vectors, german, wrist_topics, wrist_vectors
+from file_writers import (
+    bag_of,
+    finger_columns,
+    finger_topics,
+    finger_vectors,
+    german,
+    lerobot_of,
+    mcap_of,
+    robomimic_of,
+    wrist_topics,
+    wrist_vectors,
+    write_mcap,
+    write_robomimic,
+)
 
 from experiments.wrist_scene import Setup, performances, wrist_recording
 from hmmseg.hand.inspect import inspect, propose
@@ -191,7 +202,6 @@ def test_new_lays_out_files_that_read(tmp_path, hand):
 
 def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
     """`new`, then `inspect --write`: the file's names in the places of those laid out, all else as it was."""
-    from walk_scene import wrist_topics
 
     rig = tmp_path / "lab/rig.toml"
     log = mcap_of(tmp_path / "a.mcap", wrist_topics(WRIST))
@@ -210,7 +220,6 @@ def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
 
 def test_axes_of_the_work_are_found_in_what_the_fingers_do(tmp_path):
     """Three axes of poses and wrenches, of which the fingers close along y and lift along z."""
-    from walk_scene import finger_topics
 
     ours = cartesian()
     found = inspect(mcap_of(tmp_path / "a.mcap", finger_topics(ours)))

@@ -44,13 +44,6 @@ def test_smooth_forces_are_found_behind_a_low_pass(time):
     assert off.max() < 0.08  # beside a crest that falls unevenly on its samples
 
 
-def test_a_crest_is_no_corner():
-    t = np.arange(80) * STEP
-    wave = np.sin(2 * np.pi * 3.0 * t)
-    found = np.asarray(shifted(np.asarray(wave)[None, :, None], 0.5))[0, :, 0]
-    assert np.abs(found - np.sin(2 * np.pi * 3.0 * (t + STEP / 2)))[2:-3].max() < 0.14  # a cubic's own error
-
-
 def test_no_force_before_the_contact_behind_a_low_pass():
     t = np.arange(60) * STEP
     onset = 20.4 * STEP

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from demo_recordings import recorded
 
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import BlockTask, read_task
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
@@ -48,11 +45,7 @@ def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
 
 @pytest.fixture(scope="module")
 def given():
-    folder = Path(__file__).parents[2] / "recordings" / "none_1"
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    assert isinstance(task, BlockTask)
-    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
-    return double_precision(lambda: problem(build(align(trials, task, rig))))()
+    return double_precision(lambda: problem(build(align(*recorded("none_1", 2)))))()
 
 
 def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
