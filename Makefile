@@ -49,18 +49,21 @@ wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, 
 # Both ends of what pyproject.toml declares, each in an environment of its own; ArviZ 1 needs Python 3.12,
 # which NEWEST_PYTHON can name.
 NEWEST_PYTHON ?= $(BIN)/python
-oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares
+oldest: $(BIN)/uv  ## the demo and the file formats with the oldest versions that pyproject.toml declares
 	$(call at_versions,oldest,$(BIN)/python,--resolution lowest-direct)
 
-newest: $(INSTALLED)  ## the demo with the newest versions there are
+newest: $(BIN)/uv  ## the demo and the file formats with the newest versions there are
 	$(call at_versions,newest,$(NEWEST_PYTHON),--upgrade)
 
-define at_versions
+$(BIN)/uv: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+
+define at_versions
 	$(BIN)/uv venv --quiet --clear --python $(2) build/$(1)
-	$(BIN)/uv pip install --quiet --python build/$(1) $(3) '.[mujoco]'
+	$(BIN)/uv pip install --quiet --python build/$(1) $(3) '.[mujoco,files]' 'pytest>=8'
 	build/$(1)/bin/hmmseg doctor
-	build/$(1)/bin/hmmseg demo --figures build/$(1)_demo
+	build/$(1)/bin/hmmseg demo --quiet --figures build/$(1)_demo
+	build/$(1)/bin/python -m pytest -q -W default -p no:cacheprovider tests/hmmseg/test_formats.py
 endef
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors

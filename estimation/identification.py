@@ -122,9 +122,8 @@ class Identification(Tabled):
             return None
         found = self.sampled
         return {
-            "method": found.method, "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess,
-            "rhat": found.rhat, "acceptance": found.acceptance, "converged": found.converged,
-            "apart_from_laplace": found.apart,
+            "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess, "rhat": found.rhat,
+            "acceptance": found.acceptance, "converged": found.converged,
         }  # fmt: skip
 
     def tables(self):
@@ -195,8 +194,6 @@ def identify_aligned(
             reasons |= contradicted | impossible(design, sampled)
             kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
             scale = None if aligned.late else force_scale(design.doubt, weighed, rig)
-        if sampled.method != "emcee":
-            warnings.append("the chain did not converge: intervals are of the weighted Laplace approximation")
         if not sampled.converged:
             why = f"the sampler has not converged: {sampled.shortfall}"
             warnings.append(why)

@@ -1,10 +1,9 @@
 """emcee on the scales, the unknowns drawn given them: moves, convergence and draws.
 
 All else is integrated out (`estimation.posterior`), so emcee moves in six dimensions whatever the
-task. Most proposals are independent draws (`estimation.proposal`), the rest differential evolution
-(ter Braak 2006), which frees walkers that it would hold in a tail. The chain is checked against the
-same proposal's importance-weighted draws, which owe nothing to the chain.
-benchmarks/moves.py of commit f82105c compares them with emcee's stretch move.
+task. Most proposals are independent draws (`Proposal`), the rest differential evolution (ter Braak 2006),
+which frees walkers that it would hold in a tail. benchmarks/moves.py of commit f82105c compares them with
+emcee's stretch move.
 
 Draws where it is open whether the rig's pads are as it says: from both possibilities, by their odds.
 
@@ -104,9 +103,7 @@ ENOUGH = 1.5 * MIN_ESS  # to stop at: an estimate of it is itself uncertain
 GROUPS = 4  # numerics: chains that walkers are joined into for R-hat
 KEPT = 4096  # numerics: draws of the unknowns at least, where the chain has so many
 BATCH = 256  # numerics: drawn at once
-IMPORTANCE = 4000  # numerics: independent draws that the chain is checked against
-MIN_EFFICIENCY = 0.05  # numerics: of them, for a check, and to stand in where the chain does not converge
-MAX_APART = 0.25  # numerics: of a posterior sd, between the chain's means of the scales and those draws'
+MIN_EFFICIENCY = 0.05  # numerics: share of draws that the unknowns' priors must leave effective
 
 
 @dataclass(frozen=True, repr=False)
@@ -116,9 +113,7 @@ class Draws(Brief):
     `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest
     split R-hat over scales, walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6):
     of model error that all grips have alike; `deviations` (walkers, steps, N) of the hand.
-    `apart`: largest distance of the chain's mean scales from those of importance-weighted draws, in
-    posterior sds; None where these are too few. `method`: "emcee", or "laplace" for those draws, which
-    stand in where the chain did not converge. `prior_ess`: share of draws left effective by the
+    `prior_ess`: share of draws left effective by the
     unknowns' priors. `impossible`: unknowns whose every draw has a sign that no such property has.
     """
 
@@ -130,9 +125,7 @@ class Draws(Brief):
     rhat: float
     acceptance: float
     steps: int
-    method: str
     prior_ess: float
-    apart: float | None
     impossible: tuple[int, ...] = ()
 
     @property
@@ -147,10 +140,6 @@ class Draws(Brief):
             return f"effective sample size of {self.ess:.0f}; {MIN_ESS:.0f} are needed"
         if self.rhat > MAX_RHAT:
             return f"R-hat of {self.rhat:.3f}; at most {MAX_RHAT:g} is allowed"
-        if self.apart is not None and self.apart > MAX_APART:
-            return (
-                f"means {self.apart:.2f} sd from those of independent draws; at most {MAX_APART:g} is allowed"
-            )
         if self.prior_ess < MIN_EFFICIENCY:
             shared = f"recording and priors have {self.prior_ess:.2%} of the draws in common"
             return f"{shared}; at least {MIN_EFFICIENCY:.0%} are needed"
@@ -199,17 +188,7 @@ def sample(
         long = ess >= MIN_LENGTH * WALKERS
         if steps >= 2 * CHUNK and long and ess >= ENOUGH and rhat <= MAX_RHAT:
             break
-    acceptance, method = float(sampler.acceptance_fraction.mean()), "emcee"
-    drawn, weight = importance(post, independent, random)
-    efficiency, apart = 1 / (weight**2).sum() / len(weight), None
-    if efficiency >= MIN_EFFICIENCY:
-        apart = _apart(chain, drawn, weight)
-        if ess < MIN_ESS or rhat > MAX_RHAT or apart > MAX_APART:
-            drawn, weight = importance(post, independent, random, int(ENOUGH / efficiency))
-            index = random.permutation(_resampled(weight, random))
-            num = len(index) // WALKERS
-            chain = drawn[index[: WALKERS * num]].reshape(WALKERS, num, -1)
-            ess, rhat, method, apart = float(1 / (weight**2).sum()), 1.0, "laplace", None
+    acceptance = float(sampler.acceptance_fraction.mean())
     thin = max(chain.shape[0] * chain.shape[1] // KEPT, 1)
     scales = chain[:, thin - 1 :: thin]
     rest, prior_ess, impossible = draw_unknowns(post, scales.reshape(-1, scales.shape[-1]), random)
@@ -217,25 +196,8 @@ def sample(
     rest = rest.reshape(*scales.shape[:2], -1)
     return Draws(
         scales, rest[..., :num], rest[..., num : num + deviations], rest[..., num + deviations :],
-        ess, rhat, acceptance, steps, method, prior_ess, apart, impossible,
+        ess, rhat, acceptance, steps, prior_ess, impossible,
     )  # fmt: skip
-
-
-def importance(
-    post: Posterior, independent: Proposal, random: np.random.RandomState, num: int = IMPORTANCE
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws (num, 6) of the proposal and their normalised importance weights (num,)."""
-    x = independent.draw(num, random)
-    log_weight = post.log_prob(x) - independent.log_density(x)
-    weight = np.exp(log_weight - log_weight.max())
-    return x, weight / weight.sum()
-
-
-def _apart(chain: np.ndarray, drawn: np.ndarray, weight: np.ndarray) -> float:
-    """Largest distance of the means of a chain (walkers, steps, 6) from weighted draws', in their sds."""
-    mean = weight @ drawn
-    sd = np.sqrt(weight @ (drawn - mean) ** 2)
-    return float(np.max(np.abs(chain.mean(axis=(0, 1)) - mean) / sd))
 
 
 def draw_unknowns(

@@ -192,8 +192,26 @@ def table() -> str | None:
     return "\n\n".join(parts)
 
 
+def headline() -> str | None:
+    """README: errors and coverage on two kinds of recordings, in four rows."""
+    found = load("calibration")
+    if found is None or "recordings" not in found:
+        return None
+    columns = [found["recordings"]["pooled"], found["bank"]["pooled"]]
+    b, p = [c["boundaries"]["all"] for c in columns], [c["properties"] for c in columns]
+    rows = [
+        ["boundary error, median", *(milliseconds(x["median"]) for x in b)],
+        ["90 % boundary intervals cover", *(covered(x, "coverage_90") for x in b)],
+        [", ".join(PROPERTIES), *(", ".join(percent(x[k]["rms"], 2) for k in PROPERTIES) for x in p)],
+        ["95 % property intervals cover", *(covered(x["all"], "coverage_95") for x in p)],
+    ]
+    cases = [f"{c['estimates']}" for c in columns]
+    table = markdown(["", f"recordings ({cases[0]} cases)", f"virtual model ({cases[1]} cases)"], rows)
+    return f"{table}\n\nFour trials a case; properties: rms relative error."
+
+
 def results() -> str | None:
-    """README: what was measured on two kinds of recordings; the paper's numbers below."""
+    """docs/results.md: what was measured on two kinds of recordings; the paper's numbers below."""
     found = load("calibration")
     if found is None or "recordings" not in found:
         return None

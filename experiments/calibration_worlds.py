@@ -67,7 +67,6 @@ def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
         "properties": properties, "boundaries": [float(r) for r in residual], "held_90": held,
         "reach_90": reach,
         "misfits": sum(not s.complete for s in said.segmentations), "trials": len(found.trials),
-        "sampler": None if said.sampled is None else said.sampled.method,
         "seconds": time.process_time() - began,
     }  # fmt: skip
 
@@ -86,7 +85,6 @@ def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
     out: dict[str, Any] = {
         "replicates": len(scored), "trials": sum(s["trials"] for s in scored),
         "misfits": sum(s["misfits"] for s in scored),
-        "laplace": sum(s["sampler"] == "laplace" for s in scored),
     }  # fmt: skip
     ranks = [np.array([p["rank"] for p in s["properties"]]) for s in scored]
     z = np.concatenate([[p["z"] for p in s["properties"]] for s in scored])

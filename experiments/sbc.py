@@ -94,7 +94,7 @@ def ranks_of(number: int) -> tuple[np.ndarray, list[str], str]:
     found = sample(posterior(design), seed=number)
     chosen = rng.permutation(len(found.flat))[:DRAWS]  # the chain's draws are nearly independent
     ranks = (found.flat[chosen] < true).sum(axis=0)
-    return ranks, [u.prop for u in design.unknowns], found.method if found.converged else "not converged"
+    return ranks, [u.prop for u in design.unknowns], "emcee" if found.converged else "not converged"
 
 
 def summary(ranks: np.ndarray) -> dict[str, Any]:

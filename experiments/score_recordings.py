@@ -131,7 +131,7 @@ def cells(s: dict) -> list[str]:
 
 
 def table() -> str | None:
-    """docs/results.md: the switching model beside the paper's method, on every recording of the folder."""
+    """docs/results.md: the model against the paper's method, on every recording."""
     methods = {"hmm": "this model", "qualitative": "thresholds, best monotone order",
                "first-change": "thresholds, first change (the paper)"}  # fmt: skip
     rows = []

@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[1]
 
 # Page, name of the table on it (none: it is the whole file), what writes it, and the target of its numbers.
 TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
-    ("README.md", "results", calibration.results, "results"),
+    ("README.md", "results", calibration.headline, "results"),
     ("docs/results.md", "results", calibration.results, "results"),
     ("docs/results.md", "rivals", score_recordings.table, "results"),
     ("docs/results.md", "real", hiro_snap.table, "real"),

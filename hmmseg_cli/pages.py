@@ -287,7 +287,7 @@ def _values(
 
     model = "" if p.get("nominal") is None else told(lambda u: estimate(p["nominal"], 0.0, u))
     if p["mean"] is None:
-        return model, "not told by these logs", ""
+        return model, "not determined by these logs", ""
     low, high = p["interval_90"] or (None, None)
     ends = "" if low is None or high is None else told(lambda u: interval(low, high, u))
     return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
@@ -347,8 +347,9 @@ def _detection(body: Body) -> str:
         text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
-    fewer = f"so few healthy twins were simulated that counting them shows no less than {percent(fineness)}"
-    return f"{text}; {fewer}, and what is below follows from the sensors' noise."
+    twins = round(1 / fineness) - 1
+    few = "one healthy twin was" if twins == 1 else f"{twins} healthy twins were"
+    return f"{text}. This follows from the sensors' noise: {few} simulated, too few to count."
 
 
 def _far(body: Body) -> str:

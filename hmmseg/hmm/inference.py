@@ -27,15 +27,12 @@ import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from hmmseg.hmm import durations, recursions
+from hmmseg.hmm import recursions
 from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
-from hmmseg.hmm.durations import DurationChain
-from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
+from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Posterior
 
-AnyChain = Chain | DurationChain
 SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
 TOGETHER = 64  # numerics: recordings of one shape that make one call; what is over is done one by one
-MAX_RANKS = 65_535  # limit: of k_best
 
 
 def ladder(num_samples: int) -> int:
@@ -63,7 +60,7 @@ def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
         InfeasibleAlignment, ValueError: see the module.
     """
     if _single(log_likelihoods, chain):
-        return _run(_viterbi, log_likelihoods, chain, lengths, parallel=parallel)
+        return _run(_viterbi, log_likelihoods, chain, lengths, parallel)
     tables, chains = recordings(log_likelihoods, chain, lengths)
     found = run_many(_viterbi, tables, chains, parallel=parallel)
     num_states = chains[0].num_states if chains else 0
@@ -74,7 +71,7 @@ def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
     )
 
 
-def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
+def log_evidence(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
                  parallel: bool | None = None) -> Any:  # fmt: skip
     """Log of the summed weight of all paths.
 
@@ -82,43 +79,13 @@ def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None
     probability of each state at each sample, with respect to the weights of a chain the expected number of
     moves. Arguments and exceptions as of `viterbi`.
     """
-    return _run(_log_evidence, log_likelihoods, chain, length, parallel=parallel, inside=_differentiable)
+    return _run(_log_evidence, log_likelihoods, chain, length, parallel, _differentiable)
 
 
-def filter(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
-           parallel: bool | None = None) -> Filtered:  # fmt: skip
-    """What each sample says together with those before it. Arguments and exceptions as of `viterbi`."""
-    return _run(_filter, log_likelihoods, chain, length, parallel=parallel)
-
-
-def smooth(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
+def smooth(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
            parallel: bool | None = None) -> Posterior:  # fmt: skip
     """Probabilities of states and boundaries given the whole recording; arguments as of `viterbi`."""
-    return _run(_smooth, log_likelihoods, chain, length, parallel=parallel)
-
-
-def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: Any = 0,
-           length: Any = None) -> Alignments:  # fmt: skip
-    """Independent exact draws from the posterior over alignments.
-
-    `seed`: a number, or a key of jax.random. `log_prob` is NaN. Further arguments as of `viterbi`.
-    """
-    key = jax.random.key(seed) if isinstance(seed, (int, np.integer)) else seed
-    return _run(_sample, log_likelihoods, chain, length, key, num_draws=num_draws, parallel=None)
-
-
-def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int, length: Any = None) -> Alignments:
-    """The k most probable alignments, best first; fewer where fewer are possible (under jit: -inf).
-
-    Arguments and exceptions as of `viterbi`.
-    """
-    if not 0 < k <= MAX_RANKS:
-        raise ValueError(f"k: {k}, expected 1 to {MAX_RANKS}")
-    found = _run(_k_best, log_likelihoods, chain, length, k=k, parallel=None)
-    if not isinstance(found.log_prob, np.ndarray):
-        return found
-    keep = int(np.isfinite(found.log_prob).sum())
-    return Alignments(found.starts[:keep], found.num_samples[:keep], found.log_prob[:keep])
+    return _run(_smooth, log_likelihoods, chain, length, parallel)
 
 
 # What the functions compute: of rows x without NaN and a length n, padded or not, the log weight that must be
@@ -130,43 +97,32 @@ def _tables(chain: Chain) -> tuple[jax.Array, jax.Array, jax.Array]:
     return chain.by_target(jnp), initial, final
 
 
-def _viterbi(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
-    if isinstance(chain, DurationChain):
-        starts, log_prob = durations.rank(x, chain, n, 1)
-        starts, log_prob = starts[0], log_prob[0]
-    else:
-        starts, log_prob = recursions.best_path(x, *_tables(chain), n, parallel=parallel)
+def _viterbi(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
+    starts, log_prob = recursions.best_path(x, *_tables(chain), n, parallel=parallel)
     return log_prob, Alignment(starts, n, log_prob)
 
 
-def _log_evidence(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
-    if isinstance(chain, DurationChain):
-        total = durations.evidence(x, chain, n)
-    else:
-        total = recursions.evidence(x, *_tables(chain), n, parallel=parallel)
+def _log_evidence(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
+    total = recursions.evidence(x, *_tables(chain), n, parallel=parallel)
     return total, total
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _differentiable(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> jax.Array:
+def _differentiable(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> jax.Array:
     """The log evidence in the precision of x. Its gradient is the posterior, in that of what it is of."""
     with jax.enable_x64(True):
         return _log_evidence(x, chain, n, parallel)[0].astype(x.dtype)
 
 
-def _with_gradient(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
+def _with_gradient(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
     with jax.enable_x64(True):
-        if isinstance(chain, DurationChain):
-            total, states, _ = durations.posterior(x, chain, n)
-            by_chain = None
-        else:
-            total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
-            bands = [moves[:, d, d:] for d in range(len(chain.bands))]
-            bands = [each if band.ndim == 2 else each.sum(0)
-                     for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
-            ends = states[0], recursions.row(states, n - 1)
-            by_chain = Chain.tree_unflatten(None, (tuple(bands), *ends))
-            by_chain = jax.tree.map(lambda by, of: by.astype(of.dtype), by_chain, chain)
+        total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+        bands = [moves[:, d, d:] for d in range(len(chain.bands))]
+        bands = [each if band.ndim == 2 else each.sum(0)
+                 for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
+        ends = states[0], recursions.row(states, n - 1)
+        by_chain = Chain.tree_unflatten(None, (tuple(bands), *ends))
+        by_chain = jax.tree.map(lambda by, of: by.astype(of.dtype), by_chain, chain)
         gradient = jnp.where(jnp.isnan(x), 0.0, states).astype(x.dtype)
         return total.astype(x.dtype), (gradient, by_chain)
 
@@ -179,45 +135,12 @@ def _pull_back(parallel: bool | None, gradients: Any, cotangent: jax.Array) -> t
 _differentiable.defvjp(_with_gradient, _pull_back)
 
 
-def _filter(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Filtered]:
-    if isinstance(chain, DurationChain):
-        raise ValueError("chain: tables of durations, expected a Chain")
-    w, initial, final = _tables(chain)
-    table, taken = recursions.forward(x, w, initial, n, recursions.log_add, parallel)
-    table = jnp.where((recursions.numbers(len(x)) < n)[:, None], table, recursions.NEVER)
-    total = recursions.log_sum(recursions.row(table, n - 1) + final, 0) + taken
-    return total, Filtered(total, recursions.probabilities(table, 1))
-
-
-def _smooth(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
-    if isinstance(chain, DurationChain):
-        total, states, moves = durations.posterior(x, chain, n)
-    else:
-        total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+def _smooth(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
+    total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
     return total, Posterior(total, states, tuple(moves[:, d, d:] for d in range(1, moves.shape[1])))
 
 
-def _sample(x: jax.Array, chain: Any, n: jax.Array, key: jax.Array, num_draws: int,
-            parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
-    if isinstance(chain, DurationChain):
-        total, starts = durations.draw(x, chain, n, key, num_draws)
-    else:
-        total, starts = recursions.draw(x, *_tables(chain), n, key, num_draws, parallel)
-    unknown = jnp.where(jnp.isfinite(total), jnp.nan, total)  # -inf where there was no path to draw
-    return total, Alignments(starts, jnp.full(num_draws, n), jnp.full(num_draws, unknown))
-
-
-def _k_best(x: jax.Array, chain: Any, n: jax.Array, k: int,
-            parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
-    del parallel  # ranks are found row by row on every device
-    if isinstance(chain, DurationChain):
-        starts, log_prob = durations.rank(x, chain, n, k)
-    else:
-        starts, log_prob = recursions.rank(x, *_tables(chain), n, k)
-    return log_prob[0], Alignments(starts, jnp.full(k, n), log_prob)
-
-
-def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple]:
+def _align(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple]:
     total, posterior = _smooth(x, chain, n, parallel)
     return total, (_viterbi(x, chain, n, parallel)[1], posterior)
 
@@ -226,18 +149,18 @@ def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tup
 
 
 def _single(log_likelihoods: Any, chain: Any) -> bool:
-    return getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain)
+    return getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, Chain)
 
 
-def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
-         inside: Callable | None = None, parallel: bool | None, **static: Any) -> Any:  # fmt: skip
+def _run(core: Callable, log_likelihoods: Any, chain: Chain, length: Any, parallel: bool | None,
+         inside: Callable | None = None) -> Any:  # fmt: skip
     """The core on one recording: traced where anything of it is, else compiled, as NumPy arrays."""
-    leaves = jax.tree.leaves((log_likelihoods, chain, length, keys))
+    leaves = jax.tree.leaves((log_likelihoods, chain, length))
     if not any(isinstance(leaf, Tracer) for leaf in leaves):
         table = checked(log_likelihoods, chain)
         if length is not None:
             table = table[: _checked_length(int(length), len(table))]
-        return run_many(core, [table], [chain], *keys, parallel=parallel, **static)[0]
+        return run_many(core, [table], [chain], parallel=parallel)[0]
     x = jnp.asarray(log_likelihoods)
     _check_shape(x, chain)
     with jax.enable_x64(True):
@@ -248,11 +171,11 @@ def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: A
             return inside(
                 x.astype(kind), jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain), n, parallel
             )
-        found = core(x, chain, n, *keys, parallel=parallel, **static)[1]
+        found = core(x, chain, n, parallel)[1]
         return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, found)
 
 
-def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
+def checked(log_likelihoods: ArrayLike, chain: Chain) -> np.ndarray:
     """Doubles (num_samples, num_states); ValueError for what is no such table."""
     ll = np.asarray(log_likelihoods, dtype=np.float64)
     _check_shape(ll, chain)
@@ -264,7 +187,7 @@ def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
     return ll
 
 
-def _check_shape(ll: Any, chain: AnyChain) -> None:
+def _check_shape(ll: Any, chain: Chain) -> None:
     if ll.ndim != 2 or 0 in ll.shape:
         raise ValueError(f"log_likelihoods: shape {ll.shape}, expected (num_samples, num_states)")
     num_samples, num_states = ll.shape
@@ -282,7 +205,7 @@ def _checked_length(length: int, num_samples: int, recording: str = "") -> int:
     return length
 
 
-def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
+def recordings(log_likelihoods: Any, chain: Chain | Sequence[Chain],
                lengths: Sequence[int] | np.ndarray | None) -> tuple[list, list]:  # fmt: skip
     """Checked tables and chains of several recordings."""
     tables = list(log_likelihoods)
@@ -293,14 +216,14 @@ def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
             ll[: _checked_length(n, len(ll), f" for recording {i}")]
             for i, (ll, n) in enumerate(zip(tables, lengths, strict=True))
         ]
-    chains = [chain] * len(tables) if isinstance(chain, AnyChain) else list(chain)
+    chains = [chain] * len(tables) if isinstance(chain, Chain) else list(chain)
     if len(chains) != len(tables):
         raise ValueError(f"chain: {len(chains)} given, expected {len(tables)}, one a recording")
     return [checked(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
 
 
-def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
-             parallel: bool | None = None, **static: Any) -> list:  # fmt: skip
+def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Chain],
+             parallel: bool | None = None) -> list:  # fmt: skip
     """The core on checked recordings, each padded to the ladder: one program for all of one shape.
 
     Raises InfeasibleAlignment, and ValueError for +inf.
@@ -325,12 +248,11 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
                 row[: len(tables[i])] = tables[i]
             chain = jax.tree.map(lambda *leaves: np.stack(leaves), *(padded[i] for i in part))
             with jax.enable_x64(True):
-                program = compiled(core, parallel, tuple(sorted(static.items())))
-                totals, results = jax.tree.map(np.asarray, program(x, chain, n, *keys))
+                program = compiled(core, parallel)
+                totals, results = jax.tree.map(np.asarray, program(x, chain, n))
             for j, i in enumerate(part):
                 if not np.isfinite(totals[j]):
-                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
-                    raise why(tables[i], chains[i])
+                    raise why_infeasible(tables[i], chains[i])
                 found[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], results), len(tables[i]))
     return found
 
@@ -346,25 +268,23 @@ def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> lis
 
 
 @cache
-def compiled(core: Callable, parallel: bool, static: tuple) -> Callable:
+def compiled(core: Callable, parallel: bool) -> Callable:
     """The core for several recordings as one program."""
-    kws = dict(static, parallel=parallel)
 
-    def run(x: jax.Array, chain: Any, n: jax.Array, *keys: jax.Array) -> Any:
+    def run(x: jax.Array, chain: Chain, n: jax.Array) -> Any:
         def one(args: tuple) -> Any:
-            return core(*args, *keys, **kws)
+            return core(*args, parallel)
 
         return jax.vmap(one)((x, chain, n)) if parallel else jax.lax.map(one, (x, chain, n))
 
     return jax.jit(run)
 
 
-def _padded(chain: AnyChain, num_samples: int) -> AnyChain:
+def _padded(chain: Chain, num_samples: int) -> Chain:
     """The chain for a recording that is padded to the ladder."""
     if chain.num_samples is None:
         return chain
     more = ladder(num_samples) - num_samples
-    assert isinstance(chain, Chain)
     bands = tuple(
         np.pad(band, ((0, more), (0, 0)), constant_values=-np.inf) if band.ndim == 2 else band
         for band in map(np.asarray, chain.bands)
@@ -379,8 +299,6 @@ def _trimmed(result: Any, n: int) -> Any:
     if isinstance(result, Posterior):
         moves = tuple(move[: n - 1] for move in result.moves)
         return Posterior(float(result.log_evidence), result.smoothed[:n], moves)
-    if isinstance(result, Filtered):
-        return Filtered(float(result.log_evidence), result.filtered[:n])
     if isinstance(result, Alignment):
         return Alignment(result.starts.astype(np.int64), int(result.num_samples), float(result.log_prob))
     if isinstance(result, Alignments):

@@ -80,20 +80,6 @@ class Alignments:
 
 @register_dataclass
 @dataclass(frozen=True)
-class Filtered:
-    """On-line view.
-
-    Attributes:
-        log_evidence: log of the summed weight of all complete paths.
-        filtered: [t, k] = p(state k at t | samples up to t).
-    """
-
-    log_evidence: Any
-    filtered: Any
-
-
-@register_dataclass
-@dataclass(frozen=True)
 class Posterior:
     """Posterior over alignments given the whole recording, as probabilities.
 

@@ -14,7 +14,7 @@ and the distance d of the fingers. With g = (fx1 - fx2) / 2 the grip and fy the 
 
 Free quantities have broad densities over the range the recording shows, so that all states
 score the same features and log-likelihoods compare. Residuals are Student-t (transients).
-Derivation and sources: docs/model.md.
+Derivation and sources: docs/segmentation.md.
 """
 
 from __future__ import annotations
@@ -278,16 +278,13 @@ def noise_sd(values: np.ndarray) -> float:
     return float(white_sd(there)) if there.size > 2 else np.nan
 
 
-def thin(
-    signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf, rate: float | None = None
-) -> Signals:
+def thin(signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf) -> Signals:
     """Signals read at a rate of at most `max_rate` [Hz], each reading a mean over up to `window` s.
 
     White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing.
-    A short window keeps what changes within a reading apart. `rate` [Hz]: of the recording that the signals
-    are a piece of; their own median otherwise.
+    A short window keeps what changes within a reading apart.
     """
-    rate = float(1.0 / np.median(np.diff(signals.t))) if rate is None else rate
+    rate = float(1.0 / np.median(np.diff(signals.t)))
     group = group_size(rate, max_rate)
     if group <= 1:
         return signals

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
@@ -122,9 +120,7 @@ def shifts(given: Problem, causes: Fitted) -> np.ndarray:
 
 def channels(world: World) -> np.ndarray:
     """Task-space channels (T, N, C) of a world: x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
-    world = jax.tree.map(jnp.asarray, world)
-    position, velocity = (np.asarray(z) for z in tips(world))
-    force = np.asarray(world.force)
+    (position, velocity), force = tips(world), world.force
     mean, apart = (position[..., :2] + position[..., 2:]) / 2, position[..., 2:] - position[..., :2]
     speed = (velocity[..., :2] + velocity[..., 2:]) / 2
     net, half = force[..., :2] + force[..., 2:], (force[..., :2] - force[..., 2:]) / 2

@@ -351,7 +351,7 @@ def to_do(body: Body) -> list[str]:
     asked = body.get("next_experiment")
     if asked:
         text = ", ".join(plain_name(n) for n in asked["separates"])
-        out.append(f"Record once more: {asked['do']}. That tells apart: {text}.")
+        out.append(f"Record once more: {asked['do']}. That separates: {text}.")
     if body["verdict"] == "unknown" and body["where"]:
         (channel, subtask), *_ = by_place(body)
         what, at = CHANNELS.get(channel, channel), when(subtask)
@@ -394,7 +394,7 @@ def tables(body: Mapping[str, Any]) -> list[Table]:
         asked = body["next_experiment"]
         gain = f"by {asked['expected_gain_nats']:.0f} nats at least"
         following.add_row(asked["do"])
-        following.add_row(f"expected to tell {', '.join(asked['separates'])} apart, {gain}")
+        following.add_row(f"expected to separate {', '.join(asked['separates'])}, {gain}")
         out.append(following)
     if body["where"]:
         cells = Table(title="where the gap is largest", title_justify="left")

@@ -13,7 +13,7 @@ PROPS = ("weight", "width", "height")
 
 def draws(value: float) -> Draws:
     empty = np.zeros((4, 500, 0))
-    return Draws(empty, np.full((4, 500, 3), value), empty, empty, 1e4, 1.0, 0.5, 500, "emcee", 1.0, 0.0)
+    return Draws(empty, np.full((4, 500, 3), value), empty, empty, 1e4, 1.0, 0.5, 500, 1.0)
 
 
 @pytest.mark.parametrize("doubted", [False, True])

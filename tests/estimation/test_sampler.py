@@ -12,11 +12,19 @@ from estimation.sampler import (
     GROUPS,
     MIN_ESS,
     effective_sample_size,
-    importance,
     proposal,
     sample,
     split_rhat,
 )
+
+
+def importance(post, mode, seed, num):
+    """Draws (num, 6) of the proposal and their normalised importance weights (num,)."""
+    independent = proposal(post, mode)
+    x = independent.draw(num, np.random.RandomState(seed))
+    log_weight = post.log_prob(x) - independent.log_density(x)
+    weight = np.exp(log_weight - log_weight.max())
+    return x, weight / weight.sum()
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +52,12 @@ def ar1(shape, rho, rng):
 
 
 def test_scales_have_the_moments_of_importance_sampling(post, mode, draws):
-    x, weight = importance(post, proposal(post, mode), np.random.RandomState(5), 20_000)
+    x, weight = importance(post, mode, 5, 20_000)
     assert 1 / (weight**2).sum() > 0.6 * len(x)  # the proposal is close, so its weights are even
     mean = weight @ x
     sd = np.sqrt(weight @ (x - mean) ** 2)
     flat = draws.scales.reshape(-1, 6)
-    assert draws.converged and draws.ess >= MIN_ESS and draws.method == "emcee"
+    assert draws.converged and draws.ess >= MIN_ESS
     assert np.abs((flat.mean(axis=0) - mean) / sd * np.sqrt(draws.ess)).max() < 5
     for i, order in enumerate(np.argsort(x, axis=0).T):  # tails are too heavy to compare deviations
         for q in (0.05, 0.25, 0.75, 0.95):
@@ -59,7 +67,7 @@ def test_scales_have_the_moments_of_importance_sampling(post, mode, draws):
 
 def test_unknowns_have_the_moments_of_their_mixture_of_gaussians(post, mode, draws):
     """By importance sampling of the scales, unknowns given them in closed form."""
-    x, weight = importance(post, proposal(post, mode), np.random.RandomState(6))
+    x, weight = importance(post, mode, 6, 4000)
     means, chols = post.given(x)
     num = len(post.design.unknowns)
     inverse = np.linalg.inv(chols)[:, :, :num]
@@ -111,30 +119,10 @@ def test_systematic_resampling_keeps_the_weights():
     assert (np.diff(index) >= 0).all()
 
 
-def test_a_chain_that_fails_gives_way_to_weighted_laplace_draws(post, draws, monkeypatch):
-    monkeypatch.setattr(sampler, "MIN_ESS", 1e9)
-    monkeypatch.setattr(sampler, "MAX_STEPS", 100)
-    monkeypatch.setattr(sampler, "ENOUGH", 8000)
-    found = sample(post, seed=1)
-    assert found.method == "laplace"
-    sd = draws.flat.std(axis=0)
-    np.testing.assert_allclose((found.flat.mean(axis=0) - draws.flat.mean(axis=0)) / sd, 0.0, atol=0.12)
-    np.testing.assert_allclose(found.flat.std(axis=0), sd, rtol=0.1)
-    monkeypatch.setattr(sampler, "MIN_EFFICIENCY", 1.1)  # nor do these pass: it has not converged
-    found = sample(post, seed=1)
-    assert found.method == "emcee" and not found.converged
-
-
 def test_the_same_seed_draws_the_same(post, draws):
     again, other = sample(post, seed=1), sample(post, seed=2)
     np.testing.assert_array_equal(again.chain, draws.chain)
     assert not np.array_equal(other.chain[:, :10], draws.chain[:, :10])
-
-
-def test_progress_is_told(post):
-    told = []
-    sample(post, 0, lambda steps, of: told.append((steps, of)))
-    assert [s for s, _ in told] == sorted(s for s, _ in told) and told[0][0] > 0
 
 
 def test_density_of_the_proposal_integrates_to_one(post, mode):
@@ -165,10 +153,6 @@ def test_the_worst_parameter_counts():
     assert both == pytest.approx(effective_sample_size(bad))
 
 
-def test_a_frozen_chain_has_no_effective_samples():
-    assert effective_sample_size(np.ones((8, 100, 2))) == 0.0
-
-
 def test_rhat_against_its_definition_and_drift():
     """Groups whose means differ by d standard deviations: 1 + var(means) / 1."""
     rng = np.random.default_rng(3)
@@ -188,7 +172,11 @@ def test_a_scatter_of_any_size_is_sampled(share):
     scales[4] = np.log(share / priors.SCATTER_MEDIAN[1])
     design, true, *_ = drawn(make_design(num_trials=4), 7, scales=scales)
     found = sample(posterior(design), seed=0)
-    assert found.converged and found.method == "emcee" and found.apart is not None and found.apart < 0.2
+    assert found.converged
+    x, weight = importance(posterior(design), find_mode(posterior(design)), 7, 4000)
+    mean = weight @ x
+    apart = found.scales.mean(axis=(0, 1)) - mean
+    assert np.abs(apart / np.sqrt(weight @ (x - mean) ** 2)).max() < 0.2
     width = found.flat[:, 1]
     assert abs(width.mean() - true[1]) < 4 * width.std()
     assert width.std() > 0.2 * share * UNIT[1]

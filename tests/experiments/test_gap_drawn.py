@@ -1,7 +1,5 @@
 """What becomes of a diagnosis in a drawn lab, and its table."""
 
-from __future__ import annotations
-
 import pytest
 
 from experiments import gap_drawn

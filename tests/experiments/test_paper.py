@@ -1,7 +1,5 @@
 """The paper's reproduction: results come from the data, and the page says what the results say."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

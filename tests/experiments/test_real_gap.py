@@ -1,7 +1,5 @@
 """The paper's own gap: the published result holds what it says."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Repeated tasks: every round aligned, one that fails leaves the others as they are."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace

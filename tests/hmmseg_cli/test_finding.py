@@ -1,7 +1,5 @@
 """Numbers and findings in words: from a diagnosis's JSON alone, old and new."""
 
-from __future__ import annotations
-
 import pytest
 
 from hmmseg.numbers import between, estimate, fixed, interval, percent, plain, shown_as

@@ -1,7 +1,5 @@
 """The generic diagnosis: features with known values, planted effects named, alike ensembles called alike."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +13,6 @@ from hmmseg.io.trial import Trial
 from simgap.generic.diagnose import detect, diagnose, diagnosed, gap_of, whitening
 from simgap.generic.effects import (
     Ring,
-    effects,
     fit_ring,
     from_swing,
     predicted,
@@ -235,11 +232,6 @@ def test_rates_may_differ():
     found = both(lay)
     top = lay.kind == FAST
     assert np.abs(found[0].mean(0) - found[1].mean(0))[top].mean() < 0.6  # averaged, not picked
-
-
-def test_every_candidate_says_what_it_does():
-    for name, candidate in effects().items():
-        assert candidate.name == name and candidate.says and candidate.shows and candidate.parameters
 
 
 def test_rings_begin_at_their_event(alike):

@@ -1,7 +1,5 @@
 """Exact fits come to planted values from wrong starts, and sets are judged by the discrepancy they leave."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

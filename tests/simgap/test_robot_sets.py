@@ -1,7 +1,5 @@
 """Evidence of sets in closed form against integrals, and what whitens rows against what it says it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
