@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from experiments.golden import rounded
 from experiments.real.xl330 import FULL
 from experiments.saving import save
 from hmmseg.plot.style import BLUE, INK, ORANGE, canvas
@@ -97,12 +98,7 @@ def main() -> None:
             out[what] = body
             before, after = (1e3 * body["heldout"][k]["position"] for k in ("before", "after"))
             print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad, {body['processor']:.0f} s")
-            print(
-                {
-                    n: None if p["mean"] is None else float(f"{p['mean']:.3g}")
-                    for n, p in body["parameters"].items()
-                }
-            )
+            print({n: rounded(p["mean"], 3) for n, p in body["parameters"].items()})
         if given.diagnose:
             begun = time.process_time()
             told = diagnose(loaded.simulator, logs, more=more)
