@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot gap-arm gap-drawn sequences robots-models gap-results blind-check real wrist readme-figures identified boundaries bench bench-accelerator bench-batch bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -49,18 +49,21 @@ wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, 
 # Both ends of what pyproject.toml declares, each in an environment of its own; ArviZ 1 needs Python 3.12,
 # which NEWEST_PYTHON can name.
 NEWEST_PYTHON ?= $(BIN)/python
-oldest: $(INSTALLED)  ## the demo with the oldest versions that pyproject.toml declares
+oldest: $(BIN)/uv  ## the demo and the file formats with the oldest versions that pyproject.toml declares
 	$(call at_versions,oldest,$(BIN)/python,--resolution lowest-direct)
 
-newest: $(INSTALLED)  ## the demo with the newest versions there are
+newest: $(BIN)/uv  ## the demo and the file formats with the newest versions there are
 	$(call at_versions,newest,$(NEWEST_PYTHON),--upgrade)
 
-define at_versions
+$(BIN)/uv: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+
+define at_versions
 	$(BIN)/uv venv --quiet --clear --python $(2) build/$(1)
-	$(BIN)/uv pip install --quiet --python build/$(1) $(3) '.[mujoco]'
+	$(BIN)/uv pip install --quiet --python build/$(1) $(3) '.[mujoco,files]' 'pytest>=8'
 	build/$(1)/bin/hmmseg doctor
-	build/$(1)/bin/hmmseg demo --figures build/$(1)_demo
+	build/$(1)/bin/hmmseg demo --quiet --figures build/$(1)_demo
+	build/$(1)/bin/python -m pytest -q -W default -p no:cacheprovider tests/hmmseg/test_formats.py
 endef
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
@@ -69,51 +72,30 @@ docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are error
 constants: $(INSTALLED)  ## docs/tables/constants.csv: every numeric constant with its kind and reason
 	$(BIN)/python -m experiments.constants
 
-bench: $(INSTALLED)  ## alignment beside hmmlearn and dynamax, stages of the commands; fills docs/benchmarks.md
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
-	$(BIN)/python -m experiments.benchmarks.hmm
+bench: $(INSTALLED)  ## time of the commands, stage by stage; fills docs/benchmarks.md
 	$(BIN)/python -m experiments.benchmarks.commands recordings/paper_blocks
-	$(BIN)/python -m experiments.write_tables
-
-bench-accelerator: $(INSTALLED)  ## the same recursions on this machine's accelerator; fills docs/benchmarks.md
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[accelerator]'
-	$(BIN)/python -m experiments.benchmarks.hmm --parallel
 	$(BIN)/python -m experiments.write_tables
 
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
 	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
 
-bench-batch: $(INSTALLED)  ## a thousand trials from CSV to segments; fills docs/benchmarks.md
-	$(BIN)/python -m experiments.benchmarks.batch recordings/paper_blocks
-	$(BIN)/python -m experiments.write_tables
-
 bench-haptic: $(INSTALLED)  ## a minute of the virtual model at 4 kHz beside loops that do nothing (real-time priority: as root); fills docs/virtual_model.md
 	$(BIN)/python -m experiments.benchmarks.haptic_loop --seconds 60 --realtime
 	$(BIN)/python -m experiments.write_tables
 
-gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS, and what their patches are worth; fills docs/gap_results.md
+gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_recordings $(or $(RECORDINGS),recordings)
-	$(BIN)/python -m experiments.patch_heldout $(or $(RECORDINGS),recordings)
 	$(BIN)/python -m experiments.write_tables
 
-gap-drawn: $(INSTALLED)  ## diagnoses of healthy and single cases in labs drawn anew (build/gap_drawn); fills docs/gap_results.md
-	$(BIN)/python -m experiments.blind_check open --cases 36 --tiers healthy single --seed 519083 --out build/gap_drawn
-	$(BIN)/python -m experiments.gap_drawn build/gap_drawn --seed 519083
-	$(BIN)/python -m experiments.write_tables
-
-gap-labs: $(INSTALLED)  ## diagnoses of the open labs of another simulator in the folder LABS; fills docs/gap_results.md
+gap-labs: $(INSTALLED)  ## diagnoses of open labs in the folder LABS; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
-	$(BIN)/python -m experiments.write_tables
-
-gap-arm: $(INSTALLED)  ## diagnoses of the robot arm's sets in the folder ARM; fills docs/gap_results.md
-	$(BIN)/python -m experiments.gap_arm $(or $(ARM),../shared/panda)
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
 	$(BIN)/python -m experiments.blind_check diagnose --cases $(SET)/cases --out $(SET)/results
 	$(BIN)/python -m experiments.blind_check score --sealed $(SET) --results $(SET)/results --json experiments/results/blind_check.json
-	$(BIN)/python -m paper_figs.gap_reliability
+	$(BIN)/python -m paper_figs gap_reliability
 	$(BIN)/python -m experiments.write_tables
 
 sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
@@ -122,35 +104,22 @@ sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folde
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)
-real: $(INSTALLED)  ## recordings of real robots and people, in folders of RECORDINGS; fills docs/results.md, draws their figures
+real: $(INSTALLED)  ## recordings of real robots, in folders of RECORDINGS; fills docs/results.md, draws their figures
 	$(BIN)/python -m experiments.real.hiro_snap $(REAL)/hiro_snap
-	$(BIN)/python -m experiments.real.hiro_gap $(REAL)/hiro_snap
-	$(BIN)/python -m experiments.real.kth_handover $(REAL)/kth_handover
-	$(BIN)/python -m experiments.real.way_eeg_gal $(REAL)/way_eeg_gal_p1
-	$(BIN)/python -m experiments.real.robot_gap xl330 $(REAL)/xl330_pendulum --figures docs/figures
+	$(BIN)/python -m experiments.real.robot_gap $(REAL)/xl330_pendulum --figures docs/figures
 	$(BIN)/python -m experiments.real.xl330_sheet $(REAL)/xl330_pendulum --diagnose --output experiments/results/xl330_sheet.json
-	$(BIN)/python -m experiments.real.robot_gap so101 $(REAL)/so101 --seconds 10 --figures docs/figures
-	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
-	$(BIN)/python -m experiments.real.collins $(REAL)/collins
-	$(BIN)/python -m paper_figs.hiro_gap
-	$(BIN)/python -m paper_figs.way_eeg_gal
 	$(BIN)/python -m experiments.write_tables
 
 wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and of our own; the figures of docs/wrist.md
 	$(BIN)/python -m experiments.wrist $(RECORDINGS)
 
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
-	$(BIN)/python -m experiments.readme_figures $(SET)
+	$(BIN)/python -m experiments.readme_figures $(LOGS)
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
-
-ablation: $(INSTALLED)  ## what each special case of segmentation and estimate buys; fills docs/tables/special_cases.csv
-	$(BIN)/python -m experiments.ablation
-	$(BIN)/python -m experiments.write_tables
 
 results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/
 	$(BIN)/python -m experiments.score_recordings recordings
 	$(BIN)/python -m experiments.calibration recordings
-	$(BIN)/python -m experiments.benchmarks.moves
 	$(BIN)/python -m experiments.write_tables
 
 ROBOTS := build/robots
@@ -172,14 +141,9 @@ bench-robot: robots-models  ## time of a diagnosis of a minute of an arm of six 
 	$(BIN)/python -m experiments.benchmarks.robot $(ROBOTS)
 	$(BIN)/python -m experiments.write_tables
 
-calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds that differ, NUTS beside the sampler; resumable
+calibrate: $(INSTALLED)  ## do intervals hold: ranks of 1,000 data sets, worlds that differ; resumable
 	$(BIN)/python -m experiments.sbc
 	$(BIN)/python -m experiments.calibration_worlds
-	$(BIN)/python -m experiments.reference_posteriors
-	$(BIN)/python -m experiments.write_tables
-
-boundaries: $(INSTALLED)  ## do 90 % boundary intervals hold in worlds that differ? Fills docs/tables
-	$(BIN)/python -m experiments.calibration_boundaries
 	$(BIN)/python -m experiments.write_tables
 
 sequences: $(INSTALLED)  ## are readings without labels honest, what does one label do? REAL, PANDA, HANDS: folders; fills docs/sequences.md
@@ -200,9 +164,3 @@ check-gap: $(INSTALLED)  ## diagnose a small sealed set of another simulator's r
 
 fuzz: $(INSTALLED)  ## 100,000 damaged files through every reader and command, in process (some minutes)
 	PYTHONPATH=tests $(BIN)/python -m experiments.fuzz --cases 100000 --keep build/fuzz
-
-identified: $(INSTALLED)  ## properties and boundaries in labs drawn anew (build/drawn) and in folders of RECORDINGS
-	$(BIN)/python -m experiments.blind_check open --cases 40 --seed 1187001 --fastest 200 --out build/drawn
-	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --keep
-	$(BIN)/python -m experiments.identified build/drawn $(RECORDINGS) --pooled 1 --keep
-	$(BIN)/python -m experiments.write_tables

@@ -49,8 +49,8 @@ from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 
 WRONG = 0.01  # prior: share of recordings in which one such scale is misstated
-# learned: sds of healthy hands by experiments/consistency.py: of logarithms of gains and rates, of slopes
-# [m/m], of places [m]; what rig.toml states in [systematic] comes on top
+# learned: sds of healthy hands by consistency.py of commit f82105c: of logarithms of gains and rates, of
+# slopes [m/m], of places [m]; what rig.toml states in [systematic] comes on top
 WELL_MADE = {
     "squeeze": 0.015, "balance": 0.03, "rigidity": 4e-3, "motion": 0.04, "room": 5e-4, "level": 1.5e-3,
 }  # fmt: skip

@@ -335,7 +335,7 @@ def _likelihood(ratio: np.ndarray, sd: np.ndarray, centres: np.ndarray) -> np.nd
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples in each bin (num_bins,) once every atom has been drawn anew, its samples with it.
+    """Samples in each bin (num_bins,) once every atom has been redrawn, its samples with it.
 
     Without this step an atom with many samples would never leave its bin.
     """

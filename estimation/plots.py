@@ -131,7 +131,7 @@ ORDER = ("weight", "width", "height", "friction")
 def draw_estimates(
     properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path | None = None
 ) -> Axes:
-    """One row a property: 68 and 95 % interval in % of the measured value, numbers beside it.
+    """One row a property: 68 and 95 % interval in % of the measured value, with the numbers next to it.
 
     `properties` is the JSON of `identify`. Without a measured value the row is drawn about the
     estimate itself (open marker); a property that is None or only bounded says so.

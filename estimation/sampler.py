@@ -2,8 +2,8 @@
 
 All else is integrated out (`estimation.posterior`), so emcee moves in six dimensions whatever the
 task. Most proposals are independent draws (`Proposal`), the rest differential evolution (ter Braak 2006),
-which frees walkers that it would hold in a tail. experiments/benchmarks/moves.py compares them with emcee's
-stretch move.
+which frees walkers that it would hold in a tail. benchmarks/moves.py of commit f82105c compares them with
+emcee's stretch move.
 
 Draws where it is open whether the rig's pads are as it says: from both possibilities, by their odds.
 

@@ -12,165 +12,129 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from experiments.saving import save
-from experiments.world_scores import Replicate, line, score, summary
-from experiments.worlds import GRASP_SPREAD, Cell, deviated, disturbed, draw_deviations, recording_rig, scene
-from hmmseg.io.rig import Fingertip, Noise, Rig, Systematic
-from hmmseg.io.task import BlockTask, parse_task
-from hmmseg.io.trial import Trial
-from simgap.gap.twins import recorded
-from simgap.world.operator import OperatorSettings
-from simgap.world.properties import random_properties
-from simgap.world.simulate import SimulatedTrial, simulate_trials
+from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
+from experiments.table_text import load, markdown, milliseconds, percent
+from experiments.worlds import WORLDS, Replicate, replicates
+from hmmseg.segmentation.spans import Segmentation
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "calibration_worlds.json"
 FIRST, REPLICATES = 116_000, 32
-SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
-BIAS = 0.02  # N, what [systematic] admits where a row has biases
-PADS = 0.3  # share, likewise of pads
+LEVELS = (0.68, 0.95)
 PANELS = (
     ("95", "properties, 95 %", (92, 97)), ("68", "properties, 68 %", (63, 73)),
     ("90", "boundaries, 90 %", (86, 94)),
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Row:
-    """One world: `cell` as in the sweeps; a tower of `blocks` reversed (one: moved), `trials` pooled.
+def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
+    """One replicate: errors, sds and ranks of its properties; errors and intervals of its boundaries."""
+    from estimation import identify
 
-    `pads` [N/m]; `stated`: noise as the rig has it, over what it is; `coloured`: lag-one correlation of
-    the noise; `bias`: of every force, in units of what [systematic] admits (BIAS); `softer`: pads' true
-    stiffness over the rig's, which admits PADS in [systematic] if `doubted`; `deviating`: a hand drawn
-    from a [systematic] table.
-    """
+    began = time.process_time()
+    said = identify(found.trials, found.task, found.rig, seed)
+    properties = []
+    for obj, block in found.blocks.items():
+        for prop in ("weight", "width", "height"):
+            if (obj, prop) not in said.names:
+                continue
+            draws, true = said.of(obj, prop), getattr(block, prop)
+            properties.append({
+                "of": f"{obj}.{prop}", "share": float(draws.mean() / true - 1),
+                "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
+            })  # fmt: skip
+    for i, unknown in enumerate(said.combinations):
+        true = sum(c * found.blocks[obj].height for obj, c in unknown.terms.items())
+        draws = said.combined[:, i]
+        properties.append({
+            "of": ".".join(unknown.name), "share": float(draws.mean() / true - 1),
+            "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
+        })  # fmt: skip
+    pairs = [(s, b) for s, b in zip(said.segmentations, found.boundaries, strict=True) if s.complete]
+    residual = [r for s, b in pairs for r in boundary_residuals(s, b)]
+    held = [r for s, b in pairs for r in boundaries_covered(s, b)]
+    reach = [r for s, b in pairs for r in _reaches(s, b)]
+    return {
+        "properties": properties, "boundaries": [float(r) for r in residual], "held_90": held,
+        "reach_90": reach,
+        "misfits": sum(not s.complete for s in said.segmentations), "trials": len(found.trials),
+        "seconds": time.process_time() - began,
+    }  # fmt: skip
 
-    name: str
-    cell: Cell = field(default_factory=Cell)
-    blocks: int = 2
-    trials: int = 1
-    pads: float = 4000.0
-    stated: float = 1.0
-    coloured: float = 0.0
-    bias: float = 0.0
-    softer: float = 1.0
-    doubted: bool = False
-    deviating: bool = False
 
-
-def _rows() -> list[Row]:
-    out = [Row("as usual")]
-    out += [Row(f"{r:g} Hz", Cell(rate=r)) for r in (10.0, 50.0, 200.0, 2000.0)]
-    out += [Row(f"pace {p:g}", Cell(pace=p)) for p in (0.5, 3.0)]
-    out += [Row(f"noise x{n:g}", Cell(noise=n)) for n in (0.25, 4.0, 16.0)]
-    out += [Row(f"ringing {v:g} N", Cell(vibration=v)) for v in (0.3, 1.0)]
-    out += [Row(f"pads {k:g} N/m", pads=k) for k in (1500.0, 12000.0)]
-    out += [Row("missing 40 %", Cell(missing=0.4))]
-    out += [Row(f"noise stated x{s:g}", stated=s) for s in (0.5, 2.0)]
-    out += [Row("noise AR(1) 0.5", coloured=0.5)]
-    out += [Row("bias as admitted", bias=1.0), Row("bias twice that", bias=2.0)]
-    out += [
-        Row("pads 30 % off, admitted", softer=0.7, doubted=True),
-        Row("pads 30 % off, untold", softer=0.7),
+def _reaches(found: Segmentation, truth: np.ndarray) -> list[float]:
+    """How far each true boundary lies from that found, as a share of the way to that end of its interval."""
+    ends = [(s.start, *s.start_90) for s in found.spans[1:]]
+    return [
+        float((t - at) / max(high - at, 1e-9) if t > at else (at - t) / max(at - low, 1e-9))
+        for (at, low, high), t in zip(ends, truth, strict=True)
     ]
-    out += [Row("hand as [systematic]", deviating=True)]
-    out += [Row("1 block", blocks=1), Row("3 blocks", blocks=3), Row("6 blocks", blocks=6)]
-    out += [Row("4 trials", trials=4), Row("20 trials", trials=20)]
+
+
+def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A row of the table: coverages, each with its standard error over replicates, and rms of z."""
+    out: dict[str, Any] = {
+        "replicates": len(scored), "trials": sum(s["trials"] for s in scored),
+        "misfits": sum(s["misfits"] for s in scored),
+    }  # fmt: skip
+    ranks = [np.array([p["rank"] for p in s["properties"]]) for s in scored]
+    z = np.concatenate([[p["z"] for p in s["properties"]] for s in scored])
+    out["properties"] = int(z.size)
+    out["z_rms"] = float(np.sqrt(np.mean(z**2))) if z.size else None
+    for level in LEVELS:
+        inside = [np.abs(r - 0.5) < level / 2 for r in ranks]
+        out[f"coverage_{100 * level:.0f}"], out[f"se_{100 * level:.0f}"] = clustered(inside)
+    for prop in ("weight", "width", "height"):
+        mine = [p for s in scored for p in s["properties"] if p["of"].endswith(prop)]
+        if mine:
+            out[prop] = {
+                "rms": float(np.sqrt(np.mean([p["share"] ** 2 for p in mine]))),
+                "z_rms": float(np.sqrt(np.mean([p["z"] ** 2 for p in mine]))),
+                "coverage_95": float(np.mean([abs(p["rank"] - 0.5) < 0.475 for p in mine])),
+            }
+    # By what factor intervals would have to be wider to hold just as often as they say.
+    out["needed_95"] = float(np.quantile(np.abs(z), 0.95) / ndtri(0.975)) if z.size else None
+    reach = np.concatenate([s["reach_90"] for s in scored])
+    out["needed_90"] = float(np.quantile(reach, 0.9)) if reach.size else None
+    out["coverage_90"], out["se_90"] = clustered([np.array(s["held_90"]) for s in scored])
+    boundaries = np.concatenate([s["boundaries"] for s in scored])
+    out["boundary_median"] = float(np.median(np.abs(boundaries))) if boundaries.size else None
     return out
 
 
-ROWS = {row.name: row for row in _rows()}
-HAND = Systematic(force_bias=(0.01,) * 4, force_gain=(0.01,) * 4, joint_offset=(0.001,) * 4,
-                  link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1))  # fmt: skip
+def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]:
+    """Share inside and its standard error, replicates as clusters; at least that of as many coin tosses."""
+    rows = [np.asarray(r, float) for r in inside if len(r)]
+    if not rows:
+        return None, None
+    every = np.concatenate(rows)
+    share = float(every.mean())
+    scores = np.array([(r - share).sum() for r in rows]) / np.mean([r.size for r in rows])
+    spread = float(np.std(scores, ddof=1) / np.sqrt(len(rows))) if len(rows) > 1 else 0.0
+    # Agresti and Coull's: where all are inside, a standard error of nought says too much.
+    share_at_least = (every.sum() + 2) / (every.size + 4)
+    return share, max(spread, float(np.sqrt(share_at_least * (1 - share_at_least) / (every.size + 4))))
 
 
-def task_of(blocks: int) -> BlockTask:
-    """A tower of so many blocks reversed; one block is moved on the ground."""
-    if blocks == 2:
-        return scene()[1]
-    names = [f"b{k}" for k in range(blocks)]
-    under = {name: on for name, on in zip(names, [*names[1:], "ground"], strict=True)}
-    moves = [{"object": name, "to": "ground" if k == 0 else names[k - 1]} for k, name in enumerate(names)]
-    task = parse_task({"objects": {n: {"on": on} for n, on in under.items()}, "moves": moves})
-    assert isinstance(task, BlockTask)
-    return task
+def line(name: str, s: dict[str, Any]) -> str:
+    """A row for people."""
 
+    def percent(key: str) -> str:
+        share, se = s[f"coverage_{key}"], s[f"se_{key}"]
+        return "   -   " if share is None else f"{100 * share:4.0f} +- {100 * se:2.0f}"
 
-def replicates(row: Row, num: int) -> Iterator[Replicate]:
-    """`num` replicates of a row; each number the same whatever its company."""
-    task, nominal = task_of(row.blocks), _rig(row)
-    numbers = range(FIRST, FIRST + num)
-    done = _performed(row.cell.pace, row.pads * row.softer, row.blocks, row.trials, num)
-    sensors = recording_rig(row.cell, nominal)
-    for i, number in enumerate(numbers):
-        mine = done[i * row.trials : (i + 1) * row.trials]
-        trials = [_recorded(row, s, task, sensors, number) for s in mine]
-        yield Replicate(task, _told(row, sensors), trials, [s.boundaries for s in mine],
-                        dict(mine[0].blocks))  # fmt: skip
-
-
-def _rig(row: Row) -> Rig:
-    pads = Fingertip(normal_stiffness=row.pads, shear_stiffness=SHEAR_SHARE * row.pads)
-    return scene()[0].model_copy(update={"fingertip": pads})
-
-
-@lru_cache(maxsize=2)
-def _performed(pace: float, pads: float, blocks: int, trials: int, num: int) -> list[SimulatedTrial]:
-    """What truly happened; rows that differ by their sensors alone share it."""
-    rig, task = _rig(Row("", pads=pads)), task_of(blocks)
-    operator = OperatorSettings(pace=(pace, pace), grasp=(-GRASP_SPREAD, GRASP_SPREAD))
-    drawn = [random_properties(task, FIRST + i) for i in range(num)]
-    seeds = [100 * (FIRST + i) + k for i in range(num) for k in range(trials)]
-    return simulate_trials(task, rig, [b for b in drawn for _ in range(trials)], seeds, operator)
-
-
-def _recorded(row: Row, simulated: SimulatedTrial, task: BlockTask, rig: Rig, number: int) -> Trial:
-    t = np.arange(int(simulated.t[-1] * row.cell.rate)) / row.cell.rate
-    resampled = replace(simulated, trial=replace(simulated.trial, t=t))
-    trial = recorded(resampled, task, rig, {})
-    if row.coloured:
-        quiet = {name: sd * 1e-9 for name, sd in rig.noise.model_dump(exclude_none=True).items()}
-        clean = recorded(resampled, task, rig.model_copy(update={"noise": Noise(**quiet)}), {})
-        trial = _coloured(trial, clean, row.coloured)
-    trial = disturbed(trial, simulated.boundaries, row.cell, simulated.seed)
-    rng = np.random.default_rng([number, 6])  # of the hand: all trials of a replicate alike
-    if row.bias:
-        signs = row.bias * BIAS * rng.choice([-1.0, 1.0], 4)
-        shifted = {n: trial.channels[n] + b for n, b in zip(("fx1", "fy1", "fx2", "fy2"), signs, strict=True)}
-        trial = replace(trial, channels=trial.channels | shifted)
-    return deviated(trial, rig, draw_deviations(HAND, rng)) if row.deviating else trial
-
-
-def _coloured(noisy: Trial, clean: Trial, rho: float) -> Trial:
-    """The trial with its noise made AR(1), of the same variance."""
-    channels = {}
-    for name, values in noisy.channels.items():
-        white = values - clean.channels[name]
-        noise = np.empty_like(white)
-        noise[0] = white[0]
-        for k in range(1, white.size):
-            noise[k] = rho * noise[k - 1] + np.sqrt(1 - rho**2) * white[k]
-        channels[name] = clean.channels[name] + noise
-    return replace(noisy, channels=channels)
-
-
-def _told(row: Row, sensors: Rig) -> Rig:
-    """What the estimator is told of the hand."""
-    noise = {name: sd * row.stated for name, sd in sensors.noise.model_dump(exclude_none=True).items()}
-    told = sensors.model_copy(update={"noise": Noise(**noise)})
-    if row.bias:
-        told = told.model_copy(update={"systematic": Systematic(force_bias=(BIAS,) * 4)})
-    if row.doubted:
-        told = told.model_copy(update={"systematic": Systematic(pad_stiffness=(PADS, PADS))})
-    return told.model_copy(update={"systematic": HAND}) if row.deviating else told
+    z = "" if s["z_rms"] is None else f"{s['z_rms']:.2f}"
+    return (f"{name:26} {s['trials']:3} trials {s['misfits']:2} misfits  68 %: {percent('68')}  95 %: "
+            f"{percent('95')}  z rms {z}  boundaries 90 %: {percent('90')}")  # fmt: skip
 
 
 def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
@@ -203,10 +167,33 @@ def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
+def _covered(row: dict[str, Any], level: str) -> str:
+    share, error = row[f"coverage_{level}"], row[f"se_{level}"]
+    return "" if share is None else f"{100 * share:.0f} ± {100 * error:.0f} %"
+
+
+def table() -> str | None:
+    """docs/tables/worlds.csv: a row a world; `needed`: the factor at which intervals hold as stated."""
+    found = load("calibration_worlds")
+    if found is None:
+        return None
+    rows = []
+    for name, s in found["rows"].items():
+        rms = [percent(s[p]["rms"], 2) if p in s else "" for p in PROPERTIES]
+        needed = ["" if s[k] is None else f"x{s[k]:.2f}" for k in ("needed_95", "needed_90")]
+        cover = [_covered(s, level) for level in ("68", "95", "90")]
+        median = "" if s["boundary_median"] is None else milliseconds(s["boundary_median"])
+        cells = [*rms, *cover[:2], needed[0], cover[2], needed[1], median]
+        rows.append([name, f"{s['trials']} ({s['misfits']})", *cells])
+    head = ["world", "trials (misfits)", *(f"{p} rms" for p in PROPERTIES), "68 % cover", "95 % cover",
+            "needed", "boundaries, 90 % cover", "needed", "median"]  # fmt: skip
+    return markdown(head, rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of this experiment."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rows", nargs="*", default=list(ROWS), metavar="NAME")
+    parser.add_argument("--rows", nargs="*", default=list(WORLDS), metavar="NAME")
     parser.add_argument("--replicates", type=int, default=REPLICATES)
     parser.add_argument("--fresh", action="store_true", help="score every row anew")
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -215,11 +202,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.output.exists() and not options.fresh:
         document = json.loads(options.output.read_text(encoding="utf-8"))
     for name in options.rows:
-        num = max(2, options.replicates // 2) if ROWS[name].trials > 4 else options.replicates
+        num = max(2, options.replicates // 2) if WORLDS[name].trials > 4 else options.replicates
         if document["rows"].get(name, {}).get("replicates", 0) < num:
-            scored = [score(found) for found in replicates(ROWS[name], num)]
+            scored = [score(found) for found in replicates(WORLDS[name], range(FIRST, FIRST + num))]
             document["rows"][name] = summary(scored) | {"seconds": sum(s["seconds"] for s in scored)}
-            document["rows"] = {n: document["rows"][n] for n in ROWS if n in document["rows"]}
+            document["rows"] = {n: document["rows"][n] for n in WORLDS if n in document["rows"]}
             save(options.output, document)
         print(line(name, document["rows"][name]), flush=True)
     draw(document["rows"], HERE.parent / "docs" / "figures" / "calibration_worlds.png")

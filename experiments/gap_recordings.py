@@ -1,11 +1,10 @@
 """The diagnosis on labelled recordings of a stand-in rig: verdict, parameters against the truth, time.
 
-    python -m experiments.gap_recordings RECORDINGS [--half 0|1] [--no-twins] [--json FILE]
+    python -m experiments.gap_recordings RECORDINGS [--no-twins] [--json FILE]
 
 Four trials of every case, without `--actual` and with it, in one warm process. These recordings were in
-view while the diagnosis was built: they show that it works, the blind check shows how well. `--half` takes
-one of two random halves of the cases, to develop on one and check on the other. Writes
-experiments/results/gap_recordings.json (FILE with --json), and prints how many of each tier are right.
+view while the diagnosis was built: they show that it works, the blind check shows how well. Writes
+experiments/results/gap_recordings.json (FILE with --json).
 """
 
 from __future__ import annotations
@@ -17,40 +16,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from estimation.report import read_actual
+from experiments.blind_check.tables import describe as describe_blind
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
+from experiments.table_text import load, markdown
 from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 
 RESULT = Path(__file__).parent / "results" / "gap_recordings.json"
 TRIALS = 4
-
-
-def tier_of(effects: Sequence[str]) -> str:
-    """none, single, pair or outside (an effect that the catalogue does not have)."""
-    if not effects:
-        return "none"
-    if any(e.startswith("x_") for e in effects):
-        return "outside"
-    return "single" if len(effects) == 1 else "pair"
-
-
-def right(tier: str, effects: Sequence[str], found: dict[str, Any]) -> bool:
-    """Whether a verdict is right: a set that holds a single cause is."""
-    if tier in ("none", "outside"):
-        return found["verdict"] == {"none": "none", "outside": "unknown"}[tier]
-    if tier == "single" and found["verdict"] == "set":
-        return effects[0] in [*found["causes"], *found["partners"]]
-    return sorted(found["causes"]) == sorted(effects)
-
-
-def chosen_half(names: Sequence[str], half: int | None) -> list[str]:
-    """One of two random halves, always the same."""
-    order = list(np.random.default_rng(20).permutation(sorted(names)))
-    return sorted(names) if half is None else sorted(order[half::2])
 
 
 def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dict[str, Any]:
@@ -71,18 +46,76 @@ def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dic
     }  # fmt: skip
 
 
+def table() -> str | None:
+    """docs/gap_results.md: verdicts on labelled recordings."""
+    found = load("gap_recordings")
+    if found is None:
+        return None
+    head = ["recording", "verdict without `actual`", "with `actual`", "parameters found (90 % interval)",
+            "true", "time"]  # fmt: skip
+    return markdown(head, [_row(row) for row in found["rows"]])
+
+
+def _row(row: dict[str, Any]) -> list[str]:
+    found = {k: v for k, v in row["actual"]["parameters"].items() if len(row["actual"]["parameters"]) <= 4}
+    values = "; ".join(
+        f"{k} {mean:.4g} {unit} ({low:.4g} to {high:.4g})" for k, (mean, low, high, unit) in found.items()
+    )
+    truth = "; ".join(f"{k} {_shown(v)}" for k, v in row["truth"].items())
+    return [row["case"], _verdict(row["blind"]), _verdict(row["actual"]), values, truth,
+            f"{row['blind']['processor']:.0f} s"]  # fmt: skip
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return "(" + ", ".join(_shown(v) for v in value) + ")"
+    return f"{value:.4g}" if isinstance(value, int | float) else str(value)
+
+
+def _verdict(found: dict[str, Any]) -> str:
+    if found["verdict"] == "set":
+        return f"set: {', '.join(found['causes'] + found['partners'])}"
+    return " + ".join(found["causes"]) or found["verdict"]
+
+
+def describe() -> str | None:
+    """docs/results.md: how often the diagnosis is right."""
+    found = load("gap_recordings")
+    if found is None:
+        return None
+    rows = found["rows"]
+    affected = [r for r in rows if r["effects"]]
+    healthy = [r for r in rows if not r["effects"]]
+    right = {
+        k: sum(r[k]["causes"] == r["effects"] and r[k]["verdict"] == "named" for r in affected)
+        for k in ("blind", "actual")
+    }
+    sets = sum(
+        r["blind"]["verdict"] == "set" and r["effects"][0] in [*r["blind"]["causes"], *r["blind"]["partners"]]
+        for r in affected
+    )
+    quiet = sum(r["blind"]["verdict"] == "none" and r["actual"]["verdict"] == "none" for r in healthy)
+    slowest = max(r["blind"]["processor"] for r in rows)
+    return (
+        f"On {len(rows)} labelled recordings of the stand-in, which were in view while it was built: "
+        f"{quiet} of {len(healthy)} healthy ones called healthy, of {len(affected)} with one effect "
+        f"{right['blind']} named without knowing the blocks' properties ({sets} more as a set that holds "
+        f"the cause), {right['actual']} with them; {slowest:.0f} s of processor at most for four trials."
+        f"{describe_blind()}"
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of this experiment."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("recordings", type=Path)
-    parser.add_argument("--half", type=int, choices=(0, 1))
     parser.add_argument("--no-twins", action="store_true")
     parser.add_argument("--json", type=Path, default=RESULT)
     options = parser.parse_args(arguments)
     folder = options.recordings
     labels = {e["case"]: e for e in json.loads((folder / "labels.json").read_text(encoding="utf-8"))}
     paths = {path.name: path for path in list_cases(folder)}
-    cases = {n: (read_case(paths[n]), paths[n]) for n in chosen_half(list(paths), options.half)}
+    cases = {name: (read_case(path), path) for name, path in sorted(paths.items())}
     first = next(iter(cases.values()))
     summary(*first, False, False)  # compiles
     rows = []
@@ -98,13 +131,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
                   row[key]["wall"], "s", flush=True)  # fmt: skip
         rows.append(row)
         save(options.json, {"rows": rows})  # after every case: what is there so far counts
-    for tier in ("none", "single", "pair", "outside"):
-        mine = [row for row in rows if tier_of(row["effects"]) == tier]
-        told = [
-            f"{key} {sum(right(tier, row['effects'], row[key]) for row in mine)}"
-            for key in ("blind", "actual")
-        ]
-        print(f"{tier}: right {', '.join(told)} of {len(mine)}")
 
 
 if __name__ == "__main__":

@@ -16,10 +16,12 @@ from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from simgap.channels import at_rest
 from simgap.channels.sensors import LOWPASS
+from simgap.generic.trials import Ensembles, align
 
 TASK = SequenceTask(("approach", "press", "hold"))
 DURATIONS = (1.5, 2.0, 1.2)  # prior: s
 PACE = 0.05  # prior: sd of a log duration
+TRIALS = 6  # of each kind in a case
 Values = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value
 
 
@@ -56,6 +58,16 @@ def ensemble(
         trials.append(trial)
         boundaries[trial.file] = edges[1:-1]
     return trials, boundaries
+
+
+def made(seed: int, effects: Values | None, aligned: bool) -> Ensembles:
+    """A case of TRIALS real and as many simulated trials, cut into subtasks: at boundaries that the HMM finds
+    where `aligned`, else at the true ones.
+    """
+    rng = np.random.default_rng(seed)
+    real, first = ensemble(rng, TRIALS, effects)
+    sim, second = ensemble(rng, TRIALS, None, name="sim")
+    return align(real, sim, TASK, None, None if aligned else first | second)
 
 
 def _trial(rng, effects: Values, s: Scatter, file: str) -> tuple[Trial, np.ndarray]:

@@ -32,13 +32,13 @@ EXACT = 1e-9  # numerics: relative; digits that a step which only moves code may
 Json = Any  # what the json module reads and writes
 
 
-def rounded(value: Json) -> Json:
-    """The same with ten significant digits."""
+def rounded(value: Json, digits: int = 10) -> Json:
+    """The same with so many significant digits."""
     if isinstance(value, dict):
-        return {key: rounded(each) for key, each in value.items()}
+        return {key: rounded(each, digits) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [rounded(each) for each in value]
-    return float(f"{value:.10g}") if isinstance(value, float) else value
+        return [rounded(each, digits) for each in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 
 def identified(name: str) -> Json:
@@ -74,8 +74,7 @@ def diagnosed(name: str) -> Json:
 
 def ensembles(effect: str) -> Json:
     """What the diagnosis of given trials finds where one effect is planted in six made-up ones."""
-    from experiments.gap_generic import made
-    from experiments.generic_ensembles import PLANTED
+    from experiments.generic_ensembles import PLANTED, made
     from simgap.generic.diagnose import diagnosed as diagnose_ensembles
 
     effects = None if effect == "none" else {effect: PLANTED[effect]}

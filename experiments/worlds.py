@@ -1,16 +1,16 @@
 """The labs of the calibrations: the usual hand and task, and how what is recorded there may differ.
 
-`Cell` says how a recording differs (rate, pace, noise, ringing contacts, lost values), `World` adds pads,
-effects that the rig does not state, and hands that are not tidy; `simulated_cases` gives healthy cases as a
-folder of recordings would, with hands that deviate from their rig as a [systematic] table says. Trials are
-the virtual model's own. A number gives the same blocks and the same draw of the operator in every world, so
-that worlds differ by their condition alone.
+`World` says how a lab differs (rate, pace, noise, ringing contacts, lost values, towers, pads, errors that
+its rig states or does not, hands that are not tidy), and `replicates` records trials there, with their truth;
+`simulated_cases` gives healthy cases as a folder of recordings would, with hands that deviate from their rig
+as a [systematic] table says. Trials are the virtual model's own. A number gives the same blocks and the same
+draw of the operator in every world, so that worlds differ by their condition alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,15 +20,23 @@ from experiments.recordings import Case
 from hmmseg.hand.kinematics import inverse, joint_velocity
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Fingertip, Noise, Rig, Systematic, read_rig
-from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.task import BlockTask, parse_task, read_task
 from hmmseg.io.trial import Trial
 from simgap.gap.twins import recorded
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.operator import OperatorSettings, Plan, Window, minimum_jerk
-from simgap.world.properties import random_properties
+from simgap.world.properties import Block, random_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 SCENE = Path(__file__).parent / "scene"
+SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
+BIAS = 0.02  # N, what [systematic] admits where a world has biases
+PADS = 0.3  # share, likewise of pads
+HAND = Systematic(force_bias=(0.01,) * 4, force_gain=(0.01,) * 4, joint_offset=(0.001,) * 4,
+                  link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1))  # fmt: skip
+RINGING = (15.0, 35.0)  # Hz, a fingertip on its arm; drawn once a trial
+DAMPING = 0.05  # ratio to critical
+GRASP_SPREAD = 0.0005  # m; the operator's own scatter of the grip's height over the block's centre
 
 
 def scene(rate: float | None = None) -> tuple[Rig, BlockTask]:
@@ -38,13 +46,24 @@ def scene(rate: float | None = None) -> tuple[Rig, BlockTask]:
     return (rig if rate is None else rig.model_copy(update={"rate": rate})), task
 
 
+def task_of(blocks: int) -> BlockTask:
+    """A tower of so many blocks reversed; one block is moved on the ground."""
+    if blocks == 2:
+        return scene()[1]
+    names = [f"b{k}" for k in range(blocks)]
+    under = {name: on for name, on in zip(names, [*names[1:], "ground"], strict=True)}
+    moves = [{"object": name, "to": "ground" if k == 0 else names[k - 1]} for k, name in enumerate(names)]
+    task = parse_task({"objects": {n: {"on": on} for n, on in under.items()}, "moves": moves})
+    assert isinstance(task, BlockTask)
+    return task
+
+
 @dataclass(frozen=True)
 class Cell:
-    """One condition.
+    """One condition of the sensors and of the work.
 
     `noise` and `pace` (rate of work) in units of the usual ones; `rate` [Hz]; `vibration` [N], its
-    amplitude at a contact change; `missing`, the share of the recording's values that are lost;
-    `grasp` [m], height of the grip over the block's centre; `stated`: the rig states its noise.
+    amplitude at a contact change; `missing`, the share of the recording's values that are lost.
     """
 
     noise: float = 1.0
@@ -52,28 +71,167 @@ class Cell:
     pace: float = 1.0
     vibration: float = 0.0
     missing: float = 0.0
-    grasp: float = 0.0
-    stated: bool = True
-
-    @property
-    def key(self) -> str:
-        """What differs from the usual, as `noise=4`; `nominal` where nothing does."""
-        usual = Cell()
-        changed = [(f.name, getattr(self, f.name)) for f in fields(self)
-                   if getattr(self, f.name) != getattr(usual, f.name)]  # fmt: skip
-        return "_".join(f"{name}={value:g}" for name, value in changed) or "nominal"
 
 
-FORCES = ("fx1", "fy1", "fx2", "fy2")
-RINGING = (15.0, 35.0)  # Hz, a fingertip on its arm; drawn once a trial
-DAMPING = 0.05  # ratio to critical
-GRASP_SPREAD = 0.0005  # m; the operator's own scatter about the cell's grip height
+@dataclass(frozen=True)
+class World:
+    """One lab: a tower of `blocks` reversed (one: moved), `trials` pooled.
+
+    `pads` [N/m]; `stated`: noise as the rig has it, over what it is; `coloured`: lag-one correlation of
+    the noise; `bias`: of every force, in units of what [systematic] admits (BIAS); `softer`: pads' true
+    stiffness over the rig's, which admits PADS in [systematic] if `doubted`; `deviating`: a hand drawn
+    from the [systematic] table HAND. `effects` act on the recording without a word in the rig; `untidy`
+    names one of UNTIDY.
+    """
+
+    name: str
+    cell: Cell = field(default_factory=Cell)
+    blocks: int = 2
+    trials: int = 1
+    pads: float = 4000.0
+    stated: float = 1.0
+    coloured: float = 0.0
+    bias: float = 0.0
+    softer: float = 1.0
+    doubted: bool = False
+    deviating: bool = False
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+    untidy: str | None = None
 
 
-def recording_rig(cell: Cell, rig: Rig) -> Rig:
-    """The hand that records: the cell's rate and true noise."""
-    scaled = {name: sd * cell.noise for name, sd in rig.noise.model_dump(exclude_none=True).items()}
-    return rig.model_copy(update={"rate": cell.rate, "noise": Noise(**scaled)})
+def _worlds() -> list[World]:
+    out = [World("as usual")]
+    out += [World(f"{r:g} Hz", Cell(rate=r)) for r in (10.0, 50.0, 200.0, 2000.0)]
+    out += [World(f"pace {p:g}", Cell(pace=p)) for p in (0.5, 3.0)]
+    out += [World(f"noise x{n:g}", Cell(noise=n)) for n in (0.25, 4.0, 16.0)]
+    out += [World(f"ringing {v:g} N", Cell(vibration=v)) for v in (0.3, 1.0)]
+    out += [World(f"pads {k:g} N/m", pads=k) for k in (1500.0, 12000.0)]
+    out += [World("missing 40 %", Cell(missing=0.4))]
+    out += [World(f"noise stated x{s:g}", stated=s) for s in (0.5, 2.0)]
+    out += [World("noise AR(1) 0.5", coloured=0.5)]
+    out += [World("bias as admitted", bias=1.0), World("bias twice that", bias=2.0)]
+    out += [
+        World("pads 30 % off, admitted", softer=0.7, doubted=True),
+        World("pads 30 % off, untold", softer=0.7),
+    ]
+    out += [World("hand as [systematic]", deviating=True)]
+    out += [World("1 block", blocks=1), World("3 blocks", blocks=3), World("6 blocks", blocks=6)]
+    out += [World("4 trials", trials=4), World("20 trials", trials=20)]
+    return out
+
+
+WORLDS = {world.name: world for world in _worlds()}
+
+
+@dataclass(frozen=True)
+class Replicate:
+    """Trials as the estimator gets them, with the truth."""
+
+    task: BlockTask
+    rig: Rig
+    trials: list[Trial]
+    boundaries: list[np.ndarray]
+    blocks: dict[str, Block]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A single trial as the estimator gets it, with its true boundaries [s]."""
+
+    trial: Trial
+    rig: Rig
+    boundaries: np.ndarray
+
+
+def replicates(world: World, numbers: Sequence[int]) -> Iterator[Replicate]:
+    """Replicates of a world by their numbers, each the same whatever its company."""
+    task, sensors = task_of(world.blocks), sensors_of(world)
+    seeds = [100 * number + k for number in numbers for k in range(world.trials)]
+    done = iter(_happens(world, [n for n in numbers for _ in range(world.trials)], seeds))
+    for number in numbers:
+        mine = [next(done) for _ in range(world.trials)]
+        trials = [_recorded(world, s, task, sensors, number) for s in mine]
+        yield Replicate(task, _told(world, sensors), trials, [s.boundaries for s in mine],
+                        dict(mine[0].blocks))  # fmt: skip
+
+
+def trials_of(world: World, numbers: Sequence[int]) -> list[Judged]:
+    """Single trials of a world by their numbers, which seed their operators too."""
+    task, sensors = task_of(world.blocks), sensors_of(world)
+    return [
+        Judged(_recorded(world, s, task, sensors, number), _told(world, sensors), s.boundaries)
+        for number, s in zip(numbers, _happens(world, numbers, numbers), strict=True)
+    ]
+
+
+def sensors_of(world: World) -> Rig:
+    """The hand that records: the world's pads as the rig states them, its rate and true noise."""
+    pads = Fingertip(normal_stiffness=world.pads, shear_stiffness=SHEAR_SHARE * world.pads)
+    rig = scene()[0]
+    noise = {name: sd * world.cell.noise for name, sd in rig.noise.model_dump(exclude_none=True).items()}
+    return rig.model_copy(update={"fingertip": pads, "rate": world.cell.rate, "noise": Noise(**noise)})
+
+
+def _happens(world: World, numbers: Sequence[int], seeds: Sequence[int]) -> list[SimulatedTrial]:
+    """What truly happens, a trial for each pair; worlds that differ by their sensors alone share it."""
+    stiffness = world.pads * world.softer
+    true = {"normal_stiffness": stiffness, "shear_stiffness": SHEAR_SHARE * stiffness}
+    true |= world.effects.get("fingertip_compliance", {})
+    return _performed(
+        world.cell.pace, *true.values(), world.blocks, world.untidy, tuple(numbers), tuple(seeds)
+    )
+
+
+@lru_cache(maxsize=4)
+def _performed(pace: float, normal: float, shear: float, blocks: int, untidy: str | None,
+               numbers: tuple[int, ...], seeds: tuple[int, ...]) -> list[SimulatedTrial]:  # fmt: skip
+    pads = Fingertip(normal_stiffness=normal, shear_stiffness=shear)
+    rig, task = scene()[0].model_copy(update={"fingertip": pads}), task_of(blocks)
+    operator = OperatorSettings(pace=(pace, pace), grasp=(-GRASP_SPREAD, GRASP_SPREAD))
+    drawn = {number: random_properties(task, number) for number in numbers}
+    return simulate_trials(task, rig, [drawn[n] for n in numbers], list(seeds), operator,
+                           alter=UNTIDY.get(untidy or ""))  # fmt: skip
+
+
+def _recorded(world: World, simulated: SimulatedTrial, task: BlockTask, rig: Rig, number: int) -> Trial:
+    t = np.arange(int(simulated.t[-1] * world.cell.rate)) / world.cell.rate
+    resampled = replace(simulated, trial=replace(simulated.trial, t=t))
+    trial = recorded(resampled, task, rig, world.effects)
+    if world.coloured:
+        quiet = {name: sd * 1e-9 for name, sd in rig.noise.model_dump(exclude_none=True).items()}
+        clean = recorded(resampled, task, rig.model_copy(update={"noise": Noise(**quiet)}), {})
+        trial = _coloured(trial, clean, world.coloured)
+    trial = disturbed(trial, simulated.boundaries, world.cell, simulated.seed)
+    rng = np.random.default_rng([number, 6])  # of the hand: all trials of a replicate alike
+    if world.bias:
+        signs = world.bias * BIAS * rng.choice([-1.0, 1.0], 4)
+        shifted = {n: trial.channels[n] + b for n, b in zip(FORCE_CHANNELS, signs, strict=True)}
+        trial = replace(trial, channels=trial.channels | shifted)
+    return deviated(trial, rig, draw_deviations(HAND, rng)) if world.deviating else trial
+
+
+def _coloured(noisy: Trial, clean: Trial, rho: float) -> Trial:
+    """The trial with its noise made AR(1), of the same variance."""
+    channels = {}
+    for name, values in noisy.channels.items():
+        white = values - clean.channels[name]
+        noise = np.empty_like(white)
+        noise[0] = white[0]
+        for k in range(1, white.size):
+            noise[k] = rho * noise[k - 1] + np.sqrt(1 - rho**2) * white[k]
+        channels[name] = clean.channels[name] + noise
+    return replace(noisy, channels=channels)
+
+
+def _told(world: World, sensors: Rig) -> Rig:
+    """What the estimator is told of the hand."""
+    noise = {name: sd * world.stated for name, sd in sensors.noise.model_dump(exclude_none=True).items()}
+    told = sensors.model_copy(update={"noise": Noise(**noise)})
+    if world.bias:
+        told = told.model_copy(update={"systematic": Systematic(force_bias=(BIAS,) * 4)})
+    if world.doubted:
+        told = told.model_copy(update={"systematic": Systematic(pad_stiffness=(PADS, PADS))})
+    return told.model_copy(update={"systematic": HAND}) if world.deviating else told
 
 
 def disturbed(trial: Trial, boundaries: np.ndarray, cell: Cell, number: int) -> Trial:
@@ -82,7 +240,7 @@ def disturbed(trial: Trial, boundaries: np.ndarray, cell: Cell, number: int) -> 
     if cell.vibration > 0:
         rng = np.random.default_rng([number, 3])
         frequency = rng.uniform(*RINGING)
-        for name in FORCES:
+        for name in FORCE_CHANNELS:
             signs = rng.choice([-1.0, 1.0], boundaries.size)
             channels[name] = channels[name] + cell.vibration * ringing(trial.t, boundaries, frequency, signs)
     if cell.missing > 0:
@@ -101,12 +259,9 @@ def ringing(t: np.ndarray, at: np.ndarray, frequency: float, signs: np.ndarray) 
 
 
 # Hands that are not tidy: each alters the commanded motion, so that the simulator's own mechanics makes the
-# forces; `turned` alone edits the recording, as the simulator's blocks keep their orientation.
+# forces.
 Alter = Callable[[Plan, np.random.Generator], Plan]
 LATE = (0.02, 0.1)  # s by which one finger closes after the other
-PUSH = 1.5e-3  # m that a push on the ground commands
-STILL = 10.0  # s of holding a block still in the air
-SLOWEST = 0.05  # of the usual pace, amid a hesitation
 LOOSENED = 0.06  # s for which a grip opens amid a carry, by ...
 SLACK = 0.42  # ... this share of its way: it is lost for 40 ms; from about 0.46 on blocks are dropped
 
@@ -159,42 +314,6 @@ def tapping(plan: Plan, rng: np.random.Generator) -> Plan:
     return plan
 
 
-def pushed(plan: Plan, rng: np.random.Generator) -> Plan:
-    """A gripped block is pushed sideways on the ground before it is lifted."""
-    for k in range(len(plan.windows)):
-        n, change = _row(0.4), np.zeros((_row(0.4), 4))
-        change[:, 0] = change[:, 2] = rng.choice([-PUSH, PUSH]) * _pulse(n)
-        plan = _inserted(plan, plan.windows[k].lift - 0.02, change)
-    return plan
-
-
-def still(plan: Plan, rng: np.random.Generator) -> Plan:
-    """The first block is held still in the air for ten seconds, but for a tremor."""
-    t = np.arange(_row(STILL)) * CONTROL_PERIOD
-    change = 4e-5 * np.sin(2 * np.pi * rng.uniform(6, 12, 4) * t[:, None])
-    return _inserted(plan, plan.windows[0].middle, change)
-
-
-def hesitating(plan: Plan, rng: np.random.Generator) -> Plan:
-    """The hand nearly stops on its way to a lift, in mid-lift and on its way down, in every move."""
-    moments = [m + rng.uniform(-0.05, 0.05) for w in plan.windows
-               for m in (w.close - 0.25, w.lift + 0.2, (w.middle + w.open) / 2)]  # fmt: skip
-    t = np.arange(len(plan.command)) * CONTROL_PERIOD
-    slow = 1 - (1 - SLOWEST) * np.max([np.exp(-(((t - m) / 0.06) ** 2)) for m in moments], axis=0)
-    warped = np.concatenate([[0.0], np.cumsum(CONTROL_PERIOD / slow)[:-1]])  # the time now at each row
-    fine = np.arange(_row(warped[-1]) + 1) * CONTROL_PERIOD
-    command = np.stack([np.interp(fine, warped, c) for c in plan.command.T], axis=1)
-
-    def moved(time: float) -> float:
-        return float(np.interp(time, t, warped))
-
-    windows = tuple(
-        replace(w, close=moved(w.close), lift=moved(w.lift), middle=moved(w.middle), open=moved(w.open),
-                end=moved(w.end)) for w in plan.windows
-    )  # fmt: skip
-    return replace(plan, command=command, windows=windows, duration=len(fine) * CONTROL_PERIOD)
-
-
 def slipping(plan: Plan, rng: np.random.Generator) -> Plan:
     """The grip loosens in mid-carry for a moment, the block slips a little and is held again."""
     for k in range(len(plan.windows)):
@@ -209,137 +328,7 @@ def slipping(plan: Plan, rng: np.random.Generator) -> Plan:
     return plan
 
 
-UNTIDY: dict[str, Alter] = {
-    "late finger": late_finger, "tapping": tapping, "pushed": pushed, "still": still,
-    "hesitating": hesitating, "slipping": slipping,
-}  # fmt: skip
-
-
-SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
-HOLDING = 0.2  # N
-TURN, TURNED = 1.5e-4, 0.05  # m that a turned block spreads the fingers, N of shear that holds it
-
-
-@dataclass(frozen=True)
-class World:
-    """One row of the table; `cell` as in the sweeps, `pads` [N/m] told to the estimator as they are.
-
-    `effects` act on the recording without a word in the rig. `untidy` names an alteration.
-    """
-
-    name: str
-    cell: Cell = field(default_factory=Cell)
-    pads: float | None = None
-    effects: dict[str, dict[str, float]] = field(default_factory=dict)
-    untidy: str | None = None
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A trial as the estimator gets it, with its true boundaries [s]."""
-
-    trial: Trial
-    rig: Rig
-    boundaries: np.ndarray
-
-
-def _worlds() -> list[World]:
-    rates = [World(f"{r:g} Hz", Cell(rate=r)) for r in (10.0, 20.0, 50.0, 100.0, 1000.0)]
-    paces = [World(f"pace {p:g}", Cell(pace=p)) for p in (0.5, 3.0)]
-    noises = [World(f"noise x{n:g}", Cell(noise=n)) for n in (0.25, 4.0, 16.0)]
-    rings = [World(f"ringing {v:g} N", Cell(vibration=v)) for v in (0.2, 1.0)]
-    pads = [World(f"pads {k:g} N/m", pads=k) for k in (1500.0, 12000.0)]
-    effects = {
-        "lag 60 ms": {"force_lag": {"delay": 0.06}},
-        "low-pass 30 ms": {"force_lowpass": {"time_constant": 0.03}},
-        "bias": {"force_bias": {"fx1": 0.08, "fy1": 0.0, "fx2": 0.0, "fy2": -0.06}},
-        "pads x0.6": {"fingertip_compliance": {"normal_stiffness": 2400.0, "shear_stiffness": 1500.0}},
-        "creep": {"fingertip_creep": {"ratio": 0.4, "time_constant": 0.5}},
-    }  # fmt: skip
-    told = [World(f"untold: {name}", effects=e) for name, e in effects.items()]
-    untidy = [World(name, untidy=name) for name in (*UNTIDY, "turned")]
-    fast = [World(f"{name}, 100 Hz", Cell(rate=100.0), untidy=name) for name in ("late finger", "tapping")]
-    missing = [World("missing 40 %", Cell(missing=0.4))]
-    return [*rates, *paces, *noises, *rings, *pads, *missing, *told, *untidy, *fast]
-
-
-WORLDS = {world.name: world for world in _worlds()}
-
-
-def trials_of(world: World, numbers: Sequence[int]) -> list[Judged]:
-    """Trials of a world by their numbers."""
-    rig = _rig(world)
-    stated = recording_rig(world.cell, rig)
-    _, task = scene()
-    out = []
-    for simulated in _performed(world.cell.pace, world.pads, _scene_key(world), world.untidy, tuple(numbers)):
-        t = np.arange(int(simulated.t[-1] * world.cell.rate)) / world.cell.rate
-        resampled = replace(simulated, trial=replace(simulated.trial, t=t))
-        trial = recorded(resampled, task, stated, world.effects)
-        trial = disturbed(trial, simulated.boundaries, world.cell, simulated.seed)
-        if world.untidy == "turned":
-            trial = _turned(trial, simulated.boundaries, stated)
-        judged = Judged(trial, stated, simulated.boundaries)
-        if world.untidy != "slipping" or _still_held(judged):
-            out.append(judged)
-    return out
-
-
-def _still_held(judged: Judged) -> bool:
-    """Whether every block is in the grip as it lands: what slips out of it is a drop, and a misfit."""
-    lands = judged.boundaries[2::4]
-    if not np.isfinite(judged.boundaries).all():
-        return False
-    signals = task_space(judged.trial, judged.rig)
-    return bool((np.interp(lands, signals.t, signals.grip) > HOLDING).all())
-
-
-def _rig(world: World) -> Rig:
-    rig, _ = scene()
-    if world.pads is None:
-        return rig
-    pads = Fingertip(normal_stiffness=world.pads, shear_stiffness=SHEAR_SHARE * world.pads)
-    return rig.model_copy(update={"fingertip": pads})
-
-
-def _scene_key(world: World) -> tuple[float, float] | None:
-    values = world.effects.get("fingertip_compliance")
-    return None if values is None else (values["normal_stiffness"], values["shear_stiffness"])
-
-
-@lru_cache(maxsize=4)
-def _performed(pace: float, pads: float | None, true_pads: tuple[float, float] | None, untidy: str | None,
-               numbers: tuple[int, ...]) -> list[SimulatedTrial]:  # fmt: skip
-    """What truly happened; worlds that differ by their sensors alone share it."""
-    rig, task = _rig(World("", pads=pads)), scene()[1]
-    if true_pads is not None:
-        hand = Fingertip(normal_stiffness=true_pads[0], shear_stiffness=true_pads[1])
-        rig = rig.model_copy(update={"fingertip": hand})
-    operator = OperatorSettings(pace=(pace, pace), grasp=(-GRASP_SPREAD, GRASP_SPREAD))
-    blocks = [random_properties(task, number) for number in numbers]
-    return simulate_trials(task, rig, blocks, list(numbers), operator, alter=UNTIDY.get(untidy or ""))
-
-
-def _turned(trial: Trial, boundaries: np.ndarray, rig: Rig) -> Trial:
-    """Blocks that turn a little once they leave the ground: faces spread the fingers, shear holds them."""
-    channels, rng = dict(trial.channels), np.random.default_rng(len(trial.t))
-    for leave, meet in boundaries.reshape(-1, 4)[:, 1:3]:
-        up = np.clip((trial.t - leave) / 0.15, 0, 1) * np.clip((meet - trial.t) / 0.05, 0, 1)
-        sign = rng.choice([-1.0, 1.0])
-        channels["fy1"] = channels["fy1"] + sign * TURNED * up
-        channels["fy2"] = channels["fy2"] - sign * TURNED * up
-        signals = task_space(replace(trial, channels=channels), rig)
-        push = np.clip(signals.grip, 0, None) > 0
-        spread = TURN * up * push
-        for i, way in ((1, -spread / 2), (2, spread / 2)):
-            q, links = (channels[f"q{i}1"], channels[f"q{i}2"]), rig.finger(i).links
-            jacobian = np.array([[-links[0] * np.sin(q[0]), -links[1] * np.sin(q[1])],
-                                 [links[0] * np.cos(q[0]), links[1] * np.cos(q[1])]])  # fmt: skip
-            step = np.linalg.solve(jacobian.transpose(2, 0, 1), np.stack([way, 0 * way], 1)[..., None])[
-                ..., 0
-            ]
-            channels[f"q{i}1"], channels[f"q{i}2"] = q[0] + step[:, 0], q[1] + step[:, 1]
-    return replace(trial, channels=channels)
+UNTIDY: dict[str, Alter] = {"late finger": late_finger, "tapping": tapping, "slipping": slipping}
 
 
 SEED = 40_000  # cases are SEED, SEED + 1, ...; their trials 100 times that and on

@@ -1,4 +1,4 @@
-"""Packages whose public names are imported when they are first asked for, so that importing them is quick.
+"""Packages whose public names are imported on first use, so that importing the packages is quick.
 
 What is public, and where it lives, is said once: in the package's stub, which type checkers and editors read.
 """
@@ -14,9 +14,9 @@ from typing import Any
 
 
 def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package, from the imports of the stub beside its `file`.
+    """`__getattr__`, `__dir__` and `__all__` of a package, from the imports of the stub next to its `file`.
 
-    A name is kept in the package once it was asked for.
+    A name stays in the package after its first use.
     """
     stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]

@@ -1,4 +1,4 @@
-"""What is kept between runs, in the user's cache folder: a convenience, without which all is made anew.
+"""Files kept between runs in the user's cache folder: a convenience, without which everything is recomputed.
 
 A file holds a digest, then its content; whatever else is found there (cut short, garbled, of somebody else)
 counts as nothing, is said once and replaced. Values are kept as arrays and JSON, never as code.
@@ -45,7 +45,7 @@ def cache_folder() -> Path | None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that nobody reads half of it, whatever happens in between; OSError where it fails."""
+    """Write a file atomically, so that no reader sees half of it; OSError where it fails."""
     handle, beside = tempfile.mkstemp(dir=path.parent, prefix=".hmmseg-")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -89,7 +89,7 @@ def _damaged(path: Path) -> None:
         path.unlink(missing_ok=True)
     if path.parent not in _said:
         _said.add(path.parent)
-        warnings.warn(f"{path}: not as it was written; made anew", CacheWarning, stacklevel=4)
+        warnings.warn(f"{path}: not as it was written; recomputed", CacheWarning, stacklevel=4)
 
 
 def keep_value(path: Path | None, value: Any) -> None:

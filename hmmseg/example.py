@@ -8,7 +8,7 @@ from pathlib import Path
 def example_folder() -> Path:
     """Folder with `rig.toml`, `task.toml`, `actual.toml` and four recordings `trial_01.csv` and on.
 
-    Two stacked blocks change places on a stand-in of the hand of Dupont et al. 1999, at 20 Hz.
+    Two stacked blocks change places, in a simulation of the hand of Dupont et al. 1999, at 20 Hz.
 
     >>> from hmmseg import Task, example_folder
     >>> sorted(path.name for path in example_folder().glob("*.csv"))

@@ -67,7 +67,7 @@ def calibrate(
 
 
 def tables(document: dict[str, Any]) -> list[Table]:
-    """Parameters, what is told of several together, the simulation's own numbers, and held-out logs."""
+    """Parameters, what is determined only jointly, the simulation's own numbers, and held-out logs."""
     from hmmseg.numbers import estimate, interval, shown_as
 
     values = Table(title="parameters", title_justify="left")
@@ -82,7 +82,7 @@ def tables(document: dict[str, Any]) -> list[Table]:
         shown = shown_as(p["unit"])
         nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
         if p["mean"] is None:
-            values.add_row(p["name"], nominal, "not told", "")
+            values.add_row(p["name"], nominal, "undetermined", "")
         else:
             told = (
                 estimate(p["mean"], p["sd"], shown),

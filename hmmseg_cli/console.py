@@ -39,10 +39,10 @@ TaskArgument = Annotated[Path, typer.Argument(metavar="TASK", help="Task descrip
 TaskOption = Annotated[Path, typer.Option("--task", metavar="T", help="Task description (TOML).")]
 RigOption = Annotated[Path, typer.Option("--rig", metavar="R", help="Nominal hand (TOML).")]
 TaskBeside = Annotated[Path | None, typer.Option(
-    "--task", metavar="T", help="Task description (TOML); task.toml beside the trials if left out."
+    "--task", metavar="T", help="Task description (TOML); task.toml next to the trials by default."
 )]  # fmt: skip
 RigBeside = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Nominal hand (TOML); rig.toml beside the trials if left out.")]  # fmt: skip
+    "--rig", metavar="R", help="Nominal hand (TOML); rig.toml next to the trials by default.")]  # fmt: skip
 ActualOption = Annotated[Path | None, typer.Option(
     "--actual", metavar="A", help="Properties measured apart from the trials (TOML).")]  # fmt: skip
 JsonOption = Annotated[str | None, typer.Option(
@@ -54,7 +54,7 @@ ReportOption = Annotated[Path | None, typer.Option(
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")]
 UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, min=0)]  # taken, where nothing is random
 QuietOption = Annotated[bool, typer.Option(
-    "--quiet", help="Print nothing but errors; warnings stand in the JSON.")]  # fmt: skip
+    "--quiet", help="Print nothing but errors; warnings are in the JSON.")]  # fmt: skip
 
 STANDARD_OUTPUT = "-"
 SCRATCH = "hmmseg-"  # how folders for temporary files begin

@@ -31,7 +31,7 @@ def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: See
         )
         assert isinstance(task, BlockTask)
         rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
-        out.print("\nThe same recordings, the fingertips thought rigid as the paper has them:")
+        out.print("\nThe same recordings, with fingertips assumed rigid as in the paper:")
         out.report = finding
         paper = rig.model_copy(update={"fingertip": rigid})
         body["diagnosis"] = diagnose.run(out, trials, task, paper, None, []).body

@@ -139,7 +139,7 @@ def read_logs(
 
 @contextmanager
 def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with what a long one is at; yields what is told of each stage that begins.
+    """Progress by stages, with the position within a long one; yields the callback of each stage.
 
     InputError where the model runs so far from its logs that no equation can be solved.
     """

@@ -35,13 +35,11 @@ LABELS = {
 
 def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     """A recorded signal in task space, SI."""
-    import jax
-    import jax.numpy as jnp
 
     from simgap.effects.base import tips
 
     w = found.problem.frame.world
-    position, velocity = (np.asarray(z)[trial] for z in tips(jax.tree.map(jnp.asarray, w)))
+    position, velocity = (z[trial] for z in tips(w))
     force = dict(zip(FORCE_CHANNELS, w.force[trial].T, strict=True))
     x1, y1, x2, y2 = position.T
     table = {

@@ -26,7 +26,7 @@ class Hand(StrEnum):
 
 HandOption = Annotated[Hand | None, typer.Option(
     "--hand", help="Fingertips, two-link fingers, a gripper, or none (a plain ordered task).")]  # fmt: skip
-FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the files are laid out.")]
+FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the files are written.")]
 FromOption = Annotated[Path | None, typer.Option(
     "--from", metavar="FILE", help="Fill in hand, rate and columns from this recording."
 )]  # fmt: skip
@@ -63,7 +63,7 @@ def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = No
         if looked is not None:
             then = ("say in task.toml what goes where, then: "
                     f"hmmseg segment {source} --task {targets[1]} --rig {targets[0]}")  # fmt: skip
-        out.print(f"{targets[0]} and {targets[1]} are laid out; {then}")
+        out.print(f"wrote {targets[0]} and {targets[1]}; {then}")
         out.finish({"files": [str(path) for path in targets], "hand": hand.value})
 
 
@@ -95,6 +95,6 @@ def _map(out: Output, path: Path, mjcf: Path, source: Path | None) -> str:
     text, open_columns = proposed_map(mjcf, columns)
     out.stage(path).write_text(text, encoding="utf-8")
     left = f"; columns left to you: {', '.join(open_columns)}" if open_columns else ""
-    out.print(f"{path} is laid out{left}")
+    out.print(f"wrote {path}{left}")
     out.print(f"then: hmmseg diagnose {source} --mjcf {mjcf} --map {path} --report gap.html")
     return str(path)

@@ -287,7 +287,7 @@ def _values(
 
     model = "" if p.get("nominal") is None else told(lambda u: estimate(p["nominal"], 0.0, u))
     if p["mean"] is None:
-        return model, "not told by these logs", ""
+        return model, "not determined by these logs", ""
     low, high = p["interval_90"] or (None, None)
     ends = "" if low is None or high is None else told(lambda u: interval(low, high, u))
     return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
@@ -305,7 +305,7 @@ def _numerics(body: Body) -> str:
         for name, text in known.items()
         if (v := (body.get("numerics") or {}).get(name)) and abs(v["after"]) > 0.05
     ]
-    return f"Fitted along, and no cause: {'; '.join(said)}." if said else ""
+    return f"Fitted as well, and never a cause: {'; '.join(said)}." if said else ""
 
 
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:

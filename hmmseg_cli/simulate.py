@@ -39,7 +39,7 @@ OutputOption = Annotated[Path, typer.Option("--output", metavar="DIR", help="Fol
 OperatorOption = Annotated[Path | None, typer.Option(
     "--operator", metavar="FILE", help="How the operator works (TOML or JSON).")]  # fmt: skip
 AnimationOption = Annotated[bool, typer.Option(
-    "--animation", help="Draw fingers and blocks in motion beside the forces.")]  # fmt: skip
+    "--animation", help="Draw fingers and blocks in motion next to the forces.")]  # fmt: skip
 FormatOption = Annotated[Animation, typer.Option("--animation-format", help="Kind of animation.")]
 
 
@@ -71,7 +71,7 @@ def simulate(
             raise InputError("--replay", "goes with neither --trials nor --operator")
         blocks = paper_blocks(description) if properties is None else read_properties(properties, description)
         if properties is None and not set(description.objects) <= set(PAPER_BLOCKS):
-            out.warn("no --properties: the paper's two blocks stand in turn for the task's objects")
+            out.warn("no --properties: the task's objects are the paper's two blocks in turn")
         films: list[tuple[str, Any, Any]] = []
         if replay is None:
             files, document = _perform(out, description, hand, blocks, trials, operator, seed, films)

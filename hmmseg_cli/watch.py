@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json as jsonlib
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,8 +23,10 @@ PlotOption = Annotated[bool, typer.Option(
 SkipOption = Annotated[bool, typer.Option(
     "--skip-bad-rows", help="Leave out rows that cannot be read, instead of stopping.")]  # fmt: skip
 SAID = {
-    "gaps": "gaps between rows", "late": "rows out of order left out",
-    "repeated": "repeated rows counted once", "bad": "rows that cannot be read left out",
+    "gaps": "gaps between rows", "late": "late rows put in their place",
+    "repeated": "repeated rows counted once",
+    "too late": "rows later than the lag left out", "contradictory": "second rows for one time left out",
+    "bad": "rows that cannot be read left out",
 }  # fmt: skip
 
 
@@ -59,17 +60,15 @@ def watch(
         for key, text in SAID.items():
             if watcher.counts[key]:
                 out.warn(f"{watcher.counts[key]} {text}")
-        document = final.to_json() | {"counts": dict(watcher.counts), "warnings": out.warnings}
+        envelope = {"format": "hmmseg.watch/1", "version": hmmseg.__version__, "seed": seed,
+                    "warnings": out.warnings, "figures": [], "counts": dict(watcher.counts)}  # fmt: skip
+        line = final.line(envelope)
         if write is not None:
-            envelope = {
-                "format": "hmmseg.watch/1",
-                "version": hmmseg.__version__,
-                "seed": seed,
-                "figures": [],
-            }
-            write(jsonlib.dumps(document | envelope, separators=(",", ":")) + "\n")
+            write(line + "\n")
         if destination is not None or out.lost:
-            out.finish(document)
+            import json as jsonlib
+
+            out.finish(jsonlib.loads(line))
 
 
 def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out: Output) -> None:
@@ -105,8 +104,14 @@ def _warm_up(watcher: Watcher) -> None:
     from hmmseg.online.filter import Filter
 
     f = watcher.filter
+    size = 12
+    if f.rig.gripper is not None:
+        import scipy.ndimage
+        import scipy.spatial.transform  # noqa: F401
+
+        size = 16
     scratch = Filter(f.task, f.rig, f.lag)
     for i in range(200):
-        scratch.take(0.02 * i, np.full(12, 1e-4 * (i % 3)))
+        scratch.take(0.02 * i, np.full(size, 1e-4 * (i % 3)))
         scratch.answer().line()
     scratch.finish().line()

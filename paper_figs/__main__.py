@@ -1,4 +1,4 @@
-"""Draw every figure of the paper's reproduction from saved results.
+"""Draw every figure of the paper's reproduction, and that of the blind check, from saved results.
 
 python -m paper_figs [NAME...]
 """
@@ -6,27 +6,34 @@ python -m paper_figs [NAME...]
 from __future__ import annotations
 
 import argparse
-import importlib
+from collections.abc import Callable
 
-FIGURES = (
-    "fig03",
-    "fig05",
-    "fig06",
-    "fig07",
-    "fig08",
-    "fig09",
-    "fig11",
-    "fig12",
-    "fig13",
-    "fig14",
-    "table4",
-    "rigid",
-    "slip",
-    "replay",
-    "corner",
-    "alignments",
-    "prior_posterior",
-)
+from paper_figs import properties, recording, virtual_block
+from paper_figs.gap_reliability import gap_reliability
+
+FIGURES: dict[str, Callable[[], None]] = {
+    draw.__name__: draw
+    for draw in (
+        recording.fig03,
+        recording.fig05,
+        recording.fig06,
+        recording.fig07,
+        recording.fig08,
+        recording.fig09,
+        virtual_block.fig11,
+        virtual_block.fig12,
+        virtual_block.fig13,
+        virtual_block.fig14,
+        virtual_block.replay,
+        properties.table4,
+        properties.rigid,
+        properties.slip,
+        properties.corner,
+        properties.prior_posterior,
+        recording.alignments,
+        gap_reliability,
+    )
+}
 
 
 def main() -> None:
@@ -37,7 +44,7 @@ def main() -> None:
     for name in names:
         if name not in FIGURES:
             parser.error(f"{name!r} is none of {', '.join(FIGURES)}")
-        importlib.import_module(f"paper_figs.{name}").main()
+        FIGURES[name]()
 
 
 if __name__ == "__main__":

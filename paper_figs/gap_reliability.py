@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 
 from hmmseg.plot.style import BLUE, GREY, canvas
-from paper_figs.gap_results import load
-from paper_figs.results import target
+from paper_figs.results import ROOT, target
 
+RESULTS = ROOT / "experiments" / "results" / "blind_check.json"
 PANELS = (
     ("calibration_error", "probability of the likeliest verdict"),
     ("inclusion_all", "probability that an effect acts"),
 )
 
 
-def main() -> None:
-    found = load()["table"]
+def gap_reliability() -> None:
+    """Shares that come true against what was said, of verdicts and of single effects."""
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))["table"]
     with canvas(target("gap_reliability"), height=3.2) as figure:
         for ax, (key, words) in zip(figure.subplots(1, 2), PANELS, strict=True):
             bins = found[key]["bins"]
@@ -28,7 +31,3 @@ def main() -> None:
             ax.set(xlim=(-0.02, 1.04), ylim=(-0.02, 1.04))
             ax.set_title(f"calibration error {found[key]['value']:.3f}; numbers are counts", loc="left")
             ax.legend(loc="upper left")
-
-
-if __name__ == "__main__":
-    main()

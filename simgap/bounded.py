@@ -14,7 +14,7 @@ def least(
     """The x (n,) within [low, high] at which x' matrix x / 2 - pull x is least, and which are held (n,).
 
     `matrix` (n, n) is positive definite, so there is one. By block principal pivoting: coordinates past a
-    bound are held there, held ones that the slope draws inwards are let go, all at once while that leaves
+    bound are held there, held ones that the slope draws inwards are released, all at once while that leaves
     fewer of them, else the last one alone (Judice & Pires, Comput. Oper. Res. 21, 1994).
     """
     x, side = np.linalg.solve(matrix, pull), np.zeros(pull.size, int)  # side: -1 held low, 1 held high

@@ -54,11 +54,7 @@ class Parameter:
 
     def value(self, u: Array) -> Array:
         """The parameter from its standard normal coordinate."""
-        if not self.log:
-            return self.nominal + self.sd * u
-        import jax.numpy as jnp  # robots need none
-
-        return self.nominal * jnp.exp(self.sd * u)
+        return self.nominal * np.exp(self.sd * u) if self.log else self.nominal + self.sd * u
 
     def coordinate(self, value: float) -> float:
         """The inverse of `value`."""

@@ -1,7 +1,5 @@
 """Strict settings for every test: double precision, no silent promotion, shapes checked."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A healthy recording of two fingers, and what a line about a faulty one makes of its rig."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

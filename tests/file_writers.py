@@ -1,15 +1,134 @@
-"""One planted recording in every kind of file, each written by the field's own library."""
-
-from __future__ import annotations
+"""Recordings in every kind of file, each written by its own library, and as other labs would have them."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from log_writers import Topic, bag_of, mcap_of
+from mcap_ros2.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Bag1
+from rosbags.rosbag2 import Writer as Bag2
+from rosbags.typesys import Stores, get_typestore
+
+DELAY = 300_000  # ns: a message is logged a little later than its stamp
+HEADER = "std_msgs/Header header\n"
+SEP = "=" * 80
+STAMPED = f"{SEP}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" \
+          f"{SEP}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"  # fmt: skip
+VECTOR = "float64 x\nfloat64 y\nfloat64 z\n"
+SCHEMAS = {
+    "geometry_msgs/msg/WrenchStamped": f"{HEADER}geometry_msgs/Wrench wrench\n{SEP}\n"
+    "MSG: geometry_msgs/Wrench\ngeometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n"
+    f"{SEP}\nMSG: geometry_msgs/Vector3\n{VECTOR}{STAMPED}",
+    "sensor_msgs/msg/JointState": f"{HEADER}string[] name\nfloat64[] position\nfloat64[] velocity\n"
+    f"float64[] effort\n{STAMPED}",
+    "geometry_msgs/msg/PoseStamped": f"{HEADER}geometry_msgs/Pose pose\n{SEP}\nMSG: geometry_msgs/Pose\n"
+    "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+    f"{SEP}\nMSG: geometry_msgs/Point\n{VECTOR}{SEP}\nMSG: geometry_msgs/Quaternion\n{VECTOR}float64 w\n"
+    f"{STAMPED}",
+    "std_msgs/msg/Float64": "float64 data",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Messages of one kind at times [ns since 1970] (num_messages,).
+
+    `values` by field: of a wrench and a pose `force`, `torque`, `position` (num_messages, 3) and
+    `orientation` (num_messages, 4), what is absent zero (no turn); of a JointState columns by the joints'
+    names in `position` and `velocity`; of a Float64 `data` (num_messages,), which has no stamp.
+    """
+
+    name: str
+    kind: str
+    ns: np.ndarray
+    values: dict
+    stamps: np.ndarray | None = None  # of its headers, where they are of another clock
+
+    def body(self, k: int) -> dict:
+        """Message k as plain Python, without its header."""
+        v = {name: each if isinstance(each, dict) else each[k] for name, each in self.values.items()}
+        if self.kind == "std_msgs/msg/Float64":
+            return {"data": float(v["data"])}
+        if self.kind == "geometry_msgs/msg/WrenchStamped":
+            return {
+                "wrench": {name: _axes(v.get(name, (0.0, 0.0, 0.0)), "xyz") for name in ("force", "torque")}
+            }
+        if self.kind == "geometry_msgs/msg/PoseStamped":
+            turn = _axes(v.get("orientation", (0.0, 0.0, 0.0, 1.0)), "xyzw")
+            return {"pose": {"position": _axes(v["position"], "xyz"), "orientation": turn}}
+        arrays = {name: [float(c[k]) for c in v.get(name, {}).values()] for name in ("position", "velocity")}
+        return {"name": list(v["position"]), **arrays, "effort": []}
+
+    @property
+    def stamped(self) -> bool:
+        """Whether the kind has a header."""
+        return self.kind != "std_msgs/msg/Float64"
+
+
+def mcap_of(path: Path, topics: list[Topic]) -> Path:
+    """A log of these topics, messages in order of time."""
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        schemas = {kind: writer.register_msgdef(kind, SCHEMAS[kind]) for kind in {t.kind for t in topics}}
+        for topic, k in _ordered(topics):
+            ns = int(topic.ns[k])
+            stamp = ns if topic.stamps is None else int(topic.stamps[k])
+            head = {"header": {"stamp": _stamp(stamp), "frame_id": "tool"}} if topic.stamped else {}
+            body = topic.body(k) | head
+            writer.write_message(topic.name, schemas[topic.kind], body, log_time=ns + DELAY)
+        writer.finish()
+    return path
+
+
+def bag_of(path: Path, topics: list[Topic]) -> Path:
+    """A ROS 1 bag (.bag) or a ROS 2 bag (a folder) of these topics."""
+    one = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    pack = store.serialize_ros1 if one else store.serialize_cdr
+    with Bag1(path) if one else Bag2(path, version=9) as writer:
+        links = {t.name: writer.add_connection(t.name, t.kind, typestore=store) for t in topics}
+        for topic, k in _ordered(topics):
+            ns = int(topic.ns[k])
+            body = {name: _typed(store.types, each) for name, each in topic.body(k).items()}
+            if topic.stamped:
+                stamp = store.types["builtin_interfaces/msg/Time"](**_stamp(ns))
+                more = {"seq": 0} if one else {}
+                body["header"] = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="tool", **more)
+            writer.write(links[topic.name], ns + DELAY, pack(store.types[topic.kind](**body), topic.kind))
+    return path
+
+
+def _typed(types, value):
+    """A part of a message in the library's own types."""
+    if isinstance(value, list) and not (value and isinstance(value[0], str)):
+        return np.array(value, dtype=np.float64)
+    if not isinstance(value, dict):
+        return value
+    inner = {name: _typed(types, each) for name, each in value.items()}
+    if "force" in inner:
+        return types["geometry_msgs/msg/Wrench"](**inner)
+    if "position" in inner:
+        point = types["geometry_msgs/msg/Point"](**value["position"])
+        return types["geometry_msgs/msg/Pose"](position=point, orientation=inner["orientation"])
+    return types[f"geometry_msgs/msg/{'Quaternion' if 'w' in inner else 'Vector3'}"](**inner)
+
+
+def _ordered(topics: list[Topic]) -> list[tuple[Topic, int]]:
+    every = [(int(ns), number, k) for number, t in enumerate(topics) for k, ns in enumerate(t.ns)]
+    return [(topics[number], k) for _, number, k in sorted(every)]
+
+
+def _axes(values, names: str) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _stamp(ns: int) -> dict[str, int]:
+    return {"sec": ns // 1_000_000_000, "nanosec": ns % 1_000_000_000}
+
 
 START = 1_764_000_000_000_000_000  # ns since 1970
 FAST = np.arange(200) * 10_000_000  # 100 Hz, of the wrenches
@@ -134,3 +253,92 @@ def lerobot_of(folder: Path, version: int, fps: int, names: list[str], states: l
     else:
         pq.write_table(pa.concat_tables(tables), folder / "data/chunk-000/file-000.parquet")
     return folder
+
+
+ODD_START = 1_764_000_000_123_456_789  # ns since 1970
+WRENCH, POSE = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/PoseStamped"
+
+
+def finger_topics(c: dict[str, np.ndarray]) -> list[Topic]:
+    """Two fingertips that close along y and lift along z: poses twice as often as wrenches.
+
+    `c`: columns t, x1, y1, fx1, fy1, x2, y2, fx2, fy2 (num_timesteps,).
+    """
+    t, twice = c["t"], np.sort(np.r_[c["t"], (c["t"][1:] + c["t"][:-1]) / 2])
+    out = []
+    for side, i in (("left", 1), ("right", 2)):
+        push = np.stack([0 * t, c[f"fx{i}"], c[f"fy{i}"]], axis=1)
+        x, y = (np.interp(twice, t, c[f"{axis}{i}"]) for axis in "xy")
+        place = np.stack([0 * x + 0.4, x, y], axis=1)
+        out.append(Topic(f"/{side}_finger/wrench", WRENCH, stamps(t), {"force": push}))
+        out.append(Topic(f"/{side}_finger/tip_pose", POSE, stamps(twice), {"position": place}))
+    return out
+
+
+def wrist_topics(c: dict[str, np.ndarray], joints: int = 1) -> list[Topic]:
+    """An arm's pose and wrench on the recording's clock, a gripper's fingers at every `joints`-th time of it.
+
+    `c`: columns t, width, ee_y, ee_z, Fx to Tz (num_timesteps,).
+    """
+    t, half = c["t"], c["width"][::joints] / 2
+    fingers = {"panda_finger_joint1": half, "panda_finger_joint2": half}
+    still = {name: 0 * half for name in fingers}
+    wrench = {name: np.stack([c[f"{letter}{axis}"] for axis in "xyz"], axis=1)
+              for name, letter in (("force", "F"), ("torque", "T"))}  # fmt: skip
+    place = np.stack([0 * t + 0.5, c["ee_y"], c["ee_z"]], axis=1)
+    return [
+        Topic("/franka/ee_pose", POSE, stamps(t), {"position": place}),
+        Topic("/ft_sensor/wrench", WRENCH, stamps(t), wrench),
+        Topic("/franka_gripper/joint_states", "sensor_msgs/msg/JointState", stamps(t[::joints]),
+              {"position": fingers, "velocity": still}),
+    ]  # fmt: skip
+
+
+def stamps(t: np.ndarray) -> np.ndarray:
+    """Times [s] (num_timesteps,) as ns since 1970."""
+    return ODD_START + np.round(t * 1e9).astype(np.int64)
+
+
+def finger_columns(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same two fingertips as columns of a data set's state."""
+    out = {}
+    for side, i in (("left", 1), ("right", 2)):
+        out |= {f"{side}_tip_x": c[f"x{i}"], f"{side}_tip_z": c[f"y{i}"]}
+        out |= {f"{side}_force_x": c[f"fx{i}"], f"{side}_force_z": c[f"fy{i}"]}
+    return out
+
+
+def finger_vectors(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same as vectors (num_timesteps, 3) of observations that close along y."""
+    still = 0 * c["t"]
+    return {
+        f"obs/{side}_fingertip_{name}": np.stack([still, c[f"{letter}x{i}"], c[f"{letter}y{i}"]], axis=1)
+        for side, i in (("left", 1), ("right", 2))
+        for name, letter in (("pos", ""), ("force", "f"))
+    }
+
+
+def wrist_vectors(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A wrist as robosuite's observations: finger joints that count opposite ways."""
+    still, half = 0 * c["t"], c["width"] / 2
+    return {
+        "obs/robot0_eef_pos": np.stack([still + 0.5, c["ee_y"], c["ee_z"]], axis=1),
+        "obs/robot0_gripper_qpos": np.stack([half, -half], axis=1),
+        "obs/robot0_ee_force": np.stack([c["Fx"], c["Fy"], c["Fz"]], axis=1),
+        "obs/robot0_ee_torque": np.stack([c["Tx"], c["Ty"], c["Tz"]], axis=1),
+    }
+
+
+def german(columns: dict[str, np.ndarray], names: dict[str, tuple[str, float]]) -> bytes:
+    """A spreadsheet's CSV: semicolons, decimal commas, remarks with umlauts, ISO stamps.
+
+    `names`: theirs and how many of their units are one of ours, by column.
+    """
+    start = np.datetime64("2026-03-02T10:15:30.250000")
+    rows = ["# Prüfstand 3, Messung vom 2.3.2026", "% Greifer mit Schaumbelägen"]
+    rows.append(";".join(["Zeitstempel", *(theirs for theirs, _ in names.values())]))
+    for k, t in enumerate(columns["t"]):
+        stamp = start + np.timedelta64(round(float(t) * 1e6), "us")
+        cells = [f"{columns[name][k] * size:.9f}".replace(".", ",") for name, (_, size) in names.items()]
+        rows.append(";".join([str(stamp), *cells]))
+    return "\n".join(rows).encode("cp1252")

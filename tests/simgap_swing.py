@@ -1,7 +1,5 @@
 """A pendulum in a few lines, as a user would bring it: driven by a torque, exact to integrator error."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from simgap.simulators.recording import Recording

@@ -1,8 +1,8 @@
-"""docs/architecture.md and what other pages say of files are true of the code."""
-
-from __future__ import annotations
+"""What pages say of files is true, imports run downwards, and what scripts import is there."""
 
 import ast
+import importlib
+import importlib.util
 import re
 from pathlib import Path
 
@@ -49,3 +49,78 @@ def test_files_that_pages_name_are_there(page):
 def test_no_module_is_longer_than_one_idea_takes(tree):
     lines = {path: path.read_text(encoding="utf-8").count("\n") for path in (ROOT / tree).rglob("*.py")}
     assert lines and {str(path): count for path, count in lines.items() if count > 700} == {}
+
+
+FLOORS = ("experiments", "paper_figs", "hmmseg_cli", "simgap", "estimation", "hmmseg")
+
+
+def imported_packages(source: str) -> set[str]:
+    """Top packages a module imports, inside functions too; a relative import is its own package."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def upward(package: str, source: str) -> set[str]:
+    """Packages of higher floors that a module of `package` imports."""
+    return imported_packages(source) & set(FLOORS[: FLOORS.index(package)])
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_imports_run_downwards(package):
+    for path in sorted((ROOT / package).rglob("*.py")):
+        above = upward(package, path.read_text(encoding="utf-8"))
+        assert not above, f"{path.relative_to(ROOT)} imports {', '.join(sorted(above))} from above"
+
+
+def test_an_upward_import_is_seen():
+    assert upward("hmmseg", "def f():\n    from estimation.priors import x\n") == {"estimation"}
+    assert upward("hmmseg", "import simgap.world.hand as h, hmmseg.io.task") == {"simgap"}
+    assert upward("simgap", "from hmmseg import task\nimport estimation") == set()
+
+
+ROOMS = ("online", "sequence", "segmentation", "hand", "contact", "io")  # of hmmseg, from the top down
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_within_hmmseg_run_downwards(room):
+    """`Trial.read` alone looks up, to what judges a hand's recording: it is where users look for it."""
+    above = {f"hmmseg.{name}" for name in ROOMS[: ROOMS.index(room)]}
+    for path in sorted((ROOT / "hmmseg" / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                seen = ".".join(node.module.split(".")[:2])
+                allowed = path.name == "trial.py" and node.module == "hmmseg.hand.read"
+                assert seen not in above or allowed, f"{path.relative_to(ROOT)} imports {node.module}"
+
+
+OURS = ("hmmseg", "estimation", "simgap", "hmmseg_cli", "experiments", "paper_figs")
+
+
+def imported_names(path: Path) -> list[tuple[str, str]]:
+    """Module and name of everything of ours that a file imports by name."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OURS:
+            found += [(node.module, alias.name) for alias in node.names]
+    return found
+
+
+def missing(module: str, name: str) -> bool:
+    """Whether a module has no such name and no such submodule."""
+    found = importlib.import_module(module)
+    if hasattr(found, name):
+        return False
+    return not hasattr(found, "__path__") or importlib.util.find_spec(f"{module}.{name}") is None
+
+
+@pytest.mark.parametrize("package", ["experiments", "paper_figs"])
+def test_what_is_imported_is_there(package):
+    pytest.importorskip("mujoco", reason="the blind check's simulator needs the extra `check`")
+    for path in sorted((ROOT / package).rglob("*.py")):
+        gone = [f"{module}.{name}" for module, name in imported_names(path) if missing(module, name)]
+        assert not gone, f"{path.relative_to(ROOT)} imports {', '.join(gone)}"

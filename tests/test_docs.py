@@ -5,8 +5,6 @@ On a page, blocks marked `python` run in order in one namespace, and lines `$ hm
 `<!-- not run: why -->` before a block leaves it out. Pages that take long are marked slow.
 """
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import re

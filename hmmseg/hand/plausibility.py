@@ -281,7 +281,7 @@ def _noise(values: np.ndarray) -> float:
 
 
 ALL = 0.95  # limit: share of the samples that must agree
-MOST = 0.75  # limit: the same where a hold goes on after its block has been put down
+MOST = 0.75  # limit: the same where a hold continues after its block has been put down
 LIFTED = 0.005  # limit: [m]
 CARTESIAN_STEMS = ("x{}", "y{}", "vx{}", "vy{}", "fx{}", "fy{}")
 JOINT_STEMS = ("q{}1", "q{}2", "dq{}1", "dq{}2", "fx{}", "fy{}")

@@ -52,8 +52,11 @@ class Pose:
     window: float
 
 
-def pose_of(trial: Trial, gripper: Gripper) -> Pose:
-    """Pose in every sample, gaps bridged; InputError where it cannot be had."""
+def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose:
+    """Pose in every sample, gaps bridged; InputError where it cannot be had.
+
+    `window` [s]: over which to smooth; as wide as the noise wants where it is not given.
+    """
     t, n = trial.t, trial.t.size
     position = np.zeros((n, 3))
     for axis, name in gripper.position.items():
@@ -67,7 +70,7 @@ def pose_of(trial: Trial, gripper: Gripper) -> Pose:
         where = f"{trial.file}: [gripper] closing"
         problem = f"the pads close along {gripper.closing}, which is mostly up and down"
         raise InputError(where, problem, "the axis along which they close, and a quaternion x, y, z, w")
-    window = _window(t, position)
+    window = _window(t, position) if window is None else window
     velocity, acceleration = (smooth(t, position, deriv, window) for deriv in (1, 2))
     return Pose(t, position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)
 
@@ -161,8 +164,9 @@ class Tool:
     `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
     [N s/m]; `jerked` [kg s]: of how the acceleration changes, which is by how much later than the wrench the
     pose was taken, times the inertia; `noise` [N]: scale of one component of F in free motion about the
-    model; `since` [s]: when the drift has added nothing to the offset; `against`: the reading goes against a
-    stated sign; `centre_of_mass` (3,) [m] in the tool's axes, None where no torques or turns tell it.
+    model; `since` [s]: when the drift has added nothing to the offset, `drift_sd` [N/s]: its standard error;
+    `against`: the reading goes against a stated sign; `centre_of_mass` (3,) [m] in the tool's axes, None
+    where no torques or turns tell it.
     """
 
     axes: np.ndarray
@@ -175,8 +179,23 @@ class Tool:
     drift: np.ndarray
     noise: float
     since: float
+    drift_sd: float
     against: bool = False
     centre_of_mass: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FreeMotion:
+    """Samples of free motion at `t` (n,) [s]: smoothed readings `force` (n, 3) [N] and what they go with.
+
+    `terms` (4, n, 3): acceleration, minus gravity, velocity and jerk in the axes that the wrench is given in
+    or turns with; `window` [s]: samples nearer to each other than this are no two.
+    """
+
+    t: np.ndarray
+    force: np.ndarray
+    terms: np.ndarray
+    window: float
 
 
 def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
@@ -199,28 +218,49 @@ def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
     return np.stack([_in_tool(pose, gripper, v) for v in every])
 
 
-def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
-    """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
-    gripper, t, since = rig.wrist, trial.t[free], float(trial.t.mean())
-    where = f"{trial.file}: columns {', '.join(gripper.wrench[:3])}"
-    if t.size < SAMPLES:
-        raise InputError(where, "show no free motion to find the tool's own share from",
-                         "samples before the first grip and after the last")  # fmt: skip
+def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMotion:
+    """What samples `free` (num_timesteps,) of a trial say of its tool."""
+    gripper = rig.wrist
     force = np.stack([bridged(c, trial.t) for c in wrench_of(trial, gripper).T], axis=1)
     force = smooth(trial.t, force, window=pose.window)[free]
-    terms = _terms(pose, gripper, rig.gravity)[:, free]
+    return FreeMotion(trial.t[free], force, _terms(pose, gripper, rig.gravity)[:, free], pose.window)
+
+
+def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
+    """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
+    motion = free_motion(trial, rig, pose, free)
+    tool = tool_of(trial.file, rig, motion, float(trial.t.mean()))
+    return replace(tool, centre_of_mass=_centre_of_mass(trial, rig.wrist, tool, free, motion.terms))
+
+
+def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool = True) -> Tool:
+    """The tool, its centre of mass left open; InputError where free motion says nothing, or another rig.
+
+    `between`: what is to be read lies between samples of free motion. Else the offset's drift is carried on
+    only where it shows clearly.
+    """
+    gripper = rig.wrist
+    where = f"{file}: columns {', '.join(gripper.wrench[:3])}"
+    if motion.t.size < SAMPLES:
+        raise InputError(where, "show no free motion to find the tool's own share from",
+                         "samples before the first grip and after the last")  # fmt: skip
+    force, terms = motion.force, motion.terms
+    time = motion.t - since
     turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
-    axes, fitted, scale = _fit(rig, force, terms, t - since, turns)
     # Smoothed samples within one window go together.
-    error = scale * np.sqrt(max(1.0, pose.window / float(np.median(np.diff(t))))) * fitted.error
-    _check(where, gripper, fitted.inertia, error)
+    together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
+    axes, fitted, scale = _fit(rig, force, terms, time, turns)
+    error = scale * np.sqrt(together) * fitted.errors
+    if not between and np.all(np.abs(fitted.drift) < SURE * error[2:]):
+        axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
+    _check(where, gripper, fitted.inertia, float(error[0]))
     mass = fitted.mass if fitted.mass is not None else fitted.inertia
-    against = gripper.reaction is not None and fitted.inertia < -SURE * error
-    tool = Tool(
-        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, axes @ fitted.offset,
-        axes @ fitted.drift, scale, since, against,
+    offset, drift = axes @ fitted.offset, axes @ fitted.drift
+    against = gripper.reaction is not None and fitted.inertia < -SURE * float(error[0])
+    return Tool(
+        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, offset, drift, scale,
+        since, float(error[2:].max()), against,
     )  # fmt: skip
-    return replace(tool, centre_of_mass=_centre_of_mass(trial, gripper, tool, free, terms))
 
 
 def _fit(rig: Rig, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool
@@ -238,7 +278,7 @@ def _fit(rig: Rig, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns
 
 @dataclass(frozen=True)
 class _Fitted:
-    """`mass` None where it goes into the offset; `error` of the inertia for unit noise."""
+    """`mass` None where it goes into the offset; `errors` of inertia, drag and drift (3) for unit noise."""
 
     inertia: float
     mass: float | None
@@ -247,7 +287,7 @@ class _Fitted:
     offset: np.ndarray
     drift: np.ndarray
     residual: np.ndarray
-    error: float
+    errors: np.ndarray
 
 
 def _regressed(weights: np.ndarray, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool,
@@ -265,11 +305,11 @@ def _regressed(weights: np.ndarray, force: np.ndarray, terms: np.ndarray, time: 
     flat = (rows * root[:, :, None]).reshape(3 * n, -1)
     found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
     information = flat.T @ flat
-    error = float(np.sqrt(np.linalg.pinv(information, rcond=1e-9)[0, 0]))
+    errors = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-9)))[[0, 1, -3, -2, -1]]
     mass = given if given is not None else float(found[3]) if turns else None
     residual = left - rows @ found
     inertia, drag, jerked = (float(each) for each in found[:3])
-    return _Fitted(inertia, mass, drag, jerked, found[-6:-3], found[-3:], residual, error)
+    return _Fitted(inertia, mass, drag, jerked, found[-6:-3], found[-3:], residual, errors)
 
 
 def _spread(vectors: np.ndarray) -> float:

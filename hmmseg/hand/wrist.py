@@ -448,7 +448,7 @@ TILT = 0.01  # chosen: rad; an arm whose orientation is not recorded holds its h
 SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a touch is known to a fifth of it
 CLIPPED = 2.0  # chosen: noise scales
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
-NOMINAL = 1.0  # chosen: N; stands for a grip of rigid pads whose force nobody measured: any will do
+NOMINAL = 1.0  # chosen: N; assumed for a grip of rigid pads whose force was not measured: any will do
 HIDDEN_GRIP = (
     "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
     "[gripper] would tell"

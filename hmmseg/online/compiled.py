@@ -41,7 +41,7 @@ def _examine(folder: Path) -> None:
     if found and (not left or any(found.get(name, digest) != digest for name, digest in left.items())):
         shutil.rmtree(folder, ignore_errors=True)
         if left:
-            warnings.warn(f"{folder}: not as it was written; made anew", CacheWarning, stacklevel=2)
+            warnings.warn(f"{folder}: not as it was written; recomputed", CacheWarning, stacklevel=2)
 
 
 def _leave(folder: Path) -> None:

@@ -11,10 +11,12 @@ the contact equations say more: the alignment of the two subtasks alone, with th
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -63,10 +65,11 @@ from hmmseg.segmentation.emissions import (
     thin,
 )
 from hmmseg.segmentation.pads import sense
-from hmmseg.segmentation.posteriors import contacts
+from hmmseg.segmentation.posteriors import contacts, nearest_touch
 from hmmseg.segmentation.rounds import one_round, round_tasks
 
 WARM_UP = 8  # numerics: rows that tell a force noise which the rig does not state
+NUM_CHANNELS = len(CARTESIAN_CHANNELS)
 KINDS = {FREE: FREE_KIND, ON_GROUND: GROUND_KIND, SLIDING: SLIDING_KIND, ABOVE_GROUND: ABOVE_KIND}
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
 # hand at rest creeps, and pads' foam gives by tenths of a mm.
@@ -84,7 +87,7 @@ FINE = 100.0  # numerics: Hz; in faster recordings the filter itself places touc
 
 @dataclass
 class _State:
-    """All that changes from row to row."""
+    """All that changes from row to row; copied whole, it is a point to return to."""
 
     rows: np.ndarray
     known: np.ndarray
@@ -117,8 +120,11 @@ class Filter:
         self._geometry = np.array([v for f in fingers for v in (*f.base, *f.links)] or [0.0] * 8)
         self._noise = np.array([(position or 0.0) ** 2, (noise.velocity or 0.0) ** 2])
         self._pads, self.force_noise = np.array(pads_of(rig), float), noise.force
+        self._written, self._written_t = "{}", -math.inf
         self.crossings: list[Crossing] = []
         self.first_t = math.nan  # of the first row [s]
+        self.touches: list[tuple[float, float]] = []  # known apart from forces [s]
+        self.together = 1.0 / MAX_RATE  # readings nearer to each other than this are no two [s]
         self._waiting: list[tuple[float, np.ndarray]] = []
         self._velocities = True
         num_quantities = 2 * (len(task.objects) + 1) + len(task.moves)
@@ -128,6 +134,7 @@ class Filter:
             for most in (num_states + 2, 24 * num_states)
         )
         self._x = np.full(1, np.nan).astype(READING)
+        self._x["sd_fx"], self._x["sd_fy"], self._x["gripped"] = 0.0, 0.0, 1.0
         self._now, self._smoothed = np.zeros((2, self.num_steps + 1))
         self._means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
         self._least, self._round, self._departed = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
@@ -174,7 +181,10 @@ class Filter:
         s.ranges["force"] = s.ranges["press"] = LEAST_FORCE * noise
 
     def take(self, t: float, row: np.ndarray) -> None:
-        """One row (12,) in SI units, NaN where missing, at a time after all before."""
+        """One row (12,) in SI units, NaN where missing, at a time after all before.
+
+        Of a wrist's sensor (16,): what `hmmseg.online.wrist.Wrist` adds.
+        """
         self.rows.append((t, row))
         while self.rows[0][0] < t - self.lag - REACH:
             self.rows.popleft()
@@ -193,15 +203,23 @@ class Filter:
         read(s.ring, s.head, s.filled, t, dt, row, jointed, self._geometry, jointed or self._velocities,
              s.last_row, self._noise, x)  # fmt: skip
         widen(s.extremes, s.ranges, self._least, x)
+        if row.size > NUM_CHANNELS:
+            x["sd_fx"], x["sd_fy"], x["gripped"] = row[NUM_CHANNELS + 1 :]
         s.since += dt
         since = s.since if s.since >= 0.999 / MAX_RATE else 0.0
         if since:
             s.since = 0.0
-        share = min(1.0, dt * MAX_RATE) if dt > 0 else 1.0  # readings nearer than 1 / MAX_RATE are no two
+        share = min(1.0, dt / self.together) if dt > 0 else 1.0
         s.last_t, s.last_row = t, row
         s.count = advance(*self._table, *self._fresh, s.count, x, dt, since, share, *self._chain, s.ranges,
                           self._pads, self.rig.gravity)  # fmt: skip
         self._settle(t - self.lag)
+
+    def idle(self, t: float) -> None:
+        """Time goes on, though no row can be read yet."""
+        self.first_t = t if math.isnan(self.first_t) else self.first_t
+        if not self._state.started:
+            self._state.last_t = t
 
     def _wait(self, t: float, row: np.ndarray) -> None:
         """Until the force noise is known: from the rig, or from the first rows' second differences."""
@@ -250,7 +268,7 @@ class Filter:
 
         `previous` [s]: the boundary before.
         """
-        touch = before.state == FREE or after.name == "place"
+        touch, wrist = before.state == FREE or after.name == "place", self.rig.gripper is not None
         start = max(mean - REACH, previous)
         rows = [each for each in self.rows if start <= each[0] <= mean + max(self.lag, REACH)]
         if len(rows) < 2 * NEAREST or self._now[-1] > 0.5:
@@ -262,7 +280,9 @@ class Filter:
         there = {name: table[:, k] for k, name in enumerate(self.channels) if not np.isnan(table[:, k]).all()}
         if set(self.channels) - set(there) - set(self.optional):
             return None
-        signals = thin(task_space(Trial("stream", t, there), self.rig), MAX_RATE, WINDOW)
+        timing = table[:, NUM_CHANNELS] if wrist else None
+        trial = Trial("stream", t, there, touches=tuple(self.touches), timing=timing)
+        signals = thin(task_space(trial, self.rig), MAX_RATE, WINDOW)
         if signals.t.size < NEAREST:
             return None
         parameters = self._parameters()
@@ -288,6 +308,8 @@ class Filter:
         contact = contacts(signals, sense([], [], (), parameters, self.rig), parameters)
         change = contact.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
         out = combine(t, probability, {}) if change is None else moment(change, Disagreement())
+        if wrist and FREE in (before.state, after.state):
+            out = nearest_touch(tuple(self.touches), out)
         median = out.quantile(0.5)
         if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
             return None  # another event than the filter's
@@ -307,6 +329,12 @@ class Filter:
             if seen > 0:
                 width[name] = size / seen
         return Parameters(h["bias"][:, 0] / h["bias"][:, 1], weight, scale, width)
+
+    def properties_text(self, answer: Answer) -> str:
+        """The properties as JSON, written anew once an independent reading, as they change no faster."""
+        if answer.final or not answer.t < self._written_t + 1 / MAX_RATE:
+            self._written, self._written_t = answer.properties_json(), answer.t
+        return self._written
 
     def answer(self, final: bool = False) -> Answer:
         """What is known now."""
@@ -339,6 +367,30 @@ class Filter:
             self._settle(s.last_t)
         return self.answer(final=True)
 
+    def snapshot(self) -> Any:
+        """All that changes, to return to with `restore`."""
+        s = self._state
+        big = (
+            s.rows[: s.count].tobytes(),
+            s.known[: s.count].copy(),
+            s.ring.tobytes(),
+        )  # named ones copy slowly
+        small = copy.copy(s), s.extremes.copy(), s.ranges.copy()
+        return small, big, len(self.crossings), list(self._waiting), self._now.copy()
+
+    def restore(self, snapshot: Any) -> list[tuple[float, np.ndarray]]:
+        """Return to an earlier point; the rows taken since."""
+        (state, extremes, ranges), (rows, known, ring), crossings, waiting, now = snapshot
+        self._state = s = copy.copy(state)
+        s.rows[: s.count], s.known[: s.count] = np.frombuffer(rows, HYPOTHESIS), known
+        s.ring, s.extremes, s.ranges = np.frombuffer(ring, ROW).copy(), extremes.copy(), ranges.copy()
+        self._waiting, self._now[:] = list(waiting), now
+        del self.crossings[crossings:]
+        since = [each for each in self.rows if each[0] > state.last_t]
+        for _ in since:
+            self.rows.pop()
+        return since
+
 
 class Properties:
     """What the means of weights, widths and rises say of every block, with errors that all rows share.
@@ -361,6 +413,8 @@ class Properties:
                     self.signs[move] = np.sign(next(iter(rise.values())))
         gain = np.array(rig.systematic.force_gain)
         self.weight_gain = float(np.hypot(gain[1], gain[3]) / 2)  # half of it on each finger
+        self.touch_sd = 0.0  # how well the distance at which fingers touch is known, in all grips alike [m]
+        self.force_sd = 0.0  # how well the zero of the net force is known, in all grips alike [N]
         self._seen: bytes = b""
         self._heights: list[tuple[str, str, float, float]] = []
 
@@ -370,10 +424,10 @@ class Properties:
         for o, name in enumerate(self.objects):
             (weight, of_weight, weighed), (width, of_width, seen) = means[2 * o : 2 * o + 2].tolist()
             if weighed > 0.5:
-                sd = math.sqrt(of_weight + (self.weight_gain * weight) ** 2)
-                out.append((name, "weight", weight, sd))
+                variance = of_weight + (self.weight_gain * weight) ** 2 + self.force_sd**2
+                out.append((name, "weight", weight, math.sqrt(variance)))
             if seen > 0.5:
-                out.append((name, "width", width, math.sqrt(of_width)))
+                out.append((name, "width", width, math.sqrt(of_width + self.touch_sd**2)))
         rises = means[2 * len(self.objects) :]
         if rises.size and rises[:, 2].max() > 0.5:
             key = rises.tobytes()

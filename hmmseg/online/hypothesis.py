@@ -26,7 +26,7 @@ from hmmseg.contact.equations import block_width, block_y, inertia_factor
 from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.online.compiled import compiled
-from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
+from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, SHUT, STRAY, TOUCHING, WINDOW
 
 NUM_RING = 8  # numerics: boundaries that are remembered, the last ones; a move has four
 # numerics: which scale of residuals is which, as the emissions off line name them
@@ -48,6 +48,8 @@ READING = np.dtype([
     ("t", "f8"), ("force", "f8", 4), ("vx", "f8"), ("vy", "f8"), ("ay", "f8"), ("y", "f8"), ("d", "f8"),
     ("sd_y", "f8"), ("sd_d", "f8"), ("sd_vx", "f8"), ("sd_vy", "f8"),
     ("last_y", "f8"), ("last_d", "f8"), ("last_fy", "f8"),  # of the reading, net fy 1 / MAX_RATE s before
+    ("sd_fx", "f8"), ("sd_fy", "f8"),  # what may be wrong with net forces (the tool on a wrist's sensor)
+    ("gripped", "f8"),  # 0: nothing is held, 2: something is, as more than forces tells; 1: none does
 ])  # fmt: skip
 # Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
 RANGES = np.dtype([(name, "f8") for name in ("vx", "vy", "y", "d", "force", "press")])
@@ -212,6 +214,12 @@ def _square(h, which):
 
 
 @compiled
+def _carry(h, x):
+    """Variance of the net vertical force of what is carried [N^2]."""
+    return _square(h, CARRY) + x.sd_fy * x.sd_fy
+
+
+@compiled
 def _held_width(h, x, pads):
     """Width of what is held [m], as if rigid where a force is missing."""
     width = block_width(x.d, _force(h, x, 0), _force(h, x, 2), pads)
@@ -297,7 +305,8 @@ def free(h, x, span):
         still += log_student(x.d - x.last_d, sd) + math.log(span.d)
     broad = _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy)
     broad += _log_broad(x.y, span.y) + _log_broad(x.d, span.d)
-    return _ungripped(h, x, span.force) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
+    out = _ungripped(h, x, span.force) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
+    return out + SHUT if x.gripped == 2.0 else out
 
 
 @compiled
@@ -305,7 +314,9 @@ def held(h, known, block, num_blocks, x, span, pads):
     """Log-likelihood of what a reading of any grip of this block shows."""
     fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
     out = log_between((fx1 - fx2) / 2, 0.0, span.force, math.sqrt(_square(h, FORCE)))
-    out += log_student(fx1 + fx2, math.sqrt(_square(h, NET_X)))
+    if x.gripped == 0.0:
+        out += SHUT
+    out += log_student(fx1 + fx2, math.sqrt(_square(h, NET_X) + x.sd_fx * x.sd_fx))
     out += log_student((_force(h, x, 1) - _force(h, x, 3)) / 2, math.sqrt(_square(h, SHEAR)))
     spread = x.sd_d * x.sd_d + _square(h, WIDTH)
     width = _held_width(h, x, pads)
@@ -320,7 +331,7 @@ def lifted(h, known, block, num_blocks, x, span, gravity, settled):
     """
     factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
     fy = _force(h, x, 1) + _force(h, x, 3)
-    out = _log_known(fy, factor, known, 2 * block, num_blocks, _square(h, CARRY), 0.0, span.force, True)
+    out = _log_known(fy, factor, known, 2 * block, num_blocks, _carry(h, x), 0.0, span.force, True)
     out += _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy) + _log_broad(x.y, span.y)
     still = STILL * max(settled, JUST_LIFTED)
     return out + log_sum(math.log1p(-still), math.log(still) + _halting(h, x, span))
@@ -333,7 +344,7 @@ def supported(h, known, kind, block, x, span, pads, levels):
     `levels`: whether the height at which the block rests counts.
     """
     weighed = known[2 * block, 1] > 0.0
-    most, variance = span.press, _square(h, CARRY)
+    most, variance = span.press, _carry(h, x)
     if weighed:
         most, variance = known[2 * block, 0] / known[2 * block, 1], variance + 1.0 / known[2 * block, 1]
     force = log_between(_force(h, x, 1) + _force(h, x, 3), -span.press, most, math.sqrt(variance))
@@ -422,7 +433,7 @@ def learn(h, known, kind, block, x, pads, gravity, share, levels):
         if weight[1] > 0.0:
             _learn_scale(h.scale[CARRY], fy1 + fy2 - factor * weight[0] / weight[1], share, noise)
         if factor > 0.1:  # in free fall a force says nothing of the weight
-            _learn_mean(weight, (fy1 + fy2) / factor, _square(h, CARRY) / (factor * factor), share, math.inf)
+            _learn_mean(weight, (fy1 + fy2) / factor, _carry(h, x) / (factor * factor), share, math.inf)
         return
     _learn_scale(h.scale[VELOCITY], x.vy, share, FLOOR * x.sd_vy**2)
     if levels:

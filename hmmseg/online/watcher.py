@@ -1,9 +1,9 @@
-"""`Watcher`: rows of a recording as they come, at whatever pace."""
+"""`Watcher`: rows of a recording as they come, in whatever order and at whatever pace."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,9 +17,17 @@ from hmmseg.io.trial import ROLL
 from hmmseg.levels import GAP
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
+from hmmseg.online.wrist import Wrist, checked
 
 LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
+SNAPSHOTS = 10  # numerics: points over the lag to which a late row returns
 USUAL = 0.02  # numerics: how fast the usual interval follows
+ODD = {
+    "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
+    "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",
+    "too late": "too late: {behind:.3g} s behind, more than the lag of {lag:g} s; left out",
+    "late": "late: {behind:.3g} s behind, put in its place",
+}
 
 
 class Watcher:
@@ -32,26 +40,29 @@ class Watcher:
         final = watcher.finish()
 
     `lag` [s]: how long a boundary is waited for before it is settled. Time and memory a row do not grow.
-    A row that is not later than the one before is left out; `counts` says how many were late, repeated, or
-    followed a gap. InputError for a plain ordered task, and for a gripper with a sensor in its wrist, whose
-    share of the load is known from the whole recording alone.
+    A late row is put in its place as long as that is within the lag; `counts` says how many rows were late,
+    repeated, or followed a gap. A gripper with a sensor in its wrist is followed a smoothing window late,
+    from its first grip on (`hmmseg.online.wrist`). InputError for a plain ordered task.
     """
 
     def __init__(self, task: Any, rig: Any, lag: float = LAG) -> None:
         description, hand = Task.read(task), Rig.read(rig)
         if not isinstance(description, BlockTask):
             raise InputError("task", "a plain ordered task cannot be watched", "objects and moves")
-        if hand.gripper is not None:
-            problem = "a gripper with a sensor in its wrist cannot be watched"
-            raise InputError("[gripper]", problem, "fingers that feel; hmmseg segment reads such recordings")
         if not 0 <= lag < math.inf:
             raise InputError("lag", f"found {lag}", "0 s or more")
         self.filter = Filter(description, hand, float(lag))
+        self._wrist = None if hand.gripper is None else Wrist(hand)
         self.channels, self.optional = self.filter.channels, self.filter.optional
-        if not hand.jointed:
+        if not hand.jointed and self._wrist is None:
             self.channels, self.optional = (*self.channels, ROLL), (*self.optional, ROLL)
+        if self._wrist is not None:
+            self.channels, self.optional = self._wrist.names, ()
         self.counts: Counter[str] = Counter()
+        self._mark: Any = None  # where the last grip of a wrist's gripper began
+        self._snapshots: deque[tuple[float, Any]] = deque()
         self._roll = 0.0  # of the hand, as last recorded [rad]
+        self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
 
     @property
@@ -81,6 +92,7 @@ class Watcher:
 
         Raises:
             ValueError: for another number of channels, or a time that is not finite.
+            InputError: for an orientation that cannot be, or lifts that pull up.
         """
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]
@@ -94,8 +106,9 @@ class Watcher:
         if not math.isfinite(t):
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
-        note = self._followed(t, row)
-        answer = self.filter.answer()
+        f = self.filter
+        note = self._followed(t, row) if self._wrist is None else self._felt(self._wrist, t, row)
+        answer = f.answer()
         answer.note = note
         return answer
 
@@ -106,18 +119,51 @@ class Watcher:
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
 
     def _followed(self, t: float, row: np.ndarray) -> str | None:
-        """Take a row unless it is not later than the one before; what was irregular about it."""
-        rows = self.filter.rows
-        behind = rows[-1][0] - t if rows else -math.inf
-        if behind == 0 and np.array_equal(rows[-1][1], row, equal_nan=True):
-            self.counts["repeated"] += 1
-            return f"repeated: the row at {t:.9g} s came before, and counts once"
-        if behind >= 0:
-            self.counts["late"] += 1
-            return f"late: {behind:.3g} s behind the row before; left out"
-        note = self._gap(-behind) if rows else None
-        self.filter.take(t, row)
+        """Take a row, in its place; what was irregular about it."""
+        f, note = self.filter, None
+        rows = f.rows
+        if rows and t <= rows[-1][0]:
+            note = self._out_of_order(t, row)
+        else:
+            if rows:
+                note = self._gap(t - rows[-1][0])
+            if not self._snapshots or t >= self._snapshots[-1][0] + self._every:
+                self._snapshots.append((rows[-1][0] if rows else -math.inf, f.snapshot()))
+                while len(self._snapshots) > SNAPSHOTS + 1:
+                    self._snapshots.popleft()
+            f.take(t, row)
         return note
+
+    def _felt(self, wrist: Wrist, t: float, row: np.ndarray) -> str | None:
+        """Take a row of a wrist's sensor; what was irregular about it."""
+        checked(self.filter.rig, t, row)
+        newest = wrist.newest
+        stray = wrist.place(t, row)
+        if stray is None:
+            note = None if math.isnan(newest) else self._gap(t - newest)
+        else:
+            self.counts[stray] += 1
+            note = ODD[stray].format(t=t, behind=newest - t, lag=wrist.delay)
+        self._take_felt(wrist, wrist.ready())
+        self.filter.idle(t)
+        return note
+
+    def _take_felt(self, wrist: Wrist, rows: list[tuple[float, np.ndarray]]) -> None:
+        f = self.filter
+        if wrist.tool is None:
+            return
+        if f.force_noise is None:  # each finger has half of the sensor's, and their sum all of it
+            f.force_noise = wrist.tool.noise / math.sqrt(2)
+            f.together = max(f.together, wrist.delay)  # what is smoothed errs alike for as long as the window
+        f.touches, f.properties.touch_sd = wrist.touches, wrist.touch_sd
+        f.properties.force_sd = wrist.force_sd
+        if wrist.back and self._mark is not None:
+            f.restore(self._mark)
+        wrist.back = False
+        for t, row in rows:
+            if wrist.mark is not None and t >= wrist.mark:
+                self._mark, wrist.mark = f.snapshot(), None
+            f.take(t, row)
 
     def _gap(self, dt: float) -> str | None:
         usual, self._usual = self._usual, dt if math.isnan(self._usual) else self._usual
@@ -127,8 +173,31 @@ class Watcher:
         self.counts["gaps"] += 1
         return f"gap: {dt:.3g} s since the row before"
 
+    def _out_of_order(self, t: float, row: np.ndarray) -> str:
+        f = self.filter
+        newest = f.rows[-1][0]
+        same = next((old for at, old in reversed(f.rows) if at == t), None)
+        if same is not None:
+            if np.array_equal(same, row, equal_nan=True):
+                self.counts["repeated"] += 1
+                return ODD["repeated"].format(t=t)
+            self.counts["contradictory"] += 1
+            return ODD["contradictory"].format(t=t)
+        while len(self._snapshots) > 1 and self._snapshots[-1][0] >= t:
+            self._snapshots.pop()
+        if self._snapshots[0][0] >= t:
+            self.counts["too late"] += 1
+            return ODD["too late"].format(behind=newest - t, lag=self.lag)
+        self.counts["late"] += 1
+        taken = f.restore(self._snapshots[-1][1])
+        for at, each in sorted([*taken, (t, row)], key=lambda pair: pair[0]):
+            f.take(at, each)
+        return ODD["late"].format(behind=newest - t)
+
     def finish(self) -> Answer:
         """The last answer: every boundary that has come is settled, whatever its age."""
+        if self._wrist is not None:
+            self._take_felt(self._wrist, self._wrist.ready(final=True))
         return self.filter.finish()
 
     @property

@@ -16,7 +16,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING
 
 WIDTH = 7.2  # look: in, a journal's double column
 DPI = 200  # numerics: of figures
-# Okabe and Ito's palette, told apart under the common colour vision deficiencies.
+# Okabe and Ito's palette, distinguishable under the common colour vision deficiencies.
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442",
 )  # fmt: skip
@@ -41,7 +41,7 @@ def canvas(
 ) -> Iterator[Figure]:
     """An empty figure of this size [in]; saved to `path` (kind by its suffix) when the block ends.
 
-    No pyplot: nothing is left open and no display is asked for. Without a path the figure is the
+    No pyplot: nothing is left open and no display is needed. Without a path the figure is the
     caller's to show: pyplot's in a notebook, which shows it below the cell, and where a script has loaded it.
     """
     with matplotlib.rc_context(STYLE):

@@ -12,7 +12,7 @@ The chain of contact states does not know that motion is continuous (a block tha
 near the ground); these samples do. The alignment says which contact is meant.
 
 Force and position must agree where there is contact. By how much they do not, at the contacts nearest to
-the changes of one kind in all recordings at hand (a block that a first finger pushed, a table that yields,
+the changes of one kind in all recordings (a block that a first finger pushed, a table that yields,
 pads that creep), is a discrepancy [m] that positions are then allowed. A change that may be one of several
 things (a grip that ends, the later of two touches) is a mixture of them.
 """

@@ -5,7 +5,7 @@ which a path may leave the chain for good. P(leaving) is small (DEPARTURE), so t
 misfit only where leaving gains more evidence than that (posterior odds above 1); the subtask that the path
 then does not reach is the one that fails. Ending before the last subtask, or starting outside of the first
 one, is leaving as well. Contacts ring and bounce for a while after each change, so every state is entered
-through settling stages (docs/model.md).
+through settling stages (docs/segmentation.md).
 
 Of a trial that fails, the subtasks up to the failing one are reported and, counted back from the end, those
 that the recording's last runs still match (same contact state, same block). What lies between belongs to no
@@ -147,7 +147,7 @@ def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) 
 
 
 ENDING = 1e-3  # prior: and that its recording stops before the task's end
-# cited: s; nobody grips anew before a slip was felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
+# cited: s; no new grip begins before a slip is felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
 LAPSE = 0.074
 MAX_RATE = 50.0  # chosen: Hz; noise of finer samples is averaged before they are judged
 MAX_ASSIGNMENTS = 24  # numerics: tried at most
@@ -282,7 +282,7 @@ def conformity(
 
 
 def _lapses(c: Conformity) -> list[slice]:
-    """Samples in which a departure has a grip lose its block for too brief a moment to grip anew.
+    """Samples in which a departure has a grip lose its block for too brief a moment to grip again.
 
     From the first of them to the last it was lost for sure. Those that were left out before say nothing.
     """

@@ -14,7 +14,7 @@ and the distance d of the fingers. With g = (fx1 - fx2) / 2 the grip and fy the 
 
 Free quantities have broad densities over the range the recording shows, so that all states
 score the same features and log-likelihoods compare. Residuals are Student-t (transients).
-Derivation and sources: docs/model.md.
+Derivation and sources: docs/segmentation.md.
 """
 
 from __future__ import annotations

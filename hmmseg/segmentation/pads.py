@@ -241,7 +241,7 @@ class Sensing:
 
     `delay` [s] is of the forces (negative: they lead), `delay_sd` its standard deviation. Where it is the
     sensor's (`late`), forces are to be read `delay` later, or, of a `filter`, undone. `friction` is the
-    largest ratio of shear to grip force that one finger's pad is seen to bear as it lets go.
+    largest ratio of shear to grip force observed on one finger's pad as it lets go.
     """
 
     normal: Compliance

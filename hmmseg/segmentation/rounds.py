@@ -72,7 +72,7 @@ def cut(f: Features, task: BlockTask) -> list[float]:
 def _closed(
     free: FreeContacts, steps: Sequence[Subtask], assignment: dict[str, int | None], leave: float
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Log-likelihoods and model of the chain that begins anew after its end, settling stages and all."""
+    """Log-likelihoods and model of the chain that restarts after its end, with its settling stages."""
     columns = [column(free, s, assignment) for s in steps]
     initial, transition = departing(free.states, columns, leave)
     k = len(steps)

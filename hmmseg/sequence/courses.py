@@ -8,7 +8,7 @@ nothing in one of them says how far to trust it: all are kept.
 
 Every way to choose the named boundaries among the changes of a course counts: their sum is exact, and so are
 the probabilities that a boundary is this change or that (forward and backward over the changes, as
-Fearnhead, Stat. Comput. 16, 2006, over samples). After the last named state something may settle that nobody
+Fearnhead, Stat. Comput. 16, 2006, over samples). After the last named state something may settle that no one
 named.
 
 How probable a choice is: emissions are wrong in ways that all samples of all trials share, so evidence must
@@ -35,7 +35,7 @@ def partition(
     """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 of least total cost.
 
     A stretch of n blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells,
-    num_features), which must be finite; none goes on across the cells `cuts`. ValueError where there are
+    num_features), which must be finite; none crosses the cells `cuts`. ValueError where there are
     fewer cells than stretches.
     """
     num_cells = len(values)
@@ -216,7 +216,7 @@ class Weighing:
     """What makes a choice probable, learned on sequences of many kinds (`experiments.sequences learn`).
 
     `independent`: observations that evidence counts as in the limit of many. `settled`: log odds of a
-    state that nobody named after the last event. `shares`: exponent of the share of its trial that each state
+    unnamed state after the last event. `shares`: exponent of the share of its trial that each state
     but the last takes. `lag`: scale of the Laplace law by which boundaries lie off the change they are, as a
     share of the trial; `labelled`: the same where labels say by how much. `elsewhere`: probability that a
     boundary is at no change at all; `unseen`: how probable a change that the channels do not show is, against

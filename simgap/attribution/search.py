@@ -105,7 +105,7 @@ class Detection:
 
 
 def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ...] = ()) -> float:
-    """Log Bayes factor of a gap beside the effects that are `acting`, by others or the background, against
+    """Log Bayes factor of a gap beyond the effects that are `acting`, by others or the background, against
     these effects and stated noise alone."""
     models = sought(f) if models is None else models
     wider = [m for m in models if {*acting} <= {*m.effects}]

@@ -56,7 +56,7 @@ class Verdict:
     probabilities: dict[str, float]
 
     def beside(self: V, more: Iterable[str]) -> V:
-        """The verdict with more effects that cannot be told from its causes."""
+        """The verdict with more effects that cannot be distinguished from its causes."""
         partners = tuple(sorted({*self.indistinguishable, *more} - {*self.causes}))
         return replace(self, verdict="set", indistinguishable=partners) if partners else self
 
@@ -150,7 +150,7 @@ def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:
 def alike(sets: Sequence[Explanation], causes: tuple[str, ...]) -> tuple[str, ...]:
     """Effects that take a cause's place in sets no larger that are not ruled out.
 
-    What the likeliest set of these causes has beside them, too small to be a cause, is no cause in others.
+    Effects of the likeliest set that are too small to be causes are no causes in others either.
     """
     holding = [one for one in sets if {*causes} <= {*one.effects}]
     best = max(holding, key=lambda one: one.weight)

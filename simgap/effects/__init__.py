@@ -31,7 +31,7 @@ def catalogue() -> dict[str, HandEffect]:
 
 
 def decoys() -> dict[str, HandEffect]:
-    """Effects that are fitted to be told from the catalogue's, and never named."""
+    """Decoys: effects fitted as alternatives to the catalogue's, and never named."""
     return _defined(decoy=True)
 
 

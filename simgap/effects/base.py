@@ -7,13 +7,10 @@ truth is taken forward (`apply`, `scene`) to make recordings with a known effect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.hand.kinematics import turning
@@ -21,8 +18,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from simgap.channels import ChannelEffect, Theta, at_rest
 from simgap.effect import Array, Effect
 
-Values = dict[str, Array]  # parameter name -> scalar
-Numbers = dict[str, float]  # the same outside of a trace
+Values = dict[str, float]  # parameter name -> its value
 
 
 class World(NamedTuple):
@@ -34,7 +30,7 @@ class World(NamedTuple):
     relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
     `delay`, `smoothing` (4,) [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
     the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
-    yields with that delay (a spring beside a damper). `inertia`: factor of the mass times acceleration.
+    yields with that delay (spring and damper in parallel). `inertia`: factor of the mass times acceleration.
     `couple` [m]: how far the mass lies right of the middle.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
@@ -97,7 +93,7 @@ class Performance(NamedTuple):
 
 
 Correct = Callable[[World, Values, Array], World]
-Apply = Callable[[Performance, Numbers, np.random.Generator], Performance]
+Apply = Callable[[Performance, Values, np.random.Generator], Performance]
 
 
 @dataclass(frozen=True)
@@ -131,19 +127,19 @@ class HandEffect(Effect):
     stage: int = 0
     correct: Correct | None = None
     apply: Apply | None = None
-    scene: Callable[[Numbers], Numbers] | None = None
-    finish: Callable[[np.ndarray, Numbers], np.ndarray] | None = None
+    scene: Callable[[Values], Values] | None = None
+    finish: Callable[[np.ndarray, Values], np.ndarray] | None = None
     chosen: bool = True
     report: Callable[[dict[str, Any], Rig], dict[str, Any]] | None = None
     forms: tuple[tuple[str, ...], ...] = ()
     scatter: Callable[[Any, np.ndarray], Any] | None = None
-    admitted: Callable[[Rig], tuple[str, Numbers]] | None = None
+    admitted: Callable[[Rig], tuple[str, Values]] | None = None
     wrist: bool = False
     played: Mapping[str, float] | None = None
     phrase: Callable[[Mapping[str, float], Mapping[str, Any]], str] | None = None
-    sampled: Callable[[np.ndarray, Numbers, np.random.Generator], np.ndarray] | None = None
+    sampled: Callable[[np.ndarray, Values, np.random.Generator], np.ndarray] | None = None
     grip: tuple[float, float] | None = None
-    restored: Callable[[dict[str, np.ndarray], Numbers], dict[str, np.ndarray]] | None = None
+    restored: Callable[[dict[str, np.ndarray], Values], dict[str, np.ndarray]] | None = None
     patched: Callable[[Any, Mapping[str, Any]], dict[str, str] | None] | None = None
     wrong: Callable[[Any, np.ndarray], list[Any]] | None = None
     turns: str = ""
@@ -168,19 +164,21 @@ def tips(world: World) -> tuple[Array, Array]:
     jx, jy = swung(world)
 
     def paired(x: Array, y: Array) -> Array:
-        return jnp.stack(
+        return np.stack(
             [x[..., 0] + x[..., 1], y[..., 0] + y[..., 1], x[..., 2] + x[..., 3], y[..., 2] + y[..., 3]], -1
         )
 
     position = world.base[None, None, :] + paired(jy, -jx)
     velocity = paired(jx * world.rates, jy * world.rates)
     there = world.jointed > 0.5
-    return jnp.where(there, position, world.joints), jnp.where(there, velocity, world.rates)
+    return np.where(there, position, world.joints), np.where(there, velocity, world.rates)
 
 
 def with_mode(world: World, mode: int, on: Array) -> World:
     """The world with one of `modes` switched on where `on` is 1."""
-    return world._replace(modes=jnp.asarray(world.modes).at[mode].add(on))
+    modes = np.array(world.modes, float)
+    modes[mode] += on
+    return world._replace(modes=modes)
 
 
 def with_load(world: World, force: Array) -> World:
@@ -192,8 +190,8 @@ def gradient(t: Array, values: Array) -> Array:
     """Central differences along the second axis of (T, N, C) or (T, N), times (T, N) [s]."""
     step = t[:, 2:] - t[:, :-2]
     step = step[..., None] if values.ndim == 3 else step
-    inner = (values[:, 2:] - values[:, :-2]) / jnp.maximum(step, 1e-6)
-    return jnp.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
+    inner = (values[:, 2:] - values[:, :-2]) / np.maximum(step, 1e-6)
+    return np.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
 
 
 def flat(performance: Performance) -> np.ndarray:
@@ -213,13 +211,6 @@ NET = np.array([[1.0, 0, 1, 0], [0, 1, 0, 1], [0.5, 0, -0.5, 0], [0, 0.5, 0, -0.
 USUAL = 3.0  # prior: N; of a hand's forces: what shares of a channel are shares of
 
 
-@contextmanager
-def as_numpy() -> Iterator[None]:
-    """JAX broadcasts and promotes as NumPy does, for functions that are written for both."""
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        yield
-
-
 class Motion(NamedTuple):
     """What a load may depend on: times, tips' `position`, `velocity`, `acceleration` (..., 4) for x1, y1, x2,
     y2, and how long ago each event was (..., events) [s]."""
@@ -233,45 +224,41 @@ class Motion(NamedTuple):
 
 
 def loading(
-    load: Callable[[Motion, Values, Any], Array], given: Callable[[Numbers], Numbers] | None = None,
+    load: Callable[[Motion, Values], Array], given: Callable[[Values], Values] | None = None,
     **more: Any,
 ) -> HandEffect:  # fmt: skip
-    """A force load(motion, values, xp) (..., 4) [N] on the fingers that is none of the contact's, in NumPy or
-    JAX (`xp`); `given` turns parameters as they are reported into those that are fitted."""
+    """A force load(motion, values) (..., 4) [N] on the fingers that is none of the contact's; `given` turns
+    parameters as they are reported into those that are fitted."""
 
     def correct(world: World, values: Values, on: Array) -> World:
         position, velocity = tips(world)
         since = world.t[:, :, None] - world.events[:, None, :]
-        motion = Motion(
-            world.t, position, velocity, gradient(world.t, velocity), since, jnp.asarray(world.gravity)
-        )
-        with as_numpy():
-            return with_load(world, load(motion, values, jnp))
+        motion = Motion(world.t, position, velocity, gradient(world.t, velocity), since, world.gravity)
+        return with_load(world, load(motion, values))
 
-    def apply(p: Performance, values: Numbers, rng: np.random.Generator) -> Performance:
+    def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
         acceleration = np.gradient(p.velocity, p.t, axis=0)
         place, speed, quick = (z.reshape(-1, 4) for z in (p.position, p.velocity, acceleration))
         motion = Motion(p.t, place, speed, quick, p.t[:, None] - p.events[None, :], p.rig.gravity)
-        return with_force(p, flat(p) + load(motion, values if given is None else given(values), np))
+        return with_force(p, flat(p) + load(motion, values if given is None else given(values)))
 
     return HandEffect(correct=correct, apply=apply, **more)
 
 
-def mixing(matrix: Callable[[Values, Any], Array], inverse: bool = False, **more: Any) -> HandEffect:
-    """Sensors that read matrix(values, xp) (4, 4) times the true forces, or its `inverse`.
+def mixing(matrix: Callable[[Values], Array], inverse: bool = False, **more: Any) -> HandEffect:
+    """Sensors that read matrix(values) (4, 4) times the true forces, or its `inverse`.
 
     The noise of net forces, grip and shear is by so much louder than that of corrected ones as the matrix
     turns it.
     """
 
     def correct(world: World, values: Values, on: Array) -> World:
-        back = matrix(values, jnp)
-        back = back if inverse else jnp.linalg.inv(back)
-        quiet = jnp.sqrt(jnp.square(NET).sum(1) / jnp.square(NET @ back).sum(1))[None, None, :]
+        back = matrix(values) if inverse else np.linalg.inv(matrix(values))
+        quiet = np.sqrt(np.square(NET).sum(1) / np.square(NET @ back).sum(1))
         return world._replace(force=world.force @ back.T, loudness=world.loudness * quiet)
 
-    def apply(p: Performance, values: Numbers, rng: np.random.Generator) -> Performance:
-        there = matrix(values, np)
+    def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
+        there = matrix(values)
         return with_force(p, flat(p) @ (np.linalg.inv(there) if inverse else there).T)
 
     return HandEffect(correct=correct, apply=apply, **more)
@@ -284,7 +271,7 @@ Clock = Callable[[Array, Array, Mapping[str, Array]], Array]  # (time since the 
 def reading(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -> Apply:
     """`apply` of an effect on every force channel, by a `clock` of its own where one is given."""
 
-    def apply(p: Performance, values: Numbers, rng: np.random.Generator) -> Performance:
+    def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
         since = p.t - p.t[0]
         since = since if clock is None else clock(since, p.events.max() - p.t[0], values)
         each = zip(flat(p).T, spread(values), strict=True)
@@ -297,14 +284,13 @@ def unread(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -
     """`correct` of an effect on every force channel that can be undone."""
 
     def correct(world: World, values: Values, on: Array) -> World:
-        since, force = world.t - world.t[:, :1], jnp.asarray(world.force)
+        since = world.t - world.t[:, :1]
         if clock is not None:
-            last = jnp.asarray(world.events).max(axis=1, keepdims=True) - world.t[:, :1]
+            last = world.events.max(axis=1, keepdims=True) - world.t[:, :1]
             since = clock(since, last, values)
         assert channel.undo is not None
-        with as_numpy():
-            each = [channel.undo(since, force[..., c], theta) for c, theta in enumerate(spread(values))]
-        return world._replace(force=jnp.stack(each, -1))
+        each = [channel.undo(since, world.force[..., c], theta) for c, theta in enumerate(spread(values))]
+        return world._replace(force=np.stack(each, -1))
 
     return correct
 

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+import numpy as np
+from scipy.signal import lfilter
 
 
-def lowpass(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
+def lowpass(values: np.ndarray, time: np.ndarray | float, step: float) -> np.ndarray:
     """First-order low-pass of (T, N, C) along N, started at rest; linear between samples.
 
     `time` [s]: one of all channels, or (C,).
     """
-    time = jnp.reshape(time, (1, 1, -1))
-    ratio = step / jnp.maximum(time, 1e-4)
-    keep = jnp.exp(-ratio)
+    ratio = step / np.maximum(time, 1e-4)
+    keep = np.exp(-ratio)
     new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep
-    before = jnp.concatenate([values[:, :1], values[:, :-1]], 1)
-    drive = new * values + old * before
-    return faded(jnp.concatenate([values[:, :1], drive[:, 1:]], 1), ratio)
+    drive = np.empty_like(values)
+    drive[:, 0], drive[:, 1:] = values[:, 0], new * values[:, 1:] + old * values[:, :-1]
+    return faded(drive, ratio)
 
 
-def faded(drive: jax.Array, ratio: jax.Array) -> jax.Array:
-    """y[k] = exp(-ratio) y[k-1] + drive[k] along N, by doubling: after j rounds y holds the last 2^j."""
-    out, reach = drive, 1
-    while reach < drive.shape[1]:
-        before = jnp.concatenate([jnp.zeros_like(out[:, :reach]), out[:, :-reach]], 1)
-        out, reach = out + jnp.exp(-ratio * reach) * before, 2 * reach
-    return out
+def faded(drive: np.ndarray, ratio: np.ndarray | float) -> np.ndarray:
+    """y[k] = exp(-ratio) y[k-1] + drive[k] of (T, N, C) along N; `ratio` of all channels, or (C,)."""
+    keep = np.exp(-np.asarray(ratio, float))
+    if not keep.ndim:
+        return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=1))
+    each = (lfilter([1.0], [1.0, -k], drive[..., c], axis=1) for c, k in enumerate(keep))
+    return np.stack([*each], -1)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.contact.equations import rolled_offset
@@ -17,37 +15,37 @@ from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
 # A hand that is not as its drawing says: angles read with offsets, links longer than nominal, all alike or
-# each by its own, the second finger's base beside its place.
+# each by its own, the second finger's base off its place.
 
 JOINTS = ("q11", "q12", "q21", "q22")
 LINKS = ("link11", "link12", "link21", "link22")
 BASE = ("base_x", "base_y")
 
 
-def _numbers(values, names, xp, common: str = ""):
-    return xp.stack([xp.asarray(values.get(n, 0.0) + values.get(common, 0.0), float) for n in names])
+def _numbers(values, names, common: str = "") -> np.ndarray:
+    return np.array([values.get(n, 0.0) + values.get(common, 0.0) for n in names])
 
 
 def correct_hand(world: World, values, on) -> World:
     """The world of the true hand."""
     return world._replace(
-        joints=world.joints - _numbers(values, JOINTS, jnp)[None, None, :] * world.jointed,
-        link=world.link * (1 + _numbers(values, LINKS, jnp, "scale")),
-        base=world.base + jnp.concatenate([jnp.zeros(2), _numbers(values, BASE, jnp)]),
+        joints=world.joints - _numbers(values, JOINTS) * world.jointed,
+        link=world.link * (1 + _numbers(values, LINKS, "scale")),
+        base=world.base + np.concatenate([np.zeros(2), _numbers(values, BASE)]),
     )
 
 
 def apply_hand(p: Performance, values, rng) -> Performance:
     """Tips as a nominal hand reads them that is not as nominal."""
-    return moved_joints(p, values, lambda q: q + _numbers(values, JOINTS, np))
+    return moved_joints(p, values, lambda q: q + _numbers(values, JOINTS))
 
 
 def moved_joints(p: Performance, values, change) -> Performance:
     """Tips as read by a nominal hand whose angles (n, 4) pass through `change`."""
     if not p.rig.jointed:
         raise ValueError("a Cartesian hand has no joints")
-    longer = _numbers(values, LINKS, np, "scale").reshape(2, 2)
-    shift = np.array([[0.0, 0.0], _numbers(values, BASE, np)])
+    longer = _numbers(values, LINKS, "scale").reshape(2, 2)
+    shift = np.array([[0.0, 0.0], _numbers(values, BASE)])
     q, dq = [], []
     for i in (1, 2):
         nominal = p.rig.finger(i)
@@ -121,77 +119,75 @@ HUSH = 3.0  # chosen: sds of an angle by which it must turn on before its joint 
 CROSSED, STAYED = 0.6, 0.1  # chosen: variance midway through a rest of a joint that turns back, or goes on
 
 
-def _noise_backlash(values: jax.Array) -> jax.Array:
+def _noise_backlash(values: np.ndarray) -> np.ndarray:
     """Noise (T, 4) of sampled signals (T, N, 4), from their second differences."""
-    bend = jnp.abs(values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2])
-    return jnp.maximum(jnp.median(bend, axis=1) / (0.6745 * np.sqrt(6)), 1e-6)
+    bend = np.abs(values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2])
+    return np.maximum(np.median(bend, axis=1) / (0.6745 * np.sqrt(6)), 1e-6)
 
 
-def _moves_backlash(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _moves_backlash(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Direction (T, N, 4) in which each recorded angle moves, -1, 1, or 0 where it rests; and the angle
     without its noise: it stays where it rests."""
+    from simgap.recursions import play
+
     hush = HUSH * _noise_backlash(joints)
-
-    def follow(last, now):
-        new = jnp.clip(last, now - hush, now + hush)
-        return new, (jnp.sign(new - last), new)
-
-    _, out = jax.lax.scan(follow, joints[:, 0], jnp.moveaxis(joints, 1, 0))
-    return jnp.moveaxis(out[0], 0, 1), jnp.moveaxis(out[1], 0, 1)
+    calm = np.empty_like(joints)
+    for trial, joint in np.ndindex(hush.shape):
+        calm[trial, :, joint] = play(joints[trial, :, joint], 2 * hush[trial, joint])
+    return np.sign(np.diff(calm, axis=1, prepend=joints[:, :1])), calm
 
 
-def _nearest_backlash(moves: jax.Array, reverse: bool) -> tuple[jax.Array, jax.Array]:
+def _nearest_backlash(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
     """The last move before each sample (the next one in reverse), 0 where there is none, and how long ago.
 
     A sample's own noise would choose its own side, so its own move does not count.
     """
+    if reverse:
+        move, ago = _nearest_backlash(moves[:, ::-1], False)
+        return move[:, ::-1], ago[:, ::-1]
+    here = np.arange(moves.shape[1])[:, None]
+    last = np.maximum.accumulate(np.where(moves != 0, here, -1), axis=1)
+    last = np.concatenate([np.full_like(last[:, :1], -1), last[:, :-1]], 1)
+    move = np.where(last < 0, 0.0, np.take_along_axis(moves, np.maximum(last, 0), axis=1))
+    return move, (here - last).astype(float)
 
-    def keep(state, now):
-        move, ago = state
-        after = jnp.where(now != 0, now, move), jnp.where(now != 0, 1.0, ago + 1)
-        return after, state
 
-    start = jnp.zeros_like(moves[:, 0]), jnp.ones_like(moves[:, 0])
-    _, (move, ago) = jax.lax.scan(keep, start, jnp.moveaxis(moves, 1, 0), reverse=reverse)
-    return jnp.moveaxis(move, 0, 1), jnp.moveaxis(ago, 0, 1)
-
-
-def within(world: World, half: jax.Array, unseen: jax.Array) -> tuple[jax.Array, jax.Array]:
+def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.ndarray]:
     """Where in the dead band of so much to either side [rad] each joint lies (T, N, 4): mean and variance.
 
     A recorded angle that moves pins its joint to the side it moves to. At rest the joint goes from one pin
     to the next: as its speed says, unless that is `unseen`; then no one knows when. A band narrower than what
     an angle must turn on by to be seen moving is not seen either.
     """
-    half = half * jnp.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
+    half = half * np.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
     moves, calm = _moves_backlash(world.joints)
     (last, ago), (following, ahead) = _nearest_backlash(moves, False), _nearest_backlash(moves, True)
     rest = ago + ahead - 1
     share = (ago - 0.5) / rest
-    share = jnp.where(last == 0, 1.0, jnp.where(following == 0, 0.0, share))
-    midway = jnp.where(last == following, STAYED * (1 - 1 / rest), CROSSED)
+    share = np.where(last == 0, 1.0, np.where(following == 0, 0.0, share))
+    midway = np.where(last == following, STAYED * (1 - 1 / rest), CROSSED)
     open_end = (last == 0) | (following == 0)
-    blind = jnp.square(half) * jnp.where(open_end, STAYED, 4 * share * (1 - share) * midway)
+    blind = np.square(half) * np.where(open_end, STAYED, 4 * share * (1 - share) * midway)
 
     # Speeds integrated less what the sensor saw: how far the joint went in its dead band, but for a constant.
     step = (world.t[:, 1:] - world.t[:, :-1])[..., None]
-    went = jnp.cumsum(step * (world.rates[:, 1:] + world.rates[:, :-1]) / 2, axis=1)
-    went = jnp.pad(went, ((0, 0), (1, 0), (0, 0)))
+    went = np.cumsum(step * (world.rates[:, 1:] + world.rates[:, :-1]) / 2, axis=1)
+    went = np.pad(went, ((0, 0), (1, 0), (0, 0)))
     hidden = went - calm
     # Of a sample that moves, what the sensor saw before: its own noise must not be taken out of it.
-    own = went - jnp.concatenate([calm[:, :1], calm[:, :-1]], axis=1)
+    own = went - np.concatenate([calm[:, :1], calm[:, :-1]], axis=1)
     n = hidden.shape[1]
-    here = jnp.arange(n)[None, :, None]
+    here = np.arange(n)[None, :, None]
     before, after = (
-        jnp.take_along_axis(hidden, jnp.clip(here + k.astype(int), 0, n - 1), axis=1) for k in (-ago, ahead)
+        np.take_along_axis(hidden, np.clip(here + k.astype(int), 0, n - 1), axis=1) for k in (-ago, ahead)
     )
     pinned = half * (last * (1 - share) + following * share)
     free = (moves == 0) | (last != following)
-    path = pinned + (1 - unseen) * jnp.where(free, own - before * (1 - share) - after * share, 0.0)
-    walk = jnp.square(_noise_backlash(world.rates)[:, None] * jnp.median(step))
-    length = jnp.where(open_end, jnp.minimum(ago, ahead), rest * share * (1 - share))
-    seen = jnp.minimum(walk * length, blind)
-    return jnp.clip(path, -half, half), unseen * blind + (1 - unseen) * seen
+    path = pinned + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
+    walk = np.square(_noise_backlash(world.rates)[:, None] * np.median(step))
+    length = np.where(open_end, np.minimum(ago, ahead), rest * share * (1 - share))
+    seen = np.minimum(walk * length, blind)
+    return np.clip(path, -half, half), unseen * blind + (1 - unseen) * seen
 
 
 def _correct_backlash(world: World, values, on) -> World:
@@ -263,7 +259,7 @@ def _scatter_hand_roll(given, residual: np.ndarray):
     if not (unit > 0).any():
         return None
     found = on_grid("hand_roll", square, unit, ROLLS, rows.cell, VARIED)
-    # How much of it there is in which carry and how fast nobody knows: what lies there has its own variance.
+    # Its size and speed in each carry are unknown: what lies there has its own variance.
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.io.rig import FORCE_CHANNELS
@@ -23,7 +22,7 @@ from simgap.effects.base import (
 )
 
 FINGERTIP_MASS = loading(  # outboard of its force sensor
-    lambda m, v, xp: v["mass"] * (m.acceleration + m.gravity * xp.asarray([0.0, 1.0, 0.0, 1.0])),
+    lambda m, v: v["mass"] * (m.acceleration + m.gravity * np.array([0.0, 1.0, 0.0, 1.0])),
     name="fingertip_mass",
     acts_on="dynamics",
     says="recorded F = F + mass (a + g up), outboard of the sensor",
@@ -39,7 +38,7 @@ FINGERTIP_MASS = loading(  # outboard of its force sensor
 )
 
 VISCOUS_DRAG = loading(
-    lambda m, v, xp: v["coefficient"] * m.velocity,
+    lambda m, v: v["coefficient"] * m.velocity,
     name="viscous_drag",
     acts_on="dynamics",
     says="recorded F = F + coefficient v on each finger",
@@ -59,9 +58,8 @@ VISCOUS_DRAG = loading(
 MIDDLE = (0.13, 0.02)  # prior: m; about where the fingers work
 
 
-def _cable(m: Motion, values, xp):
-    at = xp.stack([xp.asarray(values[n], float) for n in ("at_x", "at_y")] * 2)
-    return values["stiffness"] * (m.position - xp.asarray(MIDDLE * 2)) + at
+def _cable(m: Motion, values):
+    return values["stiffness"] * (m.position - MIDDLE * 2) + [values["at_x"], values["at_y"]] * 2
 
 
 def _report_cable_force(draws, rig):
@@ -97,11 +95,11 @@ CABLE_FORCE = loading(
 LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known as an impulse only
 
 
-def _impact(m: Motion, values, xp):
+def _impact(m: Motion, values):
     since = m.since[..., 2::4]
     inside = (since >= 0) & (since < LENGTH)
-    pulse = xp.where(inside, (1 - xp.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0).sum(-1)
-    return -values["impulse"] * pulse[..., None] * xp.asarray([0.0, 0.5, 0.0, 0.5])
+    pulse = np.where(inside, (1 - np.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0).sum(-1)
+    return -values["impulse"] * pulse[..., None] * np.array([0.0, 0.5, 0.0, 0.5])
 
 
 CONTACT_IMPACT = loading(
@@ -127,27 +125,24 @@ AMPLITUDES = tuple(
 )
 
 
-def _ringing(world: World, values) -> jnp.ndarray:
+def _ringing(world: World, values) -> np.ndarray:
     omega = 2 * np.pi * values["frequency"]
     moves = world.events.shape[1] // 4
-    total = jnp.zeros_like(world.force)
+    total = np.zeros_like(world.force)
     for group, kinds in GROUPS:
-        since = jnp.stack([world.t - world.events[:, 4 * m + k, None] for m in range(moves) for k in kinds])
+        since = np.stack([world.t - world.events[:, 4 * m + k, None] for m in range(moves) for k in kinds])
         started = (since >= 0) & (since < 3.0)
-        since = jnp.where(started, since, 0.0)
-        decay = jnp.where(started, jnp.exp(-values["damping"] * omega * since), 0.0)
-        for part, wave in (("sin", jnp.sin), ("cos", jnp.cos)):
+        since = np.where(started, since, 0.0)
+        decay = np.where(started, np.exp(-values["damping"] * omega * since), 0.0)
+        for part, wave in (("sin", np.sin), ("cos", np.cos)):
             shape = (decay * wave(omega * since)).sum(0)
-            total += (
-                shape[..., None]
-                * jnp.stack([values[f"{part}_{group}_{c}"] for c in FORCE_CHANNELS])[None, None, :]
-            )
+            total += shape[..., None] * [values[f"{part}_{group}_{c}"] for c in FORCE_CHANNELS]
     return total
 
 
 def _correct_structural_vibration(world: World, values, on) -> World:
     # What loads ring is put into what they should read, not taken out: recorded noise stays as it is.
-    ring = jnp.stack([jnp.asarray(values[n], float) for n in ("frequency", "damping", "drive")])
+    ring = np.array([values[n] for n in ("frequency", "damping", "drive")])
     return with_mode(world, RINGING, on)._replace(force=world.force - _ringing(world, values), ring=ring)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
 
 from simgap.channels import at_rest
 from simgap.channels.sensors import LOWPASS
@@ -26,11 +25,10 @@ FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
 
 
 def _correct_fingertip_compliance(world: World, values, on) -> World:
-    normal, shear = jnp.asarray(values["give_normal"], float), jnp.asarray(values["give_shear"], float)
-    each = jnp.stack([jnp.asarray(values[n], float) for n in FINGERS])
+    each = np.array([values[n] for n in FINGERS])
     return world._replace(
-        give_normal=world.give_normal + normal[None] + each[:2],
-        give_shear=world.give_shear + shear[None] + each[2:],
+        give_normal=world.give_normal + values["give_normal"] + each[:2],
+        give_shear=world.give_shear + values["give_shear"] + each[2:],
     )
 
 
@@ -104,7 +102,7 @@ FINGERTIP_COMPLIANCE = HandEffect(
 )
 
 
-# A viscoelastic arm on the pad: foam that goes on yielding while held (standard linear solid).
+# A viscoelastic arm on the pad: foam that keeps yielding while held (standard linear solid).
 #
 # Stiff at once by (1 + ratio) k and relaxing to k: with the arm's time constant T, displacement d and
 # force F obey F + T F' = k d + T (1 + ratio) k d'. Solved for d, a share ratio / (1 + ratio) of the
@@ -159,15 +157,12 @@ HANGING = 0.9  # chosen: share of a carry, at least, that pads do not slide in: 
 
 def _correct_grip_slip(world: World, values, on) -> World:
     force = world.force - world.load
-    shear = jnp.abs(force[..., jnp.asarray([1, 3])])
-    push = jnp.stack([force[..., 0], -force[..., 2]], -1)
-    ratio = shear / jnp.maximum(push, 0.5 * LOADED)
+    push = np.stack([force[..., 0], -force[..., 2]], -1)
+    ratio = np.abs(force[..., 1::2]) / np.maximum(push, 0.5 * LOADED)
     carried = (world.carry > 0) & (push.min(axis=-1) > LOADED)
-    unknown = jnp.where(carried.any(), jnp.nan, 0.0)
-    steady = jnp.nanquantile(jnp.where(carried, ratio.max(axis=-1), unknown), HANGING)
-    mu = jnp.maximum(values["mu"], 1.05 * steady)
-    sliding = jax.nn.sigmoid((ratio / mu - 1.02) / 0.02).max(axis=-1)
-    sliding = sliding * jax.nn.sigmoid((push.min(axis=-1) - LOADED) / 0.05)
+    steady = np.quantile(ratio.max(axis=-1)[carried], HANGING) if carried.any() else 0.0
+    mu = max(values["mu"], 1.05 * steady)
+    sliding = expit((ratio / mu - 1.02) / 0.02).max(axis=-1) * expit((push.min(axis=-1) - LOADED) / 0.05)
     return with_mode(world, SLIDING, on)._replace(
         slip=world.slip + on * sliding * (world.ground + world.carry)
     )

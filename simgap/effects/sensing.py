@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import block_diag
 
 from hmmseg.io.rig import FORCE_CHANNELS
 from simgap.channels.sensors import BIAS, DRIFT, LAG, LOWPASS
@@ -62,8 +61,7 @@ def _since(t, last, values):
 
     The bend is nothing at the start and as the last block is left: the mean slope stays as it is.
     """
-    last = jnp.maximum(last, 1e-3) if isinstance(last, jax.Array) else max(float(last), 1e-3)
-    return t * (1 + values.get("bend", 0.0) * (1 - t / last))
+    return t * (1 + values.get("bend", 0.0) * (1 - t / np.maximum(last, 1e-3)))
 
 
 FORCE_DRIFT = of_forces(
@@ -88,12 +86,9 @@ FORCE_DRIFT = of_forces(
 FINGERS = ("finger1", "finger2")
 
 
-def of_channels(values, common: str, xp) -> list:
-    """A parameter of each force channel, made up of what is common, of its finger and of its own."""
-    return [
-        xp.asarray(sum(values.get(n, 0.0) for n in (common, f"finger{c[-1]}", c)), float)
-        for c in FORCE_CHANNELS
-    ]
+def of_channels(values, common: str) -> np.ndarray:
+    """A parameter of each force channel (4,), made up of what is common, of its finger and of its own."""
+    return np.array([sum(values.get(n, 0.0) for n in (common, f"finger{c[-1]}", c)) for c in FORCE_CHANNELS])
 
 
 def _phrase_force_gain(means, rig):
@@ -106,7 +101,7 @@ def _phrase_force_gain(means, rig):
 
 
 FORCE_GAIN = mixing(
-    lambda v, xp: xp.diag(1 + xp.stack(of_channels(v, "gain", xp))),
+    lambda v: np.diag(1 + of_channels(v, "gain")),
     name="force_gain",
     says="recorded F = (1 + gain) F, common to all channels, of a finger, or of each channel",
     shows="every load, in proportion",
@@ -125,21 +120,14 @@ FORCE_GAIN = mixing(
 # Each force axis picks up a share of the other one; and force sensors mounted with a turn.
 
 
-def both_fingers(one, two, xp):
-    """A matrix (4, 4) of both fingers' (x, y) pairs from two of scalars."""
-    rows = [[*one[0], 0.0, 0.0], [*one[1], 0.0, 0.0], [0.0, 0.0, *two[0]], [0.0, 0.0, *two[1]]]
-    return xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in rows])
+def _crosstalk(values):
+    pair = np.array([[1.0, values["fx_from_fy"]], [values["fy_from_fx"], 1.0]])
+    return block_diag(pair, pair)
 
 
-def _crosstalk(values, xp):
-    pair = ((1.0, values["fx_from_fy"]), (values["fy_from_fx"], 1.0))
-    return both_fingers(pair, pair, xp)
-
-
-def _turned(values, xp):
-    c, s = ([f(values[n]) for n in ("angle1", "angle2")] for f in (xp.cos, xp.sin))
-    one, two = (((c[k], -s[k]), (s[k], c[k])) for k in (0, 1))
-    return both_fingers(one, two, xp)
+def _turned(values):
+    c, s = ([f(values[n]) for n in ("angle1", "angle2")] for f in (np.cos, np.sin))
+    return block_diag(*([[c[k], -s[k]], [s[k], c[k]]] for k in (0, 1)))
 
 
 FORCE_CROSSTALK = mixing(
@@ -185,7 +173,7 @@ def _of_fingers(words: str) -> Callable[[Mapping[str, float], Mapping[str, Any]]
 
 
 def _spread(name: str) -> Spread:
-    return lambda values: [{name: v} for v in of_channels(values, name, np)]
+    return lambda values: [{name: v} for v in of_channels(values, name)]
 
 
 FORCE_LAG = of_forces(
@@ -205,9 +193,7 @@ FORCE_LAG = of_forces(
         )
         for n in ("delay", *FINGERS)
     },
-    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(
-        delay=w.delay + jnp.stack(of_channels(v, "delay", jnp))
-    ),
+    correct=lambda w, v, on: with_mode(w, LATE, on)._replace(delay=w.delay + of_channels(v, "delay")),
     forms=(("delay",), ("finger1",), ("finger2",)),
     apply=reading(LAG, _spread("delay")),
     wrist=True,
@@ -231,7 +217,7 @@ FORCE_LOWPASS = of_forces(
     },
     forms=(("time_constant",), ("finger1",), ("finger2",)),
     correct=lambda w, v, on: with_mode(w, SMOOTH, on)._replace(
-        smoothing=w.smoothing + jnp.stack(of_channels(v, "time_constant", jnp))
+        smoothing=w.smoothing + of_channels(v, "time_constant")
     ),
     apply=reading(LOWPASS, _spread("time_constant")),
     wrist=True,
@@ -303,15 +289,14 @@ def _scatter_clock_jitter(given, residual: np.ndarray):
 
 def _rates_clock_jitter(given) -> np.ndarray:
     """Whitened change per second of clock error (T, N, C): only where motion is fast."""
-    w = given.frame.world
-    world = jax.tree.map(jnp.asarray, w)
+    world = given.frame.world
     _, velocity = tips(world)
-    step = np.median(np.diff(w.t, axis=1))
-    mean_v = np.asarray((velocity[..., :2] + velocity[..., 2:]) / 2)
+    step = np.median(np.diff(world.t, axis=1))
+    mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     out = np.zeros_like(given.whitening.weight)
     # Central differences of positions read at wrong times: v times the times' difference over 2 steps; and
     # the mean (1, 4, 1) / 6 of speeds that were read at them.
-    rate = np.asarray(gradient(world.t, jnp.asarray(mean_v)))
+    rate = gradient(world.t, mean_v)
     for k, c in enumerate(("vx", "vy")):
         out[..., CHANNELS.index(c)] = np.hypot(mean_v[..., k] / step, rate[..., k]) / np.sqrt(2)
     return out * given.whitening.weight
@@ -323,7 +308,7 @@ CLOCK_JITTER = HandEffect(
     shows="noise in proportion to the rate of change",
     mistaken_for=("noise",),
     called="samples that are not taken when their time stamps say",
-    check="Log the acquisition clock beside the time stamps; look for samples stamped on arrival.",
+    check="Log the acquisition clock together with the time stamps; look for samples stamped on arrival.",
     parameters={"sd": Parameter(0.004, 1.0, "s", log=True, low=1e-4, high=0.05)},
     stage=READOUT,
     sampled=lambda t, v, rng: t + rng.normal(0, v["sd"], t.size),

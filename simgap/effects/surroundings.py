@@ -17,7 +17,7 @@ from simgap.effects.base import (
     with_mode,
 )
 
-# The carried block's inertia, where a quasistatic model is asked for.
+# The carried block's inertia, where a quasistatic model is requested.
 
 OBJECT_INERTIA = HandEffect(
     name="object_inertia",
@@ -35,7 +35,7 @@ OBJECT_INERTIA = HandEffect(
 )
 
 
-# A block whose mass lies beside its middle: the fingers share its weight unequally.
+# A block whose centre of mass is off its middle: the fingers share its weight unequally.
 
 
 def _apply_offcentre_mass(performance: Performance, values, rng) -> Performance:
@@ -139,7 +139,7 @@ TABLE_COMPLIANCE = HandEffect(
     shows="height falls with vertical force on the ground",
     mistaken_for=("fingertip_compliance",),
     called="a table that yields under load",
-    check="Press on the table with a known weight beside a dial gauge; look for foam, a mat or a loose foot.",
+    check="Press on the table with a known weight by a dial gauge; look for foam, a mat or a loose foot.",
     parameters={
         "give": Parameter(0.0, 4e-4, "m/N", low=0.0),
         "settling": Parameter(0.02, 0.8, "s", low=1e-3, high=0.2, log=True, hidden=True),

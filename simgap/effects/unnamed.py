@@ -1,8 +1,7 @@
-"""Decoys: fitted to be told from the catalogue's, and never named; where one explains best it is unknown."""
+"""Decoys: fitted as alternatives to the catalogue, never named; where one explains best it is unknown."""
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.io.rig import FORCE_CHANNELS
@@ -39,17 +38,16 @@ SHARES = tuple(f"share_{time:g}" for time in TIMES)
 def _remembered(force, values, step):
     """What the readings (T, N, C) owe to loads of before, to first order: readings stand for the loads."""
     return sum(
-        values[name] * (lowpass(force, jnp.asarray(time), step) - force)
-        for name, time in zip(SHARES, TIMES, strict=True)
+        values[name] * (lowpass(force, time, step) - force) for name, time in zip(SHARES, TIMES, strict=True)
     )
 
 
 def _correct_force_memory(world: World, values, on) -> World:
-    force = jnp.asarray(world.force)
-    step = jnp.median(world.t[:, 1:] - world.t[:, :-1])
+    force, step = world.force, np.median(world.t[:, 1:] - world.t[:, :-1])
     # A correction that smooths would have less noise than was recorded.
-    click = jnp.zeros((1, LONG, 1)).at[0, 1, 0].set(1.0)
-    noise = jnp.sqrt(jnp.square(click - _remembered(click, values, step)).sum())
+    click = np.zeros((1, LONG, 1))
+    click[0, 1, 0] = 1.0
+    noise = np.sqrt(np.square(click - _remembered(click, values, step)).sum())
     return world._replace(force=force - _remembered(force, values, step), loudness=world.loudness / noise)
 
 
@@ -80,7 +78,7 @@ FORCE_MEMORY = HandEffect(
 MIXED = tuple(f"{to}_from_{of}" for to in FORCE_CHANNELS for of in FORCE_CHANNELS)
 
 FORCE_MIXING = mixing(
-    lambda v, xp: xp.eye(4) + xp.stack([xp.asarray(v[n], float) for n in MIXED]).reshape(4, 4),
+    lambda v: np.eye(4) + np.array([v[n] for n in MIXED]).reshape(4, 4),
     inverse=True,
     name="force_mixing",
     says="F = (1 + M) recorded F, M any matrix of both fingers' four channels",
@@ -96,17 +94,17 @@ FORCE_MIXING = mixing(
 
 
 def _correct_force_nonlinearity(world: World, values, on) -> World:
-    size, gain, curve = jnp.abs(world.force), 1 + values["gain"], values["curve"]
-    root = jnp.sqrt(jnp.maximum(gain**2 + 4 * curve * size, 0.05))
+    size, gain, curve = np.abs(world.force), 1 + values["gain"], values["curve"]
+    root = np.sqrt(np.maximum(gain**2 + 4 * curve * size, 0.05))
     louder = (root[..., :2] + root[..., 2:]) / 2  # the slope of the reading is that root
     return world._replace(
-        force=jnp.sign(world.force) * 2 * size / (gain + root),
-        loudness=world.loudness * jnp.concatenate([louder, louder], -1),
+        force=np.sign(world.force) * 2 * size / (gain + root),
+        loudness=world.loudness * np.concatenate([louder, louder], -1),
     )
 
 
 def _correct_gain_drift(world: World, values, on) -> World:
-    gain = jnp.maximum(1 + values["gain"] + values["rate"] * world.t, 0.1)[..., None]
+    gain = np.maximum(1 + values["gain"] + values["rate"] * world.t, 0.1)[..., None]
     return world._replace(force=world.force / gain, loudness=world.loudness * gain)
 
 
@@ -159,12 +157,12 @@ MOTIONS = ("x", "y", "vx", "vy", "ax", "ay")
 LINEAR = tuple(f"{axis}_of_{motion}" for axis in ("fx", "fy") for motion in MOTIONS)
 
 
-def _of_motion(m: Motion, values, xp):
-    steady, matrix = (xp.stack([xp.asarray(values[n], float) for n in s]) for s in (FORCE_CHANNELS, LINEAR))
-    parts = (m.position - xp.asarray(MIDDLE * 2), m.velocity, m.acceleration)
+def _of_motion(m: Motion, values):
+    steady, matrix = (np.array([values[n] for n in s]) for s in (FORCE_CHANNELS, LINEAR))
+    parts = (m.position - MIDDLE * 2, m.velocity, m.acceleration)
     parts = [part / usual for part, usual in zip(parts, USUAL, strict=True)]
-    fingers = [xp.concatenate([p[..., k : k + 2] for p in parts], -1) for k in (0, 2)]
-    return xp.concatenate([f @ matrix.reshape(2, 6).T for f in fingers], -1) + steady
+    fingers = [np.concatenate([p[..., k : k + 2] for p in parts], -1) for k in (0, 2)]
+    return np.concatenate([f @ matrix.reshape(2, 6).T for f in fingers], -1) + steady
 
 
 MOTION_LOAD = loading(
@@ -185,13 +183,13 @@ GIVES = ("give1", "give2")
 
 
 def _correct_skewed_pads(world: World, values, on) -> World:
-    rise = jnp.stack([values[n] for n in GIVES])[None, None, :] * jnp.abs(world.force[..., 0::2])
+    rise = np.array([values[n] for n in GIVES]) * np.abs(world.force[..., 0::2])
     along_x, along_y = swung(world)
     inner, outer = along_x[..., 0::2], along_x[..., 1::2]
     turn = rise / (inner * along_y[..., 1::2] - outer * along_y[..., 0::2])
-    joints = jnp.stack([-outer * turn, inner * turn], -1).reshape(world.joints.shape)
-    place = jnp.stack([jnp.zeros_like(rise), rise], -1).reshape(world.joints.shape)
-    return world._replace(joints=world.joints - jnp.where(world.jointed > 0.5, joints, place))
+    joints = np.stack([-outer * turn, inner * turn], -1).reshape(world.joints.shape)
+    place = np.stack([np.zeros_like(rise), rise], -1).reshape(world.joints.shape)
+    return world._replace(joints=world.joints - np.where(world.jointed > 0.5, joints, place))
 
 
 def _apply_skewed_pads(p: Performance, values, rng) -> Performance:

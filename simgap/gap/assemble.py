@@ -213,7 +213,7 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
 def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], np.ndarray]) -> np.ndarray:
     """What noise makes of columns (n, M), (D, n, M) draws, from those `on` the redrawn recordings.
 
-    Where it does not act in proportion, as beside a contact that it makes or breaks, nothing is said.
+    Where it does not act in proportion, as next to a contact that it makes or breaks, it is undetermined.
     """
     changes = [(on(other) - columns) / size for other, size in zip(others, SIZES * len(SIGNS.T), strict=True)]
     out = []

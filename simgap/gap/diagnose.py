@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
@@ -16,7 +14,7 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import Model, forms
+from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
 from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
@@ -122,9 +120,7 @@ def shifts(given: Problem, causes: Fitted) -> np.ndarray:
 
 def channels(world: World) -> np.ndarray:
     """Task-space channels (T, N, C) of a world: x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
-    world = jax.tree.map(jnp.asarray, world)
-    position, velocity = (np.asarray(z) for z in tips(world))
-    force = np.asarray(world.force)
+    (position, velocity), force = tips(world), world.force
     mean, apart = (position[..., :2] + position[..., 2:]) / 2, position[..., 2:] - position[..., :2]
     speed = (velocity[..., :2] + velocity[..., 2:]) / 2
     net, half = force[..., :2] + force[..., 2:], (force[..., :2] - force[..., 2:]) / 2
@@ -384,16 +380,15 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    models: list[Model] | None = sought(forms(gap))
-    leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    leading = [j for j in sought(forms(gap), 1)[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(
             found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
         )
-        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
+        gap = together(found.problem, gap, found.healthy, joint, left, found.redrawn)
     absorbed = properties_tolerated(found.problem)
-    return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
+    return gap, attribute(gap, twins, forced, seed, absorbed=absorbed)
 
 
 def _together(found: Search, which: Sequence[int]) -> Fitted:

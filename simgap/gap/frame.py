@@ -233,7 +233,7 @@ def trial_arrays(
 
 
 def _struck(force: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Samples (N,) beside a finger's touch or letting go, where its speed jumps as no difference tells."""
+    """Samples (N,) next to a finger's touch or release, where its speed jumps as no difference shows."""
     touches = np.hypot(force[:, ::2], force[:, 1::2]) > SURE * sd[:, None]
     change = np.pad((touches[1:] != touches[:-1]).any(axis=1), (2, 2))
     return change[:-3] | change[1:-2] | change[2:-1] | change[3:]
@@ -249,7 +249,7 @@ def _shaken(
         mine = subtask == s
         weight[mine] = max(float(np.median(force[mine, 1] + force[mine, 3])), 0.0)
     jumps = np.hypot(*(kinks(mean_of(signals, v), sample[v] / root2) for v in ("vx", "vy")))
-    # Differences of speeds have one or the other beside a jump, and what pads hold rings as much again, both
+    # Differences of speeds have one or the other next to a jump, and what pads hold rings as much again, both
     # ways, for it turns in the grip as well.
     return weight * root2 * of_a_kink(group)[1] / step * jumps
 
@@ -262,7 +262,7 @@ def _one_finger(
     boundaries: np.ndarray,
     sd: np.ndarray,
 ) -> np.ndarray:
-    """Samples (N,) of free motion beside a grip at which one finger touches already or still.
+    """Samples (N,) of free motion next to a grip at which one finger touches already or still.
 
     Such a touch is a contact that the task does not list and no gap. One finger presses inwards, compared
     with its own median in that free motion, and the other does not; `sd` (N,) is a force's noise [N].
@@ -327,15 +327,12 @@ def _there(
     return np.stack([columns[c] for c in CHANNELS], 1).astype(float)
 
 
-TRIALS = 4  # numerics: arrays are padded to multiples of it, so that few programs are compiled
-
-
 class Arrays(NamedTuple):
     """Constants of the contact equations: T trials, N samples, C channels, M moves, O objects.
 
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): how far it
     is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `kind` (T, N):
-    2 * phase, + 1 beside a contact change; `subtask` (T, N);
+    2 * phase, + 1 next to a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
     `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
     forces as they stand in `World`.
@@ -356,7 +353,7 @@ class Arrays(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """Everything the diagnosis needs of aligned trials; the first `num_trials` rows are real.
+    """Everything the diagnosis needs of aligned trials.
 
     `forces`: each trial's forces (N, 4) [N] as they were read, of which `groups` became one sample here.
     """
@@ -385,17 +382,14 @@ def build(aligned: AlignedTrials) -> Frame:
         raise ValueError("no trial fits its task")
     trials = [a.trial for a in chosen]
     rows = [trial_arrays(a.trial, boundary_quantiles(a), steps, rig) for a in chosen]
-    length = padded_length(max(r["t"].size for r in rows))
-    count = -(-len(rows) // TRIALS) * TRIALS
-    stack = {key: _stacked([r[key] for r in rows], length, count) for key in rows[0] if key != "events"}
+    length = max(r["t"].size for r in rows)
+    stack = {key: _stacked([r[key] for r in rows], length) for key in rows[0] if key != "events"}
     events = np.stack([r["events"] for r in rows])
-    events = np.concatenate([events, np.repeat(events[-1:], count - len(rows), 0)])
-    for r in range(count):
-        end = rows[r]["t"].size if r < len(rows) else 0
+    for r, row in enumerate(rows):
+        end, t = row["t"].size, stack["t"][r]
         stack["there"][r, end:] = 0.0  # padding says nothing
-        t = stack["t"][r]  # time goes on evenly, for the sampling interval is read off it
-        last, step = (end, np.median(np.diff(t[:end]))) if end else (1, np.median(np.diff(rows[-1]["t"])))
-        t[last:] = t[last - 1] + step * np.arange(1, t.size - last + 1)
+        # Time continues evenly, as the sampling interval is read off it.
+        t[end:] = t[end - 1] + np.median(np.diff(t[:end])) * np.arange(1, length - end + 1)
     moves = len(task.performed)
     objects, rises = np.zeros((moves, len(task.objects))), np.zeros((moves, len(task.objects)))
     for m, move in enumerate(task.performed):
@@ -431,15 +425,9 @@ def build(aligned: AlignedTrials) -> Frame:
     )
 
 
-def padded_length(samples: int) -> int:
-    """Samples to pad to: 240, 480, 960, .. (ten seconds at 20 Hz fit the first)."""
-    return 240 * 2 ** max(0, int(np.ceil(np.log2(samples / 240))))
-
-
-def _stacked(rows: list[np.ndarray], length: int, count: int) -> np.ndarray:
-    """Rows of different length as one array (count, length, ...), padded with their last entries."""
-    padded = [np.pad(r, [(0, length - len(r)), *[(0, 0)] * (r.ndim - 1)], "edge") for r in rows]
-    return np.stack(padded + [padded[-1]] * (count - len(rows)))
+def _stacked(rows: list[np.ndarray], length: int) -> np.ndarray:
+    """Rows of different length as one array (T, length, ...), padded with their last entries."""
+    return np.stack([np.pad(r, [(0, length - len(r)), *[(0, 0)] * (r.ndim - 1)], "edge") for r in rows])
 
 
 def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:

@@ -1,4 +1,4 @@
-"""What recordings contain that is nobody's fault, as columns that are fitted along with every effect.
+"""What recordings contain that is not a fault, as columns fitted together with every effect.
 
 What rig.toml admits under [systematic]; speeds that a drive takes as differences; and blocks that turn in the
 grip. Each column is per its standard deviation beforehand, so that its prior is N(0, 1).
@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from simgap.effects.base import gradient, tips, with_load
@@ -54,7 +52,7 @@ def _admitted(given: Problem) -> list[np.ndarray]:
 def _inertial(given: Problem) -> list[np.ndarray]:
     """The column (n, 1) of pads' inertia: a sensor that was tared with its pad on does not show the pad's
     weight, but what it takes to accelerate it. No effect of the catalogue is that, and no fault."""
-    world = given.constants[0]
+    world = given.frame.world
     force = BEYOND * gradient(world.t, tips(world)[1])
     change = residual_of(given, with_load(world, force)) - residual_of(given, world)
     return [-change[:, None]]
@@ -66,22 +64,21 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
     How a drive comes by its speeds rig.toml does not say: differences are as usual as a tachometer.
     """
     world, weight = given.frame.world, given.whitening.weight
-    tree = jax.tree.map(jnp.asarray, world)
     step = float(np.median(np.diff(world.t[0])))
-    velocity = np.asarray(tips(tree)[1])
+    velocity = tips(world)[1]
     mean = (velocity[..., :2] + velocity[..., 2:]) / 2
-    position = np.asarray(tips(tree)[0])
+    position = tips(world)[0]
     place = (position[..., :2] + position[..., 2:]) / 2
     # Of the quieter of both: a column that holds the residual's own noise would be fitted to smooth it.
-    calm = _quieter(given, mean, np.asarray(gradient(tree.t, jnp.asarray(place))), step)
-    rate = np.asarray(gradient(tree.t, jnp.asarray(calm)))
-    bend = np.asarray(gradient(tree.t, jnp.asarray(rate)))
+    calm = _quieter(given, mean, gradient(world.t, place), step)
+    rate = gradient(world.t, calm)
+    bend = gradient(world.t, rate)
     # What a drive that takes differences of its own readings from sample to sample would say.
     before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
-    own = np.asarray(tips(tree._replace(rates=jnp.asarray((world.joints - before) / step)))[1])
+    own = tips(world._replace(rates=(world.joints - before) / step))[1]
     own = (own[..., :2] + own[..., 2:]) / 2
     own[:, 1:-1] = (own[:, :-2] + 4 * own[:, 1:-1] + own[:, 2:]) / 6
-    own = own - np.asarray(gradient(tree.t, jnp.asarray(place)))
+    own = own - gradient(world.t, place)
     out = []
     for change, usual in ((own, 1.0), (rate, step / 2), (bend, step**2 / 2)):
         column = np.zeros_like(weight)
@@ -108,7 +105,7 @@ def _turning(given: Problem) -> list[np.ndarray]:
     Balance of moments about its middle: what both fingers' shears and the couple of grips at unequal heights
     exert turns a block against the pads, as far as its support does not hold it upright. The support's load
     acts within its feet, so it holds a moment up to the load times half its stance; beyond that the block
-    turns about a foot, and its middle rises. How easily pads turn is nobody's fault.
+    turns about a foot, and its middle rises. How easily pads turn is not a fault.
     """
     world, arrays = given.frame.world, given.frame.arrays
     stiffness = 1 / np.maximum(world.give_normal.mean(), 1e-9)
@@ -116,7 +113,7 @@ def _turning(given: Problem) -> list[np.ndarray]:
     weight, width = (
         np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, k]) for k in (0, 1)
     )
-    position = np.asarray(tips(jax.tree.map(jnp.asarray, world))[0])
+    position = tips(world)[0]
     fx1, fy1, fx2, fy2 = np.moveaxis(world.force, -1, 0)
     apart = position[..., 3] - position[..., 1] - (fy2 * world.give_shear[1] - fy1 * world.give_shear[0])
     moment = width / 2 * (fy2 - fy1) + (fx1 - fx2) / 2 * apart

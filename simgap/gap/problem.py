@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
@@ -18,7 +16,7 @@ from simgap.effect import Parameter
 from simgap.effects import fitted as known_effects
 from simgap.effects import free_parameters, name_of
 from simgap.effects.base import HandEffect, World
-from simgap.gap.frame import CHANNELS, Arrays, Frame
+from simgap.gap.frame import CHANNELS, Frame
 from simgap.gap.residuals import contact, residuals
 
 # Residuals in units of their sensors' noise.
@@ -115,10 +113,9 @@ class Problem:
         return self.centre + self.sd * own.reshape(*own.shape[:-1], *self.centre.shape)
 
     @cached_property
-    def constants(self) -> tuple[Any, Any, Any]:
-        """World, arrays and whitening as JAX has them, to be used where this is in double precision."""
-        tree = (self.frame.world, self.frame.arrays, self.whitening)
-        return jax.tree.map(lambda z: jnp.asarray(z, float if z.dtype.kind == "f" else None), tree)
+    def noise(self) -> np.ndarray:
+        """Standard deviation (T, N, C) of every residual, 1 where there is none."""
+        return 1 / np.where(self.whitening.weight > 0, self.whitening.weight, 1.0)
 
     @cached_property
     def existing(self) -> np.ndarray:
@@ -246,86 +243,53 @@ def tolerated(given: Problem) -> np.ndarray:
 STEP = 1e-5  # numerics: of a usual deviation, for differences
 
 
-def corrected(world: World, u: jax.Array, on: jax.Array, num_properties: int) -> World:
-    """The world with every effect of coordinates u (all columns) taken out; `on` (num_slots,)."""
-    world = jax.tree.map(lambda z: jnp.asarray(z, float), world)
-    for k, slot in enumerate(slots(num_properties)[0]):
-        values = {p.name: p.value(u[slot.start + j]) for j, p in enumerate(slot.effect.parameters.values())}
-
-        def taken_out(values=values, effect=slot.effect, k=k, world=world) -> World:
-            changed = effect.correct(world, values, on[k])  # type: ignore[misc]
-            return jax.tree.map(lambda new, old: jnp.broadcast_to(new, old.shape), changed, world)
-
-        world = jax.lax.cond(on[k] > 0, taken_out, lambda world=world: world)
+def corrected(world: World, u: np.ndarray, effects: Sequence[str], num_properties: int) -> World:
+    """The world with these effects, at coordinates u (all columns), taken out."""
+    names = {name_of(key) for key in effects}
+    for slot in slots(num_properties)[0]:
+        if slot.effect.name in names:
+            each = enumerate(slot.effect.parameters.values())
+            values = {p.name: p.value(u[slot.start + j]) for j, p in each}
+            world = slot.effect.correct(world, values, 1.0)  # type: ignore[misc]
     return world
 
 
-def whitened(
-    world: World, arrays: Arrays, w: Whitening, properties: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def whitened(given: Problem, world: World, properties: np.ndarray) -> tuple[np.ndarray, float]:
     """Whitened residuals (T, N, C) of a world that effects were taken out of, and the cost of doubts [nats].
 
     A residual in doubt counts for less; half the log of its variance's factor is what that costs.
     `properties` (O, 3): weight, width, height.
     """
-    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
-    raw, factor = residuals(world, arrays, properties, noise)
-    cost = jnp.where(w.weight > 0, 0.5 * jnp.log(factor), 0.0).sum()
-    return raw / jnp.sqrt(factor) * w.weight, cost
-
-
-_corrected = jax.jit(corrected, static_argnames="num_properties")
-_whitened = jax.jit(whitened)
-
-
-@jax.jit
-def _whitened_at_each(world, arrays, w, properties):
-    """Of B rows of properties (B, O, 3): a property alone needs no effect taken out once more."""
-    return jax.vmap(lambda row: whitened(world, arrays, w, row))(properties)
+    weight = given.whitening.weight
+    raw, factor = residuals(world, given.frame.arrays, properties, given.noise)
+    cost = 0.5 * float(np.log(factor[weight > 0]).sum())
+    return raw / np.sqrt(factor) * weight, cost
 
 
 def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Whitened residuals (T, N, C) of a candidate at coordinates u."""
-    _, arrays, w = given.constants
-    world = _without_effects(given, effects, u)
-    return np.asarray(_whitened(world, arrays, w, jnp.asarray(given.properties(u)))[0])
+    return whitened(given, _without_effects(given, effects, u), given.properties(u))[0]
 
 
 def residual_of(given: Problem, world: World) -> np.ndarray:
     """Whitened residuals (n,) of a world that effects were taken out of, properties as expected."""
-    _, arrays, w = given.constants
-    usual = jnp.asarray(given.properties(neutral(given)))
-    return np.asarray(_whitened(world, arrays, w, usual)[0]).ravel()[given.existing]
-
-
-@jax.jit
-def _in_contact(world):
-    return world._replace(force=contact(world), load=jnp.zeros_like(world.load))
+    return whitened(given, world, given.properties(neutral(given)))[0].ravel()[given.existing]
 
 
 def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
     """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
-    return _in_contact(_without_effects(given, effects, u))
+    world = _without_effects(given, effects, u)
+    return world._replace(force=contact(world), load=np.zeros_like(world.load))
 
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Residuals (T, N, C) in units of their channels."""
-    world, (_, arrays, w) = _without_effects(given, effects, u), given.constants
-    noise = 1 / jnp.where(w.weight > 0, w.weight, 1.0)
-    return np.asarray(_raw(world, arrays, jnp.asarray(given.properties(u)), noise)[0])
-
-
-_raw = jax.jit(residuals)
+    world = _without_effects(given, effects, u)
+    return residuals(world, given.frame.arrays, given.properties(u), given.noise)[0]
 
 
 def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
-    on = jnp.asarray(_on(given, effects))
-    return _corrected(given.constants[0], jnp.asarray(u), on, given.num_properties)
-
-
-def _on(given: Problem, effects: Sequence[str]) -> np.ndarray:
-    names = {name_of(e) for e in effects}
-    return np.array([float(s.effect.name in names) for s in slots(given.num_properties)[0]])
+    return corrected(given.frame.world, u, effects, given.num_properties)
 
 
 class Evaluated(NamedTuple):
@@ -349,31 +313,20 @@ def evaluated(
 ) -> Evaluated:
     """What a candidate leaves at coordinates u, and its derivatives by the columns `mine`.
 
-    They are differences over a small step: in double precision good to STEP of a usual deviation, and cheaper
-    to compile than derivatives. `usual` (n, P): those by the properties, which an effect hardly changes,
-    where they are known already.
+    They are differences over a small step: in double precision good to STEP of a usual deviation. `usual`
+    (n, P): those by the properties, which an effect hardly changes, where they are known already.
     """
-    k, on = given.num_properties, jnp.asarray(_on(given, effects))
-    recorded, arrays, w = given.constants
-
-    def without(u: np.ndarray) -> World:
-        return _corrected(recorded, jnp.asarray(u), on, k)
-
-    properties = jnp.asarray(given.properties(u))
-    if usual is None:
-        steps = given.properties(u + STEP * np.eye(k + 1, u.size, -1))
-        every = _whitened_at_each(without(u), arrays, w, jnp.asarray(steps))
-    else:
-        every = [z[None] for z in _whitened(without(u), arrays, w, properties)]
-    found, doubt = (np.asarray(each) for each in every)
-    z, doubts, step = [found.reshape(len(found), -1)], [doubt], u.copy()
+    k, step = given.num_properties, u.copy()
+    world, properties = _without_effects(given, effects, u), given.properties(u)
+    each = [whitened(given, world, properties)]
+    if usual is None:  # a property alone needs no effect taken out once more
+        each += [whitened(given, world, row) for row in given.properties(u + STEP * np.eye(k, u.size))]
     for column in mine[k:]:
         step[column] += STEP
-        residual, doubt = _whitened(without(step), arrays, w, properties)
+        each.append(whitened(given, _without_effects(given, effects, step), properties))
         step[column] = u[column]
-        z.append(np.asarray(residual).reshape(1, -1))
-        doubts.append(np.asarray(doubt)[None])
-    z, doubts = np.concatenate(z)[:, given.existing], np.concatenate(doubts)
+    z = np.stack([residual.ravel()[given.existing] for residual, _ in each])
+    doubts = np.array([doubt for _, doubt in each])
     push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
     if usual is not None:
         push, lift = np.concatenate([usual, push], 1), np.concatenate([np.zeros(k), lift])
@@ -429,7 +382,7 @@ def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | No
     """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
 
     Properties have normal priors, an effect's parameters together a Cauchy distribution. `usual`: derivatives
-    by the properties, if `evaluated` need not take them anew.
+    by the properties, if `evaluated` need not recompute them.
     """
     mine, z = columns_of(given, start.effects), given.num_properties
     low, high = (edge[mine] for edge in limits(given))

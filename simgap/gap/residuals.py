@@ -9,10 +9,9 @@ positions. None of them multiplies position noise by a stiffness.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import jax
-import jax.numpy as jnp
+import numpy as np
+from scipy.signal import lfilter
+from scipy.special import expit
 
 from hmmseg.contact.equations import Pads, block_offset, block_width, block_x, block_y, support_load
 from simgap.effects.base import (
@@ -40,72 +39,66 @@ SHARP = 0.75  # chosen: by how much one side is flatter, as a share of both, bey
 EITHER = 0.6  # prior: of a force's change, sd: how a force between two samples goes from one to the other
 
 
-def net_forces(force: jax.Array) -> jax.Array:
+def net_forces(force: np.ndarray) -> np.ndarray:
     """Net force, grip and shear (T, N, 4) of both fingers' forces (T, N, 4)."""
     one, two = force[..., :2], force[..., 2:]
-    return jnp.concatenate([one + two, (one - two) / 2], -1)
+    return np.concatenate([one + two, (one - two) / 2], -1)
 
 
-def sampling_interval(world: World) -> jax.Array:
+def sampling_interval(world: World) -> float:
     """The usual time [s] from one sample to the next."""
-    return jnp.median(world.t[:, 1:] - world.t[:, :-1])
+    return float(np.median(np.diff(world.t, axis=1)))
 
 
-def shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
+def shifted(values: np.ndarray, steps: np.ndarray | float) -> np.ndarray:
     """Values (T, N, C) read `steps` samples later (a number or (C,), a fraction allowed): cubic Catmull-Rom.
 
     Where they have a corner between two samples, as at a contact change, both sides go straight on to it:
     before a contact there is no force yet. Sides that would not meet between the two are joined straight.
     """
-    return jax.vmap(_shifted, (2, 0), 2)(values, jnp.broadcast_to(steps, values.shape[2:]))
-
-
-def _around(values: jax.Array, steps: jax.Array) -> tuple[jax.Array, ...]:
-    """Four neighbours of (T, N) read `steps` samples later, and the fraction between the middle two."""
-    n, whole = values.shape[1], jnp.floor(steps)
-    index = jnp.arange(n) + whole.astype(int)
-    return *(values[:, jnp.clip(index + k, 0, n - 1)] for k in (-1, 0, 1, 2)), steps - whole
-
-
-def _shifted(values: jax.Array, steps: jax.Array) -> jax.Array:
     p0, p1, p2, p3, s = _around(values, steps)
     cubic = ((-p0 + 3 * p1 - 3 * p2 + p3) * s + (2 * p0 - 5 * p1 + 4 * p2 - p3)) * s + (p2 - p0)
     before, across, after = p1 - p0, p2 - p1, p3 - p2
     convex = after > before
     before, after = (
-        jnp.where(convex, one(side, across), other(side, across))
-        for side, one, other in ((before, jnp.minimum, jnp.maximum), (after, jnp.maximum, jnp.minimum))
+        np.where(convex, one(side, across), other(side, across))
+        for side, one, other in ((before, np.minimum, np.maximum), (after, np.maximum, np.minimum))
     )
     left, right = p1 + s * before, p2 - (1 - s) * after
-    corner = jnp.where(convex, jnp.maximum(left, right), jnp.minimum(left, right))
-    corner = jnp.clip(corner, jnp.minimum(p1, p2), jnp.maximum(p1, p2))
+    corner = np.where(convex, np.maximum(left, right), np.minimum(left, right))
+    corner = np.clip(corner, np.minimum(p1, p2), np.maximum(p1, p2))
     smooth = p1 + 0.5 * s * cubic
     return smooth + _sharp(p1 - p0, p3 - p2, EVEN) * (corner - smooth)
 
 
-def _sharp(left: jax.Array, right: jax.Array, even: float | jax.Array) -> jax.Array:
+def _around(values: np.ndarray, steps: np.ndarray | float) -> tuple[np.ndarray, ...]:
+    """Four neighbours of (T, N, C) read `steps` samples later, a number or (C,), and the fraction (C,)
+    between the middle two."""
+    steps = np.broadcast_to(steps, values.shape[2:])
+    whole, n = np.floor(steps).astype(int), values.shape[1]
+    index = np.arange(n)[:, None] + whole
+    each = (np.take_along_axis(values, np.clip(index + k, 0, n - 1)[None], axis=1) for k in (-1, 0, 1, 2))
+    return *each, steps - whole
+
+
+def _sharp(left: np.ndarray, right: np.ndarray, even: float) -> np.ndarray:
     """How surely (0 to 1) changes on both sides are those of a corner; both are alike below `even`.
 
     A force that rises and falls as fast has a crest there: at a corner one side is flatter than the other.
     """
-    left, right = jnp.abs(left), jnp.abs(right)
-    return jax.nn.sigmoid((jnp.abs(left - right) / (left + right + even) - SHARP) / 0.08)
+    left, right = np.abs(left), np.abs(right)
+    return expit((np.abs(left - right) / (left + right + even) - SHARP) / 0.08)
 
 
-def per_channel(values: jax.Array) -> jax.Array:
-    """Values (C,), or one, to go with (T, N, C)."""
-    return jnp.reshape(values, (1, 1, -1))
-
-
-def fivepoint(world: World, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+def fivepoint(world: World, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rate of change (T, N, C) from five samples, exact to fourth order, and from three."""
     near = gradient(world.t, values)
-    far = (values[:, 4:] - values[:, :-4]) / jnp.maximum(world.t[:, 4:] - world.t[:, :-4], 1e-6)[..., None]
-    far = jnp.concatenate([near[:, :2], far, near[:, -2:]], 1)
+    far = (values[:, 4:] - values[:, :-4]) / np.maximum(world.t[:, 4:] - world.t[:, :-4], 1e-6)[..., None]
+    far = np.concatenate([near[:, :2], far, near[:, -2:]], 1)
     return (4 * near - far) / 3, near
 
 
-def slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
+def slope(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rate of change (T, N, C) of forces from five samples, and by how much it is in doubt.
 
     Three samples alone take sin(w) for w [rad a sample]: a low-pass would come out too slow. Where a force
@@ -113,149 +106,108 @@ def slope(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
     J. Numer. Anal. 21, 1984): before a contact there is no force yet.
     """
     smooth, near = fivepoint(world, force)
-    side = (force[:, 1:] - force[:, :-1]) / jnp.maximum(world.t[:, 1:] - world.t[:, :-1], 1e-6)[..., None]
-    left, right = jnp.concatenate([side[:, :1], side], 1), jnp.concatenate([side, side[:, -1:]], 1)
+    side = (force[:, 1:] - force[:, :-1]) / np.maximum(world.t[:, 1:] - world.t[:, :-1], 1e-6)[..., None]
+    left, right = np.concatenate([side[:, :1], side], 1), np.concatenate([side, side[:, -1:]], 1)
     sharp = _sharp(left, right, EVEN / sampling_interval(world))
-    flatter = jnp.where(left * right > 0, jnp.where(jnp.abs(left) < jnp.abs(right), left, right), 0.0)
-    doubt = (1 - sharp) * jnp.abs(smooth - near) + sharp * jnp.abs(smooth - flatter)
+    flatter = np.where(left * right > 0, np.where(np.abs(left) < np.abs(right), left, right), 0.0)
+    doubt = (1 - sharp) * np.abs(smooth - near) + sharp * np.abs(smooth - flatter)
     return smooth + sharp * (flatter - smooth), doubt
 
 
-def sensed(world: World, force: jax.Array) -> tuple[jax.Array, jax.Array]:
+def sensed(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Net force, grip and shear (T, N, 4) behind each sensor's low-pass and delay, and their variance.
 
     The low-pass is exact between samples for straight lines. The variance is that of what is read between
     two samples: a contact may have changed before or after, for both fingers at once.
     """
 
-    def slow(f: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return lowpass(f, world.smoothing, sampling_interval(world)), _unsure(
-            f, world.smoothing, sampling_interval(world)
-        )
-
-    def late(f: jax.Array) -> tuple[jax.Array, jax.Array]:
-        steps = world.delay / sampling_interval(world)
-
-        def one(f: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-            _, old, new, _, ahead = _around(f, -steps)  # read (1 - ahead) of a sample after the later one
-            return old + ahead * (new - old), jnp.sqrt(ahead * (1 - ahead) + 1e-12) * EITHER * (new - old)
-
-        return jax.vmap(one, (2, 0), 2)(f, jnp.broadcast_to(steps, f.shape[2:]))
-
-    modes = jnp.asarray(world.modes)
-    prompt = (force, jnp.zeros_like(force))
-
-    def fingers(net: jax.Array) -> tuple[jax.Array, jax.Array]:
-        each = jnp.concatenate([net[..., :2] / 2 + net[..., 2:], net[..., :2] / 2 - net[..., 2:]], -1)
-        smooth, jumps = jax.lax.cond(modes[SMOOTH] > 0, slow, lambda f: (f, jnp.zeros_like(f)), each)
-        delayed, either = jax.lax.cond(modes[LATE] > 0, late, lambda f: (f, jnp.zeros_like(f)), smooth)
-        return net_forces(delayed), jumps + jnp.square(net_forces(either))
-
-    return jax.lax.cond(modes[SMOOTH] + modes[LATE] > 0, fingers, lambda f: prompt, force)
+    variance = np.zeros_like(force)
+    if not (world.modes[SMOOTH] or world.modes[LATE]):
+        return force, variance
+    each = np.concatenate([force[..., :2] / 2 + force[..., 2:], force[..., :2] / 2 - force[..., 2:]], -1)
+    step = sampling_interval(world)
+    if world.modes[SMOOTH]:
+        variance = variance + _unsure(each, world.smoothing, step)
+        each = lowpass(each, world.smoothing, step)
+    if world.modes[LATE]:
+        # Read (1 - ahead) of a sample after the later one.
+        _, old, new, _, ahead = _around(each, -world.delay / step)
+        either = np.sqrt(ahead * (1 - ahead) + 1e-12) * EITHER * (new - old)
+        each, variance = old + ahead * (new - old), variance + np.square(net_forces(either))
+    return net_forces(each), variance
 
 
-def when(world: World, mode: int, change: Callable[[jax.Array], jax.Array], values: jax.Array) -> jax.Array:
-    """Changed values where a candidate has the mode; else the change is not even evaluated."""
-    return jax.lax.cond(jnp.asarray(world.modes)[mode] > 0, change, lambda v: v, values)
-
-
-def _unsure(values: jax.Array, time: jax.Array, step: jax.Array) -> jax.Array:
+def _unsure(values: np.ndarray, time: np.ndarray, step: float) -> np.ndarray:
     """Variance (T, N, 4) of net force, grip and shear behind the low-pass of each finger's force (T, N, 4),
     from what may have changed at any moment between two samples, for both fingers at once."""
-    ratio = step / jnp.maximum(jnp.reshape(time, (1, 1, -1)), 1e-4)
-    share = (1 - jnp.exp(-2 * ratio)) / (2 * ratio) - jnp.square((1 - jnp.exp(-ratio)) / ratio)
-    change = jnp.concatenate([jnp.zeros_like(values[:, :1]), values[:, 1:] - values[:, :-1]], 1)
-    sd = EITHER * jnp.sqrt(jnp.maximum(share, 1e-12)) * change
-    return faded(jnp.square(net_forces(sd)), 2 * jnp.mean(ratio))
+    ratio = step / np.maximum(time, 1e-4)
+    share = (1 - np.exp(-2 * ratio)) / (2 * ratio) - np.square((1 - np.exp(-ratio)) / ratio)
+    change = np.concatenate([np.zeros_like(values[:, :1]), values[:, 1:] - values[:, :-1]], 1)
+    sd = EITHER * np.sqrt(np.maximum(share, 1e-12)) * change
+    return faded(np.square(net_forces(sd)), 2 * float(np.mean(ratio)))
 
 
-def doubt_between(world: World) -> jax.Array:
+def doubt_between(world: World) -> np.ndarray:
     """Variance (T, N, 4) [N^2] of forces before delay and low-pass, from how sharply they bend."""
-
-    def rough(f: jax.Array) -> jax.Array:
-        def one(f: jax.Array, steps: jax.Array) -> jax.Array:
-            p0, p1, p2, p3, share = _around(f, steps)
-            share = share * (1 - share)
-            bend = jnp.maximum(jnp.abs(p2 - 2 * p1 + p0), jnp.abs(p3 - 2 * p2 + p1))
-            # A change that neither side goes on with may have come at any moment between the two samples.
-            jump = jnp.maximum(jnp.abs(p2 - p1) - jnp.maximum(jnp.abs(p1 - p0), jnp.abs(p3 - p2)), 0.0)
-            return jnp.square(BETWEEN * share * bend) + share * jnp.square(EITHER * jump)
-
-        return jax.vmap(one, (2, 0), 2)(
-            f, jnp.broadcast_to(world.delay / sampling_interval(world), f.shape[2:])
-        )
-
-    def steep(f: jax.Array) -> jax.Array:
-        return jnp.square(CURVED * per_channel(world.smoothing) * slope(world, f)[1])
-
-    force = jnp.asarray(world.force)
-    late = jax.lax.cond(jnp.asarray(world.modes)[LATE] > 0, rough, jnp.zeros_like, force)
-    return late + jax.lax.cond(jnp.asarray(world.modes)[SMOOTH] > 0, steep, jnp.zeros_like, force)
+    out = np.zeros_like(world.force)
+    if world.modes[LATE]:
+        p0, p1, p2, p3, share = _around(world.force, world.delay / sampling_interval(world))
+        share = share * (1 - share)
+        bend = np.maximum(np.abs(p2 - 2 * p1 + p0), np.abs(p3 - 2 * p2 + p1))
+        # A change that neither side continues may have come at any moment between the two samples.
+        jump = np.maximum(np.abs(p2 - p1) - np.maximum(np.abs(p1 - p0), np.abs(p3 - p2)), 0.0)
+        out = np.square(BETWEEN * share * bend) + share * np.square(EITHER * jump)
+    if world.modes[SMOOTH]:
+        out = out + np.square(CURVED * world.smoothing * slope(world, world.force)[1])
+    return out
 
 
 # Mechanics with a memory: a mode that rings, a support that yields late, pads that creep.
 
 
-def sunk(world: World, load: jax.Array) -> jax.Array:
+def sunk(world: World, load: np.ndarray) -> np.ndarray:
     """How far (T, N) [m] the support yields to what it carries of a block's weight, with its delay.
 
     Before a grip it has settled under the block; it carries nothing of one that is in the air.
     """
+    if not world.modes[YIELDING]:
+        return world.give_support * load
+    from simgap.recursions import recursion
 
-    def sinking(load: jax.Array) -> jax.Array:
-        borne = load * (1 - world.carry)
-        ratio = sampling_interval(world) / jnp.maximum(world.support_time, 1e-4)
-        keep = jnp.exp(-ratio)
-        new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep
-        before = jnp.concatenate([borne[:, :1], borne[:, :-1]], 1)
-
-        def step(depth, now):
-            drive, borne, free, carry = now
-            depth = (1 - carry) * ((1 - free) * (keep * depth + drive) + free * borne)
-            return depth, depth
-
-        rows = tuple(z.T for z in (new * borne + old * before, borne, world.free, world.carry))
-        _, out = jax.lax.scan(step, borne[:, 0], rows)
-        return out.T
-
-    return world.give_support * when(world, YIELDING, sinking, load)
+    borne = load * (1 - world.carry)
+    ratio = sampling_interval(world) / np.maximum(world.support_time, 1e-4)
+    keep = np.exp(-ratio)
+    new, old = 1 - (1 - keep) / ratio, (1 - keep) / ratio - keep
+    drive = new * borne + old * np.concatenate([borne[:, :1], borne[:, :-1]], 1)
+    stays, free = (1 - world.carry) * (1 - world.free), (1 - world.carry) * world.free
+    return world.give_support * recursion(keep * stays, stays * drive + free * borne, borne[:, 0])
 
 
-def driven(world: World, force: jax.Array, back: bool) -> jax.Array:
+def driven(world: World, force: np.ndarray, back: bool) -> np.ndarray:
     """Loads (T, N, C) with the mode that their changes ring; `back`: the loads that rang to these readings.
 
     The load goes straight from sample to sample: exact in between, a step at a time.
     """
-    frequency, damping, drive = (jnp.asarray(world.ring)[k] for k in range(3))
-    # The mode as a complex number: (keep_r, keep_i) turns it by a step, (gain_r, gain_i) is what a unit of
-    # load, put on evenly over that step, rings it to: (keep - 1) / (fall + 1j turn).
-    angle = 2 * jnp.pi * frequency * sampling_interval(world)
-    fall, turn = -damping * angle, jnp.sqrt(jnp.maximum(1 - damping**2, 1e-6)) * angle
-    keep_r, keep_i = jnp.exp(fall) * jnp.cos(turn), jnp.exp(fall) * jnp.sin(turn)
-    size = fall**2 + turn**2
-    gain_r = ((keep_r - 1) * fall + keep_i * turn) / size
-    gain_i = (keep_i * fall - (keep_r - 1) * turn) / size
-
-    def step(state, now):
-        load, ring_r, ring_i = state
-        free_r = keep_r * ring_r - keep_i * ring_i - gain_r * load
-        free_i = keep_r * ring_i + keep_i * ring_r - gain_i * load
-        new = (now - drive * free_i) / (1 + drive * gain_i) if back else now
-        state = new, free_r + gain_r * new, free_i + gain_i * new
-        return state, new if back else new + drive * state[2]
-
-    start = force[:, 0], jnp.zeros_like(force[:, 0]), jnp.zeros_like(force[:, 0])
-    _, out = jax.lax.scan(step, start, jnp.moveaxis(force, 1, 0))
-    return jnp.moveaxis(out, 0, 1)
+    frequency, damping, drive = world.ring
+    # The mode as a complex number z: `keep` turns it by a step, `gain` is what a unit of load, put on evenly
+    # over that step, rings it to, so that z[k] = keep z[k-1] + gain (f[k] - f[k-1]); readings are
+    # f + drive Im z: a rational filter of loads, and its inverse.
+    rate = complex(-damping, np.sqrt(max(1 - damping**2, 1e-6))) * 2 * np.pi * frequency
+    rate *= sampling_interval(world)
+    keep = np.exp(rate)
+    gain = (keep - 1) / rate
+    poles = np.array([1.0, -2 * keep.real, abs(keep) ** 2])
+    ring = np.convolve([gain.imag, -(gain * keep.conjugate()).imag], [1.0, -1.0])
+    loads, rest = poles + drive * ring, force[:, :1]
+    top, bottom = (poles, loads) if back else (loads, poles)
+    return rest + np.asarray(lfilter(top, bottom, force - rest, axis=1))
 
 
-def relaxed(world: World, force: jax.Array) -> jax.Array:
+def relaxed(world: World, force: np.ndarray) -> np.ndarray:
     """Forces (T, N, 4) that would give the pads' displacement at once, for pads that creep."""
-
-    def crept(f: jax.Array) -> jax.Array:
-        return f + world.creep * (lowpass(f, world.creep_time, sampling_interval(world)) - f)
-
-    return when(world, CREEPING, crept, force)
+    if not world.modes[CREEPING]:
+        return force
+    return force + world.creep * (lowpass(force, world.creep_time, sampling_interval(world)) - force)
 
 
 # Grips: how firmly they hold, and values less what stays the same while one holds.
@@ -268,20 +220,20 @@ SLIDE = 2e-3  # prior: m; how far a pad may slide from one sample to the next
 ANYWHERE = 0.05  # prior: m; sd of where a grip takes its block
 
 
-def firmness(grip: jax.Array, held: jax.Array, moves: jax.Array, loose: float = LOOSE) -> jax.Array:
+def firmness(grip: np.ndarray, held: np.ndarray, moves: np.ndarray, loose: float = LOOSE) -> np.ndarray:
     """How surely (T, N) a grip's pads hold the block rather than slide on it as they close or let go."""
     mine = moves * held[..., None]
-    usual = jnp.einsum("tnm,tn->tm", mine, grip) / jnp.maximum(mine.sum(1), 1.0)
-    least = jnp.maximum(HELD, loose * jnp.einsum("tnm,tm->tn", moves, usual))
-    return jax.nn.sigmoid((grip / least - 1) * USUAL / (1 / loose - 1))
+    usual = (grip[:, None] @ mine)[:, 0] / np.maximum(mine.sum(1), 1.0)
+    least = np.maximum(HELD, loose * (moves @ usual[..., None])[..., 0])
+    return expit((grip / least - 1) * USUAL / (1 / loose - 1))
 
 
-def recorded(arrays: Arrays, channel: str) -> jax.Array:
+def recorded(arrays: Arrays, channel: str) -> np.ndarray:
     """Where (T, N) a channel's residual is defined and its signals were recorded."""
-    return jnp.asarray(arrays.there[..., CHANNELS.index(channel)])
+    return arrays.there[..., CHANNELS.index(channel)]
 
 
-def less_mean(values: jax.Array, arrays: Arrays, weight: jax.Array, place: jax.Array | None) -> jax.Array:
+def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray, place: np.ndarray | None) -> np.ndarray:
     """Values (T, N) less their weighted mean in every grip (pickup and place apart if `place` is given)."""
     parts = (
         [arrays.onehot]
@@ -290,59 +242,40 @@ def less_mean(values: jax.Array, arrays: Arrays, weight: jax.Array, place: jax.A
     )
     out = values
     for part in parts:
-        members = part * weight[..., None]
-        members = members / jnp.maximum(members.sum(1, keepdims=True), 1e-9)
-        out = out - jnp.einsum("tnm,tm->tn", part, jnp.einsum("tnm,tn->tm", members, values))
+        total = (weight[:, None] @ part)[:, 0]
+        mean = ((weight * values)[:, None] @ part)[:, 0] / np.maximum(total, 1e-9)
+        out = out - (part @ mean[..., None])[..., 0]
     return out * weight
 
 
 def in_grip(
-    values: jax.Array, firm: jax.Array, channel: str, arrays: Arrays, noise: jax.Array, world: World
-) -> tuple[jax.Array, jax.Array]:
+    values: np.ndarray, firm: np.ndarray, channel: str, arrays: Arrays, noise: np.ndarray, world: World
+) -> tuple[np.ndarray, np.ndarray]:
     """Values (T, N) that are one constant in every grip, less that constant; and their variance's factor.
 
     Where pads may slide the constant walks at random; the values are less its prediction from those before.
     """
     weight = firm * recorded(arrays, channel)
-    sd = noise[..., CHANNELS.index(channel)]
-
-    def followed(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _followed(values, weight, sd, world.slip, jnp.asarray(arrays.onehot))
-
-    def centred(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return less_mean(values, arrays, weight, None), jnp.ones_like(values)
-
-    return jax.lax.cond(jnp.asarray(world.modes)[SLIDING] > 0, followed, centred, values)
+    if world.modes[SLIDING]:
+        return _followed(values, weight, noise[..., CHANNELS.index(channel)], world.slip, arrays.onehot)
+    return less_mean(values, arrays, weight, None), np.ones_like(values)
 
 
 def _followed(
-    values: jax.Array, weight: jax.Array, sd: jax.Array, slip: jax.Array, grips: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, slip: np.ndarray, grips: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
 
     The state is where a grip holds its block; it walks by SLIDE from one sample to the next where pads slide
     at either. A grip's first value sets it and tells nothing.
     """
-    other = jnp.concatenate([jnp.ones_like(slip[:, :1]), 1 - (grips[:, 1:] * grips[:, :-1]).sum(-1)], 1)
-    before = jnp.concatenate([slip[:, :1], slip[:, :-1]], 1)
-    walk = jnp.square(jnp.maximum(slip, before) * SLIDE)
+    from simgap.recursions import innovations
 
-    def step(state, now):
-        place, variance, fresh = state
-        value, w, s, q, new = now
-        variance = jnp.where(new > 0.5, ANYWHERE**2, variance + q)
-        fresh = jnp.where(new > 0.5, 1.0, fresh)
-        factor = 1 + w * variance / s**2
-        miss = value - place
-        place = place + w * variance / (s**2 * factor) * miss
-        known = 1 - fresh
-        out = known * w * miss, 1 + known * (factor - 1)
-        return (place, variance / factor, fresh * (1 - w)), out
-
-    rows = [jnp.moveaxis(z, 1, 0) for z in (values, weight, sd, walk, other)]
-    start = (values[:, 0], jnp.full_like(values[:, 0], ANYWHERE**2), jnp.ones_like(values[:, 0]))
-    _, (out, factor) = jax.lax.scan(step, start, tuple(rows))
-    return jnp.moveaxis(out, 0, 1), jnp.moveaxis(factor, 0, 1)
+    other = np.ones(slip.shape, bool)
+    other[:, 1:] = (grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5
+    before = np.concatenate([slip[:, :1], slip[:, :-1]], 1)
+    walk = np.square(np.maximum(slip, before) * SLIDE)
+    return innovations(values, weight, sd, walk, other, ANYWHERE**2)
 
 
 TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
@@ -351,22 +284,21 @@ CLOSED = 0.8  # chosen: share of its usual force by which a grip has closed: unt
 
 
 def residuals(
-    world: World, arrays: Arrays, properties: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    world: World, arrays: Arrays, properties: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (T, N, C) in units of the channels, and how far their variance exceeds `noise` squared.
 
     `properties` (O, 3): weight, width, height. The variance's factor is 1 where the correction of an effect
     leaves nothing in doubt.
     """
-    own = jnp.einsum("tnm,mo,op->tnp", arrays.onehot, arrays.objects, properties)
-    weight, width = own[..., 0], own[..., 1]
-    rise = jnp.einsum("tnm,mo,o->tn", arrays.onehot, arrays.rises, properties[:, 2])
+    weight, width = np.moveaxis(arrays.onehot @ (arrays.objects @ properties[:, :2]), -1, 0)
+    rise = arrays.onehot @ (arrays.rises @ properties[:, 2])
     position, velocity = tips(world)
     force = contact(world)
     pads = relaxed(world, force)
     x1, y1, x2, y2 = (position[..., k] for k in range(4))
     fx1, fy1, fx2, fy2 = (pads[..., k] for k in range(4))
-    couple = world.couple * weight / jnp.maximum(width, 1e-3) * world.carry
+    couple = world.couple * weight / np.maximum(width, 1e-3) * world.carry
     fy1, fy2 = fy1 + couple, fy2 - couple
     (n1, n2), (s1, s2) = world.give_normal, world.give_shear
 
@@ -377,20 +309,20 @@ def residuals(
     late = (pads - force)[..., 0] * n1 - (pads - force)[..., 2] * n2
     # A distance known to so much says nothing of a lighter touch: its noise would come out as force.
     unsure = SURE * arrays.sd[..., CHANNELS.index("distance")]
-    touching = TOUCH * jax.nn.softplus(-(gap + late + unsure * world.free) / TOUCH)
+    touching = TOUCH * np.logaddexp(0.0, -(gap + late + unsure * world.free) / TOUCH)
     held = world.ground + world.carry
-    firm = firmness(0.5 * (force[..., 0] - force[..., 2]), held, jnp.asarray(arrays.onehot))
+    firm = firmness(0.5 * (force[..., 0] - force[..., 2]), held, arrays.onehot)
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
-    place = jnp.asarray(arrays.phase[..., Phase.PLACE])
+    place = arrays.phase[..., Phase.PLACE]
     offset = block_offset(y2 - y1, fy1, fy2, pads_give)
     x = block_x((x1 + x2) / 2, fx1, fx2, pads_give)
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
-    y = y - jnp.tan(world.tilt) * (x1 + x2) / 2 - rise * place
+    y = y - np.tan(world.tilt) * (x1 + x2) / 2 - rise * place
     # Fingers that close push the block and slide on it until both hold it: only then it rests.
-    lesser = jnp.minimum(force[..., 0], -force[..., 2])
-    both = firmness(lesser, held, jnp.asarray(arrays.onehot), CLOSED)
+    lesser = np.minimum(force[..., 0], -force[..., 2])
+    both = firmness(lesser, held, arrays.onehot, CLOSED)
     closed = firm * both
     still = closed * (arrays.phase[..., Phase.PICKUP] + place)
     offset, loose_offset = in_grip(offset, closed * held, "offset", arrays, noise, world)
@@ -404,52 +336,57 @@ def residuals(
     net_x = carry * mass * ax + ground * (force[..., 0] + force[..., 2])
     net_y = carry * (weight + mass * ay) + ground * (force[..., 1] + force[..., 3])
     half = (force[..., 0] - force[..., 2]) / 2, (force[..., 1] - force[..., 3]) / 2
-    free = touching / jnp.maximum(n1 + n2, 2e-4) * world.free
-    expected = jnp.stack([net_x, net_y, held * half[0] + free, held * half[1]], -1) + net_forces(world.load)
+    free = touching / np.maximum(n1 + n2, 2e-4) * world.free
+    expected = np.stack([net_x, net_y, held * half[0] + free, held * half[1]], -1) + net_forces(world.load)
     filtered, either = sensed(world, expected)
-    filtered = when(world, RINGING, lambda f: driven(world, f, back=False), filtered)
+    if world.modes[RINGING]:
+        filtered = driven(world, filtered, back=False)
     forces = (net_forces(world.force) - filtered) * world.loudness
 
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     speeds = _compact(mean_v) - gradient(world.t, mean_p)
-    geometry = jnp.stack([x, y, distance * held, offset], -1)
+    geometry = np.stack([x, y, distance * held, offset], -1)
     # In the units of what was recorded: an effect must not gain by scaling the noise down.
-    size = jnp.mean(world.link)
-    loose = jnp.stack([jnp.ones_like(x), loose_y, jnp.ones_like(x), loose_offset], -1)
-    factor = loose + _doubt(world, firm) / jnp.square(noise[..., :4])
+    size = np.mean(world.link)
+    loose = np.stack([np.ones_like(x), loose_y, np.ones_like(x), loose_offset], -1)
+    factor = loose + _doubt(world, firm) / np.square(noise[..., :4])
     return (
-        jnp.concatenate([geometry / size, speeds / size, forces], -1),
-        jnp.concatenate([factor, jnp.ones_like(speeds), 1 + either / jnp.square(noise[..., 6:])], -1),
+        np.concatenate([geometry / size, speeds / size, forces], -1),
+        np.concatenate([factor, np.ones_like(speeds), 1 + either / np.square(noise[..., 6:])], -1),
     )
 
 
-def _doubt(world: World, firm: jax.Array) -> jax.Array:
+def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
     """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of angles and forces."""
-    turn_x, turn_y = (jnp.where(world.jointed > 0.5, turn, 0.0) for turn in swung(world))
+    if not (world.doubt_joints.any() or world.modes[LATE] or world.modes[SMOOTH]):
+        return np.zeros((*firm.shape, 4))
+    turn_x, turn_y = (np.where(world.jointed > 0.5, turn, 0.0) for turn in swung(world))
     pads = doubt_between(world)
 
-    def finger(turn: jax.Array, give: jax.Array, force: int) -> tuple[jax.Array, jax.Array]:
-        place = jnp.square(turn) * world.doubt_joints
-        pad = pads[..., force::2] * jnp.square(give)[None, None, :]
+    def finger(turn: np.ndarray, give: np.ndarray, force: int) -> tuple[np.ndarray, np.ndarray]:
+        place = np.square(turn) * world.doubt_joints
+        pad = pads[..., force::2] * np.square(give)
         return (place[..., :2].sum(-1) + pad[..., 0]), (place[..., 2:].sum(-1) + pad[..., 1])
 
     (x1, x2), (y1, y2) = finger(turn_x, world.give_normal, 0), finger(turn_y, world.give_shear, 1)
     x, y = x1 + x2, y1 + y2
-    return jnp.stack([x / 4, y / 4, x, y], -1) * jnp.square(firm)[..., None]
+    return np.stack([x / 4, y / 4, x, y], -1) * np.square(firm)[..., None]
 
 
-def _compact(v: jax.Array) -> jax.Array:
+def _compact(v: np.ndarray) -> np.ndarray:
     """(v[k-1] + 4 v[k] + v[k+1]) / 6, the mean velocity that central differences have to fourth order."""
     inner = (v[:, :-2] + 4 * v[:, 1:-1] + v[:, 2:]) / 6
-    return jnp.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
+    return np.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
 
 
-def contact(world: World) -> jax.Array:
+def contact(world: World) -> np.ndarray:
     """Forces (T, N, 4) of the contacts: before delay and low-pass, before they rang a mode, without loads."""
-    force = when(world, RINGING, lambda f: driven(world, f, back=True), world.force)
-    force = when(world, LATE, lambda f: shifted(f, world.delay / sampling_interval(world)), force)
-    return (
-        when(world, SMOOTH, lambda f: f + per_channel(world.smoothing) * slope(world, f)[0], force)
-        - world.load
-    )
+    force = world.force
+    if world.modes[RINGING]:
+        force = driven(world, force, back=True)
+    if world.modes[LATE]:
+        force = shifted(force, world.delay / sampling_interval(world))
+    if world.modes[SMOOTH]:
+        force = force + world.smoothing * slope(world, force)[0]
+    return force - world.load

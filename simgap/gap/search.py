@@ -1,4 +1,4 @@
-"""Every candidate fitted to aligned trials; boundaries taken anew without what displaced them."""
+"""Every candidate fitted to aligned trials; boundaries realigned without what displaced them."""
 
 from __future__ import annotations
 
@@ -156,11 +156,11 @@ def moved(before: AlignedTrials, after: AlignedTrials) -> float:
     return max(shifts)
 
 
-SHIFT = 0.008  # chosen: s; boundaries that move farther are taken anew
+SHIFT = 0.008  # chosen: s; boundaries that move farther are realigned
 ROUNDS = 2  # numerics: times at most
 ATTEMPTS = 3  # numerics: leading candidates that are taken out in turn where no trial fits its task
 HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
-WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be taken anew without it
+WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be realigned without it
 Identified = Mapping[tuple[str, str], float]
 
 

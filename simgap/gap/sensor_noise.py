@@ -184,7 +184,7 @@ def motion_doubt(
     """How far (N, C) residuals are off beyond noise where motion is not what equations take it for, sd.
 
     Fingers that push a block move it, and speeds that change within a sample, as that of a pressed fingertip
-    that is let go, no rule gives; while pads give way quickly, their damping bears a part of the force.
+    that is released, no rule gives; while pads give way quickly, their damping bears a part of the force.
     Samples are means over `group` finer ones.
     """
     root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))

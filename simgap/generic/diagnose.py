@@ -52,7 +52,7 @@ from simgap.progress import Progress, silent
 
 MODERATION = 4.0  # prior: degrees of freedom that a cell's mean variance is worth
 LATE = 0.02  # numerics: s; a small delay
-PACE = 0.02  # chosen: of a duration: clocks repeat themselves exactly, and nobody minds less
+PACE = 0.02  # chosen: of a duration: clocks repeat themselves exactly, and less does not matter
 NOTHING = 1e-6  # numerics: of a channel's scale: no sd is smaller
 EXCHANGES = 20  # numerics: of labels, at most
 NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm

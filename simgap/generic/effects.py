@@ -1,7 +1,7 @@
 """What effects that need no contact model do to simulated trials, and a ring found in recorded ones.
 
 Each acts in one channel on the mean simulated course and on the simulated trials, whose spectra are then
-taken anew, or on durations. A channel has the effects of `simgap.channels`, from the true value outwards;
+recomputed, or on durations. A channel has the effects of `simgap.channels`, from the true value outwards;
 vibration and noise are added to what they give.
 """
 

@@ -70,7 +70,7 @@ class Session:
         return PlayedWorld(self.task, self.rig, self.blocks, self.x, self.nominal.start, effects)
 
     def beside(self, world: PlayedWorld | None) -> None:
-        """Run another world next to the nominal one, or none; both begin anew."""
+        """Run another world next to the nominal one, or none; both restart."""
         self.other = world
         self.reset()
 
@@ -80,7 +80,7 @@ class Session:
         return [self.nominal] if self.other is None else [self.nominal, self.other]
 
     def reset(self) -> None:
-        """Everything back to the start; the recording begins anew."""
+        """Everything back to the start; the recording restarts."""
         for world in self.worlds:
             world.reset()
         self.command, self.rate = self.nominal.start.copy(), np.zeros((2, 2))

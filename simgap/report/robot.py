@@ -55,7 +55,7 @@ def own_units(loaded: Loaded | None) -> dict[str, Own]:
 @dataclass(frozen=True)
 class Course:
     """One channel of one log, (n,) at times `t` [s], in its column's own unit: recorded, simulated as the
-    model came and with what was found; NaN where a simulation is begun anew."""
+    model came and with what was found; NaN where a simulation restarts."""
 
     log: str
     channel: str

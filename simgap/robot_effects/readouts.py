@@ -37,7 +37,7 @@ WORDS = {
         "Check how the markers' frame was laid on the body.",
     ),
     "pose.offset": (
-        "a tracked point beside the body's origin",
+        "a tracked point off the body's origin",
         "Measure from the tracked point to the body's origin.",
     ),
 } | {f"readout.{n}": (e.called, e.check) for n, e in channel_effects().items()}
@@ -106,12 +106,12 @@ def of_pose(body: str, columns: Mapping[str, str]) -> Iterator[RobotEffect]:
     yield _of_columns(
         f"pose:{body}.turned", "the frame that is read is turned against the body's", angles, turned
     )
-    says = "the point that is read lies beside the body's origin, fixed to the body"
+    says = "the point that is read is off the body's origin, fixed to the body"
     yield _of_columns(f"pose:{body}.offset", says, {a: Parameter(0.0, 0.003, "m") for a in PLACE}, offset)
 
 
 def _shifted(columns: Channels, place: Sequence[str], turn: Sequence[str], arm: np.ndarray) -> Channels:
-    """Places of a point that lies by an arm (3,) in the body's frame beside that of `columns`."""
+    """Places of a point at an offset (3,) in the body's frame from that of `columns`."""
     moved = rotated(np.array([columns[n] for n in turn]), arm)
     return {n: columns[n] + d for n, d in zip(place, moved, strict=True)}
 

@@ -56,7 +56,7 @@ def read_recording(
 
     `times` is the name of the time column, `unit` its size [s]; `commands` are held from sample to sample.
     Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept; a column
-    `acts`, where it is asked for, says when each row's commands were given.
+    `acts`, where it is requested, says when each row's commands were given.
     InputError names the file and the row or column at fault: a column that is missing, a cell that is no
     number, a clock that goes back or cannot be in this unit.
     """

@@ -63,7 +63,7 @@ def load_simulator(spec: str) -> UserSimulator:
     path = Path(file)
     if not path.is_file():
         raise InputError(where, f"no such file {file}", "a Python file")
-    module_name = f"hmmseg_simulator_{path.stem}"  # a file called scipy.py does not stand in for SciPy
+    module_name = f"hmmseg_simulator_{path.stem}"  # a file called scipy.py does not replace SciPy
     module_spec = importlib.util.spec_from_file_location(module_name, path)
     if module_spec is None or module_spec.loader is None:
         raise InputError(where, f"{file} is no Python file", "FILE.py:NAME")

@@ -1,4 +1,4 @@
-"""Animation of fingers and blocks beside their force traces, as a GIF or an MP4."""
+"""Animation of fingers and blocks next to their force traces, as a GIF or an MP4."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ class _Performer:
         return self.draw(name) / self.pace * max(1.0, way / usual)
 
     def begin(self, name: str) -> None:
-        """Wait open, above and beside the first block."""
+        """Wait open, above and next to the first block."""
         self.x = _Coordinate(self.table.x[name] + self.rng.uniform(-0.02, 0.02))
         self.y = _Coordinate(self.table.top() + self.rng.uniform(0.012, 0.022))
         self.gap = _Coordinate(self.blocks[name].width + self.draw("clearance"))

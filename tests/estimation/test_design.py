@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from estimation.design import UNLIKE, _combined, build, unexpected_bias
+from estimation.design import UNLIKE, _combined, build, simplest_combinations, unexpected_bias
 from estimation.observations import aligned_weights
 from estimation.posterior import find_mode, posterior
 from experiments.worlds import simulated_cases
@@ -97,26 +99,16 @@ def test_slopes_show_a_pads_compliance_itself(design):
         np.testing.assert_allclose(design.mean[mine] / np.sqrt(design.variance[mine]), 0.0, atol=3.0)
 
 
-def test_a_joint_offset_moves_the_tip_by_the_jacobian(design, case, aligned):
-    """dx1/dq11 = -L1 sin q11; finger 1 further right makes the distance shorter."""
-    offset = shift(design, "joint_offset.q11", 1)
-    length = case.rig.finger(1).links[0]
+@pytest.mark.parametrize(("name", "lever"), [("joint_offset.q11", np.sin), ("link_length.11", np.cos)])
+def test_joints_and_links_move_the_tip_by_the_jacobian(design, case, aligned, name, lever):
+    """dx1/dq11 = -L1 sin q11, and dx1/de = L1 cos q11 of a link (1 + e) L1 long, which the nominal hand reads
+    less; finger 1 further right makes the distance shorter."""
+    found, length = shift(design, name, 1), case.rig.finger(1).links[0]
     for i in range(2):
         q = case.trials[i].channels["q11"]
         for m in (0, 1):
-            expected = mean_over_grip(aligned, i, m, "distance", length * np.sin(q))
-            assert offset[i, m] == pytest.approx(expected, rel=1e-3)
-
-
-def test_a_longer_link_moves_the_tip_in_proportion(design, case, aligned):
-    """The true link is (1 + e) of the nominal: the nominal hand reads what is e L cos q less."""
-    link = shift(design, "link_length.11", 1)
-    length = case.rig.finger(1).links[0]
-    for i in range(2):
-        q = case.trials[i].channels["q11"]
-        for m in (0, 1):
-            expected = mean_over_grip(aligned, i, m, "distance", length * np.cos(q))
-            assert link[i, m] == pytest.approx(expected, rel=1e-3)
+            expected = mean_over_grip(aligned, i, m, "distance", length * lever(q))
+            assert found[i, m] == pytest.approx(expected, rel=1e-3)
 
 
 def test_shares_of_model_error_are_taken_of_the_pads_give(design, case):
@@ -219,3 +211,31 @@ def test_alignments_are_combined_by_rubins_rule():
         assert mean[k] == pytest.approx(values.mean())
         assert total[k] == pytest.approx(variance[0, mine, k, 0].mean() + between)
     assert row == pytest.approx(np.ones((2, 1)))
+
+
+NAMES = ("a", "b", "c", "d")
+
+
+def matrix(rows):
+    return np.array([[row.get(name, 0) for name in NAMES] for row in rows], float).reshape(-1, len(NAMES))
+
+
+def test_coefficients_are_coprime_with_the_first_positive():
+    assert simplest_combinations([{"a": -2, "b": -4}], NAMES) == [{"a": 1, "b": 2}]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.lists(st.integers(-1, 1), min_size=4, max_size=4), max_size=6))
+def test_they_span_what_the_rises_span_and_single_out_what_is_determined(values):
+    rises = [{name: v for name, v in zip(NAMES, row, strict=True) if v} for row in values]
+    found = simplest_combinations(rises, NAMES)
+    given_rows, rows = matrix(rises), matrix(found)
+    rank = np.linalg.matrix_rank(given_rows) if len(given_rows) else 0
+    assert len(found) == rank
+    assert np.linalg.matrix_rank(np.concatenate([given_rows, rows])) == rank
+    _, singular, vt = np.linalg.svd(given_rows, full_matrices=True)
+    null = vt[int((singular > 1e-9).sum()) :]
+    determined = {
+        n for n, column in zip(NAMES, null.T, strict=True) if np.abs(column).max(initial=0.0) < 1e-9
+    }
+    assert {n for row in found if len(row) == 1 for n in row} == determined

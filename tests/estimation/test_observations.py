@@ -46,11 +46,6 @@ def test_weights_are_those_of_the_student_location():
     assert weights[40] == 0 and weights[3] < 0.02 * np.median(weights[inside])
 
 
-def test_nothing_recorded_has_no_weight():
-    weights, residual, centre = robust_weights(np.full(4, np.nan), np.ones(4, bool), 1.0)
-    assert not weights.any() and np.isnan(residual).all() and np.isnan(centre)
-
-
 @pytest.mark.parametrize("noise", ["gaussian", "student"])
 def test_sampling_variance_of_the_mean_against_monte_carlo(noise):
     """The sandwich estimate predicts how the weighted mean of a grip scatters from grip to grip."""
@@ -65,7 +60,10 @@ def test_sampling_variance_of_the_mean_against_monte_carlo(noise):
     assert predicted == pytest.approx(np.var(centres), rel=0.1)
 
 
-def test_noise_of_a_channel_without_residuals_is_its_scale():
+def test_without_residuals_nothing_has_weight_and_noise_is_white_and_as_stated():
+    weights, residual, centre = robust_weights(np.full(4, np.nan), np.ones(4, bool), 1.0)
+    assert not weights.any() and np.isnan(residual).all() and np.isnan(centre)
+    assert autocorrelation_time([np.array([1.0, -0.5])]) == 1.0
     noise = learned({"force": [(np.array([np.nan]), np.array([1.0]))]}, {"force": 0.3}, {})
     assert noise.variance["force"] == pytest.approx(0.09) and noise.count["force"] == 1.0
 
@@ -103,10 +101,6 @@ def test_means_of_differentiated_noise_are_better_than_of_white_noise():
     rng = np.random.default_rng(3)
     series = list(np.diff(rng.normal(size=(40, 101)), axis=1))
     assert autocorrelation_time(series) == MIN_STRETCH
-
-
-def test_short_series_are_taken_as_white():
-    assert autocorrelation_time([np.array([1.0, -0.5])]) == 1.0
 
 
 def test_every_sample_belongs_to_one_subtask():

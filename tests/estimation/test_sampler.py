@@ -125,12 +125,6 @@ def test_the_same_seed_draws_the_same(post, draws):
     assert not np.array_equal(other.chain[:, :10], draws.chain[:, :10])
 
 
-def test_progress_is_told(post):
-    told = []
-    sample(post, 0, lambda steps, of: told.append((steps, of)))
-    assert [s for s, _ in told] == sorted(s for s, _ in told) and told[0][0] > 0
-
-
 def test_density_of_the_proposal_integrates_to_one(post, mode):
     """The mean of p / q over q's draws, p a Gaussian narrower than q, is 1."""
     found = proposal(post, mode)
@@ -157,10 +151,6 @@ def test_the_worst_parameter_counts():
     good, bad = ar1((20, 2000), 0.0, rng), ar1((20, 2000), 0.8, rng)
     both = effective_sample_size(np.concatenate([good, bad], axis=2))
     assert both == pytest.approx(effective_sample_size(bad))
-
-
-def test_a_frozen_chain_has_no_effective_samples():
-    assert effective_sample_size(np.ones((8, 100, 2))) == 0.0
 
 
 def test_rhat_against_its_definition_and_drift():

@@ -1,7 +1,5 @@
 """The blind check: its simulator obeys physics, its seal holds, its scorer counts rightly."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The blind check's score, on results made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What becomes of a diagnosis in a drawn lab, and its table."""
 
-from __future__ import annotations
-
 import pytest
 
 from experiments import gap_drawn
@@ -43,27 +41,27 @@ def test_outcomes(tier, found, expected):
     assert outcome({"tier": tier, "effects": effects}, found) == expected
 
 
-def test_the_table_counts_what_gains_enough(monkeypatch):
-    def case(tier: str, effect: str, verdict: str, causes: list[str], gain: float) -> dict:
-        found = {"verdict": verdict, "causes": causes, "indistinguishable": [], "gains": {effect: gain},
-                 "detection": {"p_value": 0.5}, "seconds": 10.0}  # fmt: skip
-        return row({"case": "c", "tier": tier, "effects": [effect]}, found)
+def test_the_table_counts_by_run(monkeypatch):
+    def case(tier: str, effects: list[str], verdict: str, causes: list[str], held_out: float) -> dict:
+        found = {"verdict": verdict, "causes": causes, "indistinguishable": [], "seconds": 10.0,
+                 "shrinkage": {"fraction": held_out}}  # fmt: skip
+        return row({"case": "c", "tier": tier, "effects": effects}, found)
 
     rows = [
-        case("healthy", "none", "none", [], 0.0),
-        case("healthy", "none", "named", ["force_bias"], 0.0),
-        case("single", "force_bias", "named", ["force_bias"], 100.0),
-        case("single", "force_bias", "named", ["force_gain"], 100.0),
-        case("single", "force_bias", "none", [], 0.1),  # need not be seen
+        case("healthy", ["none"], "none", [], 0.0),
+        case("healthy", ["none"], "named", ["force_bias"], 0.1),
+        case("single", ["force_bias"], "named", ["force_bias"], 0.9),
+        case("single", ["force_bias"], "named", ["force_gain"], 0.5),
+        case("pair", ["force_bias", "force_lag"], "named", ["force_lag"], 0.5),
     ]
-    found = {"rows": rows, "seed": 1, "made_by": "abc"}
-    monkeypatch.setattr(gap_drawn, "load", lambda name: found)
+    monkeypatch.setattr(gap_drawn, "load", lambda name: {"runs": {"before": rows[:1], "now": rows}})
     text = gap_drawn.table()
     assert text is not None
-    lines = {
-        line.split("|")[1].strip(): line.split("|")[3].strip() for line in text.splitlines() if "|" in line
-    }
-    assert lines["false alarms on healthy recordings"] == "1 of 2"
-    assert lines["single effects named, no other beside them"] == "1 of 2"
-    assert lines["another name"] == "1 of 2"
-    assert "force_bias (wrong name: force_gain)" in text
+    cells = {line.split("|")[1].strip(): line.split("|")[2:4] for line in text.splitlines() if "|" in line}
+    counts = {name: [cell.strip() for cell in pair] for name, pair in cells.items()}
+    assert counts["healthy: none"] == ["1 of 1", "1 of 2"]
+    assert counts["single: named alone"] == ["0 of 0", "1 of 2"]
+    assert counts["single: another name"] == ["0 of 0", "1 of 2"]
+    assert counts["pairs: one of both"] == ["0 of 0", "1 of 1"]
+    assert counts["named with a held-out share below 0.3"] == ["0 of 0", "1 of 4"]
+    assert "c force_bias (wrong name: force_gain)" in text

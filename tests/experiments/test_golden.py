@@ -1,7 +1,5 @@
 """Published results stay what they are: recordings/ and made-up ensembles against tests/data/golden."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.real import hiro_snap, kth_handover
+from experiments.real import hiro_snap
 from hmmseg.errors import InputError
 
 
@@ -24,21 +24,6 @@ def test_malformed_snap_trials_are_refused(tmp_path):
         (tmp_path / name).write_text("0 1 2\n1 2 3\n")
     with pytest.raises(InputError, match="has 3 columns; expected t and six more"):
         hiro_snap.read_trial(tmp_path)
-
-
-def test_height_events():
-    t = np.arange(600) / 120
-    height = np.interp(t, [0, 1.0, 2.0, 3.0, 4.0, 4.5, 4.9], [0.8, 0.8, 1.0, 1.0, 0.8, 0.8, 1.1])
-    lift, down = kth_handover.height_events(t, height, 0.01)
-    assert lift == pytest.approx(1.05, abs=0.02)
-    assert down == pytest.approx(3.95, abs=0.02)
-
-
-@pytest.mark.slow
-def test_handovers_agree_with_the_height(shared):
-    for row in kth_handover.run(shared / "real/kth_handover")["recordings"]:
-        for event in ("lift_off", "put_down"):
-            assert abs(row[event]["force"] - row[event]["height"]) <= 0.2, (row["recording"], event)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -75,8 +76,8 @@ def test_a_folder_without_cases_is_refused(tmp_path):
         list_cases(tmp_path)
 
 
-def test_the_rules_on_the_paper_s_blocks(shared):
-    folder = shared / "recordings/paper_blocks"
+def test_the_rules_on_the_paper_s_blocks():
+    folder = Path(__file__).resolve().parents[2] / "recordings/paper_blocks"
     assert list_cases(folder) == [folder]
     case = read_case(folder)
     assert case.healthy and case.blocks["block1"]["weight"] == (0.343, 0.0005)

@@ -2,16 +2,13 @@
 
 import re
 from pathlib import Path
-from pkgutil import resolve_name
 
 import numpy as np
 import pytest
 
-from experiments.ablation import SPECIAL
-from experiments.estimates import Estimates, summarise_estimates
-from experiments.patch_heldout import table as patched
-from experiments.table_gap import fresh
-from experiments.table_real import real
+from experiments.blind_check.tables import fresh
+from experiments.calibration import Estimates, summarise_estimates
+from experiments.real import hiro_snap
 from experiments.table_text import as_csv, covered, markdown
 from experiments.worlds import Deviations, deviated, scene, simulated_cases
 from experiments.write_tables import TABLES, fill
@@ -55,10 +52,6 @@ def test_a_table_becomes_comma_separated_values():
     assert as_csv(text) == 'Pooled\na,b\n"1, 2",c\nnote\n'
 
 
-def test_what_the_ablation_switches_off_is_there():
-    assert all(callable(resolve_name(where)) for off in SPECIAL.values() for where, _ in off)
-
-
 def test_markdown_and_coverage():
     assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
     assert covered({"c": 0.9, "c_se": 0.0123}, "c") == "90.0 ± 1.2 %"
@@ -77,18 +70,14 @@ def snap_results():
 
 
 def test_real_recordings_stand_beside_the_predictor_without_ears(monkeypatch):
-    handover = {"lift_off": {"force": 2.0, "height": 1.98}, "put_down": {"force": 5.0, "height": 5.1}}
-    people = {"clearance": 0.01, "recordings": [{"recording": "P1", **handover}]}
-    found = {"hiro_snap": snap_results(), "kth_handover": people}
-    monkeypatch.setattr("experiments.table_real.load", found.get)
-    table = real() or ""
+    monkeypatch.setattr(hiro_snap, "load", {"hiro_snap": snap_results()}.get)
+    table = hiro_snap.table() or ""
     assert "7 guarded, 7 pivoting trials, 2 random crops of up to 3 s" in table
     assert "| guarded | none: answers the training mean | 1500 ms | 1400 ms |" in table
     row = "| pivoting | force and torque alone; no labels | 200 ms, 600 ms, 100 % | 400 ms, 800 ms, 50 % |"
     assert row in table
-    assert "| P1 | +20 ms | -100 ms |" in table
-    monkeypatch.setattr("experiments.table_real.load", {}.get)
-    assert real() is None
+    monkeypatch.setattr(hiro_snap, "load", {}.get)
+    assert hiro_snap.table() is None
 
 
 def test_coverages_have_clusters_as_their_units():
@@ -151,23 +140,7 @@ def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
 
 def test_a_spent_blind_set_is_no_result(monkeypatch):
     seals = {"blind_check": {"seal": {"sha256": "a"}}, "blind_sets": {"sets": [{"seal": "a"}]}}
-    monkeypatch.setattr("experiments.table_gap.load", seals.get)
+    monkeypatch.setattr("experiments.blind_check.tables.load", seals.get)
     assert fresh() is None
     seals["blind_sets"] = {"sets": [{"seal": "b"}]}
     assert fresh() is seals["blind_check"]
-
-
-def test_patched_models_show_what_they_leave(monkeypatch):
-    named = {
-        "recording": "a",
-        "verdict": "named",
-        "causes": ["force_bias"],
-        "nominal": 0.2,
-        "patched": 0.0512,
-    }
-    quiet = {"recording": "b", "verdict": "none", "causes": []}
-    monkeypatch.setattr("experiments.patch_heldout.load", {"patch_heldout": {"rows": [named, quiet]}}.get)
-    table = patched() or ""
-    assert "| a | force_bias | 0.200 | 0.051 |" in table and "| b | none |  |  |" in table
-    monkeypatch.setattr("experiments.patch_heldout.load", {}.get)
-    assert patched() is None

@@ -1,10 +1,14 @@
-"""Boundary posteriors against analytic roots and Monte Carlo over the model they assume."""
+"""When contacts change: densities against roots, quadrature and Monte Carlo over the model they assume."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
+from hmmseg import Rig, Trial, align, example_folder
+from hmmseg.hand.signals import task_space
 from hmmseg.segmentation.boundaries import (
     LAUNCH,
     MOTION,
@@ -21,6 +25,17 @@ from hmmseg.segmentation.boundaries import (
     crossing_density,
     first_of,
 )
+from hmmseg.segmentation.changes import (
+    Change,
+    Penetration,
+    Prior,
+    disagreements,
+    log_contact,
+    moment,
+    switch_probability,
+)
+from hmmseg.segmentation.pads import Compliance, Sensing
+from hmmseg.segmentation.posteriors import contacts
 
 WIDTH = 0.05
 NODES = (np.arange(POINTS) + 0.5) / POINTS * WIDTH
@@ -111,12 +126,6 @@ def test_combine_weighs_intervals_and_keeps_their_shapes():
     assert posterior.mean == pytest.approx(0.25 * 0.15 + 0.75 * 0.275, abs=1e-4)
     variance = 0.25 * (0.15**2 + 0.1**2 / 12) + 0.75 * 0.275**2 - posterior.mean**2 + ONSET**2
     assert posterior.sd == pytest.approx(np.sqrt(variance), rel=0.01)
-
-
-def test_combined_posteriors_stay_inside_the_recording():
-    t = np.array([0.0, 1e-3, 2e-3])
-    posterior = combine(t, np.array([1.0, 0.0]), {})
-    assert posterior.times.min() >= 0.0 and posterior.times.max() <= 2e-3
 
 
 def coverage(draw, rng, num=600):
@@ -251,3 +260,153 @@ def test_one_motion_is_no_less_certain_for_what_several_could_do():
     c = linear(0.03, 0.02, "impact", sd=2e-5)
     one, either = (crossing_density([replace(c, restless=q)], WIDTH) for q in (0.0, 0.1))
     assert np.abs(np.cumsum(one) - np.cumsum(either)).max() < 0.05
+
+
+def sensed(p, sd_pressed=3e-6, sd_place=3e-5, seed=0, **others):
+    """A contact of known penetration, with noise."""
+    rng = np.random.default_rng(seed)
+    pressed = np.maximum(p, 0) + sd_pressed * rng.standard_normal(p.size)
+    place = p + sd_place * rng.standard_normal(p.size)
+    rate = np.gradient(p, 0.05)
+    made = {"pressed": pressed, "place": place} | others
+    return Penetration(np.arange(p.size) * 0.05, made["pressed"], made["place"], rate, sd_pressed,
+                       sd_pressed, sd_place, 3e-3, 0.0)  # fmt: skip
+
+
+APPROACH = np.linspace(-1.17e-3, 0.93e-3, 22)
+
+
+@pytest.mark.parametrize("pressed, place", [(4e-5, 2e-5), (1e-6, -5e-5), (0.0, 2e-5)])
+def test_weights_of_contact_are_integrals_over_the_penetration(pressed, place):
+    # With Gaussian tails near the mode: Student-t residuals agree to a factor that both sides share.
+    c = sensed(np.array([place, 3e-4]), pressed=np.array([pressed, 3e-4]), place=np.array([place, 3e-4]))
+    contact, none = log_contact(c, making=True)
+
+    def joint(p):
+        return norm.pdf(place, p, c.sd_place) * norm.pdf(pressed, p, c.sd_pressed)
+
+    held = quad(joint, 0, 3e-4, points=[pressed])[0]
+    apart = norm.pdf(pressed, 0, c.sd_pressed) * norm.cdf(-place / c.sd_place)
+    if abs(pressed - place) < 2 * c.sd_place:
+        assert contact[0] - none[0] == pytest.approx(np.log(held / apart), abs=1.0) or held / apart > 1e3
+
+
+@pytest.mark.parametrize("making", [True, False])
+def test_the_interval_of_the_sign_change_is_found(making):
+    p = APPROACH if making else APPROACH[::-1]
+    probability = switch_probability(sensed(p), np.zeros(p.size - 1), making)
+    n = int(np.flatnonzero(np.diff(np.sign(p)))[0])
+    assert probability[n] > 0.9 and probability.sum() == pytest.approx(1.0)
+
+
+def test_a_missing_sensor_adds_nothing_and_the_other_decides():
+    for lost in ("pressed", "place"):
+        c = sensed(APPROACH, **{lost: np.full(APPROACH.size, np.nan)})
+        probability = switch_probability(c, np.zeros(APPROACH.size - 1), True)
+        n = int(np.flatnonzero(np.diff(np.sign(APPROACH)))[0])
+        assert probability[n - 1 : n + 2].sum() > 0.9
+
+
+def test_a_ringing_force_after_a_release_is_no_contact():
+    p = APPROACH[::-1]
+    ringing = np.where(p < -2e-4, 1e-4 * np.sin(np.arange(p.size)), np.maximum(p, 0))
+    probability = switch_probability(sensed(p, pressed=ringing), np.zeros(p.size - 1), False)
+    n = int(np.flatnonzero(np.diff(np.sign(p)))[0])
+    assert probability[n - 1 : n + 2].sum() > 0.9
+
+
+def test_places_lost_in_noise_do_not_date_a_lift_early():
+    """A load that fades slowly, then a hand that leaves; places are four times as noisy as it is deep."""
+    p = np.concatenate([np.linspace(1e-4, 0, 12)[:-1], -(np.linspace(0.0, 1.3e-1, 14) ** 3)])
+    ranks, true = [], 10
+    for seed in range(80):
+        c = sensed(p, sd_pressed=3e-5, sd_place=4e-4, seed=seed)
+        probability = switch_probability(c, np.zeros(p.size - 1), False)
+        ranks.append(probability[:true].sum() + probability[true] / 2)
+    assert 0.2 < np.mean(ranks) < 0.8  # places weighed as surely as forces had made it 0.998
+    assert np.mean((np.array(ranks) > 0.05) & (np.array(ranks) < 0.95)) > 0.65
+
+
+def test_a_finger_that_pushes_the_block_on_touched_when_its_force_says_so():
+    place = APPROACH - 6e-4  # the face as it lies later, where the other finger stopped it
+    probability = switch_probability(sensed(APPROACH, place=place), np.zeros(APPROACH.size - 1), True)
+    n = int(np.flatnonzero(np.diff(np.sign(APPROACH)))[0])
+    assert probability[n - 1 : n + 2].sum() > 0.8
+
+
+T = np.arange(12) * 0.02
+SD_PRESSED, SD_PLACE = 3e-6, 2e-5
+
+
+def release(seed: int, slip: float | None = None) -> Change:
+    """A contact that ends between samples 5 and 6, relaxed; it slides where it is pressed by `slip` [m]."""
+    rng = np.random.default_rng(seed)
+    place = (5 - np.arange(12)) * 2e-4 + rng.uniform(0, 2e-4)
+    pressed = np.where(np.arange(12) <= 5, np.maximum(place, 0), 0.0)
+    c = Penetration(
+        T, pressed + SD_PRESSED * rng.standard_normal(12), place + SD_PLACE * rng.standard_normal(12),
+        np.full((2, 12), -1e-2), SD_PRESSED, SD_PRESSED, SD_PLACE, 1e-3, 0.0,
+    )  # fmt: skip
+    probability = np.zeros(11)
+    probability[5] = 1.0
+    slips = () if slip is None else (slip,)
+    return Change((c,), Prior(T, probability, (0.0, 1.0)), False, "smooth", 0.0, slips)
+
+
+@pytest.mark.parametrize("louder", [1.0, 20.0])
+def test_how_loud_forces_are_after_a_change_is_learned(louder):
+    rng, changes = np.random.default_rng(3), [release(k) for k in range(40)]
+    for change in changes:
+        c = change.contacts[0]
+        c.pressed[6:] = louder * SD_PRESSED * rng.standard_normal(6)
+    (found,) = disagreements(changes).values()
+    assert found.louder == pytest.approx(louder, rel=0.2)
+
+
+def test_a_grip_that_slides_before_it_ends_may_have_ended_then():
+    (known,) = disagreements([release(k) for k in range(40)]).values()
+    change = release(99, slip=3e-4)
+    place = change.contacts[0].place
+    slides = float(np.interp(-3e-4, -place, T))  # 1e-2 m/s: 30 ms before it is spent
+    spent = float(np.interp(0.0, -place, T))
+    found, plain = moment(change, known), moment(release(99), known)
+    assert found.quantile(0.05) < slides + 2e-3 and found.quantile(0.95) > spent - 2e-3
+    assert plain.quantile(0.05) > slides + 10e-3
+    assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
+
+
+def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets():
+    folder = example_folder()
+    rig = Rig.read(folder / "rig.toml")
+    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
+    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
+    parameters = aligned.fit.parameters
+    stiff = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(4e-4, 1e-6, 0.0), 0.0, 1e-3)
+    n, step = signals.t.size, 1.5e-3
+    still = np.full(n, 0.01)
+    pushed = np.where(np.arange(n) < n // 2, 0.0, step)  # finger 2 has pushed the block to the left
+    made = replace(
+        signals, x1=-still - pushed, x2=still - pushed, vx1=0 * still, vx2=0 * still,
+        fx1=0 * still, fx2=np.full(n, -1.0),
+    )  # fmt: skip
+    table = contacts(made, stiff, replace(parameters, bias=np.zeros(4)))
+    held = np.zeros(n, bool)
+    held[n // 4 : n // 2] = True
+    moved, _ = table._pushed(1, held)
+    np.testing.assert_allclose(moved[: n // 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(moved[n // 2 :], step, atol=1e-9)
+
+
+def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():
+    folder = example_folder()
+    rig = Rig.read(folder / "rig.toml")
+    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
+    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
+    late = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(1e-5, 1e-6, 0.0), 5e-3, 1e-3)
+    n = signals.t.size
+    shaking = 5e-3 * np.random.default_rng(0).standard_normal(n)
+    still = replace(signals, vy1=shaking, vy2=shaking, fy1=np.zeros(n), fy2=np.zeros(n))
+    table = contacts(still, late, replace(aligned.fit.parameters, bias=np.zeros(4)))
+    load = table._load(aligned.subtasks[1], np.ones(n, bool), making=False)
+    np.testing.assert_allclose(load.pressed, load.pressed[0], rtol=1e-9)
+    assert load.hidden and load.pressed[0] > 0

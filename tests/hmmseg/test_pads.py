@@ -1,16 +1,26 @@
-"""Pads and delays are learned from what rests: planted ones are found, and none are invented."""
+"""Pads and delays are learned from what rests: planted ones are found and told apart, none invented."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from experiments.worlds import WORLDS, Cell, World, scene, trials_of
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import Parameters
-from hmmseg.segmentation.pads import Sensing, _compliance, limited, read_again
-from hmmseg.segmentation.stretches import Stretch, evidence, fitted, reading, steepest
+from hmmseg.segmentation.pads import (
+    LATE,
+    Sensing,
+    Squeeze,
+    _compliance,
+    _unfiltered,
+    lateness,
+    limited,
+    read_again,
+)
+from hmmseg.segmentation.stretches import NONE, Stretch, Toe, evidence, find, fitted, reading, steepest
 
 PRIOR = (2.5e-4, 0.75e-4)
 
@@ -162,3 +172,103 @@ def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():
     assert one == pytest.approx(0.8, abs=0.06) and one < 0.8
     assert two == pytest.approx(0.4, abs=0.06)
     assert steepest(signals, 0.9, 1.0, parameters) == []
+
+
+COMPLIANCE, WIDTH = 2.5e-4, 0.03
+
+
+def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE):
+    """Fingers that close on a block, hold it and open, their forces late by `delay` or filtered."""
+    rng = np.random.default_rng(seed)
+    fine = np.arange(0, 2.0, 1e-4)
+    start = rng.uniform(0.3, 0.32)
+    closed = np.clip((fine - start) / 0.25, 0, 1) - np.clip((fine - start - 0.9) / 0.25, 0, 1)
+    way = closed**2 * (3 - 2 * closed)
+    distance = WIDTH + 0.006 - (0.006 + 4.5 * compliance) * way
+    load = np.maximum(WIDTH - distance, 0) / compliance
+    if constant:
+        kept = np.exp(-1e-4 / constant)
+        load = lfilter([1 - kept], [1, -kept], load)
+    t = np.arange(0, 1.95, step)
+    read = np.interp(t - delay, fine, load) + 0.017 * rng.standard_normal(t.size)
+    seen = np.interp(t, fine, distance) + 2.8e-5 * rng.standard_normal(t.size)
+    rate = np.interp(t, fine, np.gradient(distance, 1e-4)) + 4e-3 * rng.standard_normal(t.size)
+    return Squeeze(t, seen, rate, read, 2.8e-5, 0.017)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.05])
+@pytest.mark.parametrize("delay", [0.03, 0.06, 0.2])
+def test_a_delay_is_found(delay, step):
+    found = lateness([whole_grip(delay, step=step, seed=i) for i in range(4)], PRIOR, LATE)
+    assert found is not None and not found.filter and found.gain > 15
+    assert found.delay == pytest.approx(delay, abs=0.006)
+
+
+@pytest.mark.parametrize("constant", [0.03, 0.06])
+def test_a_filter_is_found_and_told_from_a_delay(constant):
+    found = lateness([whole_grip(constant=constant, seed=i) for i in range(4)], PRIOR, LATE)
+    assert found is not None and found.filter and found.gain > 15
+    assert found.delay == pytest.approx(constant, rel=0.2)
+
+
+def test_pads_softer_than_stated_are_no_delay():
+    own = [whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)]
+    found = lateness(own, PRIOR, LATE)
+    assert found is not None and (found.gain < 1 or found.delay < LATE)
+
+
+@pytest.mark.parametrize("prior", [PRIOR, (0.0, 2e-4)])
+def test_forces_on_time_are_not_late(prior):
+    found = lateness([whole_grip(seed=i) for i in range(4)], prior, LATE)
+    assert found is not None and (found.gain < 1 or found.delay < LATE)
+
+
+def test_nothing_tells_nothing():
+    assert lateness([], PRIOR, LATE) is None
+
+
+def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
+    fine = np.arange(0, 1.0, 1e-4)
+    force = 4 * np.clip((fine - 0.31) / 0.2, 0, 1)
+    kept = np.exp(-1e-4 / 0.03)
+    t = np.arange(0, 0.98, 0.02)
+    filtered = np.interp(t, fine, lfilter([1 - kept], [1, -kept], force))
+    undone, louder = _unfiltered(t, filtered, 0.03)
+    np.testing.assert_allclose(undone, np.interp(t, fine, force), atol=0.15)
+    assert louder == pytest.approx(np.sqrt(1 + np.exp(-4 / 3)) / (1 - np.exp(-2 / 3)), rel=1e-6)
+    assert np.abs(undone[t < 0.31]).max() < 0.02
+
+
+SD = 2e-5
+
+
+def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
+    """Loads from 10 N to none of grips that let go, and the fingers' distance."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for k in range(number):
+        load = np.r_[np.full(8, 10.0), np.linspace(10, rng.uniform(0.1, 0.6), 9)]
+        give = compliances[k % len(compliances)] * load + toe.give(load)
+        out.append((load, rng.uniform(0.02, 0.05) - give + SD * rng.standard_normal(load.size), SD))
+    return out
+
+
+@pytest.mark.parametrize("planted", [Toe(6e-4, 0.8), Toe(3e-4, 1.6)])
+def test_a_planted_toe_is_found(planted):
+    found = find(releases(planted))
+    at = np.array([0.0, 0.2, 1.0, 4.0])
+    np.testing.assert_allclose(found.give(at), planted.give(at), atol=6e-5)
+    assert found.slope == pytest.approx(planted.slope, rel=0.3)
+
+
+@pytest.mark.parametrize("compliances", [(1e-4,), (1e-4, 2e-4)])
+def test_straight_contacts_have_none_however_they_differ(compliances):
+    assert all(find(releases(compliances=compliances, seed=seed)) is NONE for seed in range(10))
+
+
+def test_a_contact_that_stiffens_the_other_way_has_none():
+    assert find(releases(Toe(-4e-4, 0.8))) is NONE
+
+
+def test_too_few_samples_show_nothing():
+    assert find([]) is NONE and find([(np.ones(3), np.ones(3), SD)]) is NONE

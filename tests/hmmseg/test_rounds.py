@@ -1,7 +1,5 @@
 """Repeated tasks: every round aligned, one that fails leaves the others as they are."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace
@@ -10,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from misfit_edits import join, let_go
 
-from experiments.misfit_edits import join, let_go
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig

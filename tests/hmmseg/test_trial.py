@@ -1,17 +1,18 @@
-"""Reading trials of every kind, every trial refused with its message, and task-space signals."""
-
-from __future__ import annotations
+"""Trials of every kind, of other labs' columns and text tables; every one refused with its message."""
 
 import numpy as np
 import pandas as pd
+import polars as pl
 import pytest
 
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg.io.formats import read_table
+from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS
+from hmmseg.io.units import UNITS, known_unit, measures, si_factor, unit_in_name
 
 FINGERS = {
     "1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
@@ -228,11 +229,245 @@ def test_files_refused(tmp_path):
         read_trial(tmp_path / "one.npz", JOINTED)
 
 
-def test_recordings_are_read(shared):
-    for case in sorted((shared / "recordings").iterdir()):
-        if case.is_dir():
-            rig = read_rig(case / "rig.toml")
-            for path in sorted(case.glob("trial_*.csv")):
-                signals = task_space(read_trial(path, rig), rig)
-                assert np.isfinite(signals.fy).all()
-                assert 0.0 < np.median(signals.distance) < 0.08
+def scene(samples: int = 40) -> dict[str, np.ndarray]:
+    """A Cartesian hand's channels in SI."""
+    rng = np.random.default_rng(3)
+    columns = {name: rng.uniform(-0.1, 0.1, samples) for name in CARTESIAN_CHANNELS}
+    columns["x2"] = columns["x2"] + 0.3
+    return {"t": np.arange(samples) * 0.02, **columns}
+
+
+THEIRS = {
+    "t": ("stamp", "ns", 1, 0.0), "x1": ("left x [mm]", "mm", -1, 0.25), "y1": ("ly", "cm", 1, 0.0),
+    "vx1": ("lvx", 1e-3, -1, 0.0), "fx1": ("lfx", "mN", -1, 0.1), "fy2": ("rfy", "kgf", 1, -0.5),
+}  # fmt: skip
+
+
+def test_mapping_is_undone_by_units_sign_and_offset():
+    ours = scene()
+    theirs = dict(ours)
+    for name, (source, unit, sign, offset) in THEIRS.items():
+        theirs[source] = (
+            (theirs.pop(name) - offset) * sign / (si_factor(unit) if isinstance(unit, str) else unit)
+        )
+    theirs["name alone"] = theirs.pop("y2")
+    rig = parse_rig({"columns": {
+        name: {"from": source, "unit": unit, "sign": sign, "offset": offset}
+        for name, (source, unit, sign, offset) in THEIRS.items()
+    } | {"y2": "name alone"}})  # fmt: skip
+    trial = read_trial(theirs, rig)
+    np.testing.assert_allclose(trial.t, ours["t"], atol=1e-12)
+    for name in CARTESIAN_CHANNELS:
+        np.testing.assert_allclose(trial.channels[name], ours[name], atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("make", [dict, pd.DataFrame, pl.DataFrame], ids=["dict", "pandas", "polars"])
+def test_tables_in_memory_are_the_same_trial(make):
+    ours = scene()
+    trial = read_trial(make(ours), parse_rig({}))
+    for name in CARTESIAN_CHANNELS:
+        np.testing.assert_array_equal(trial.channels[name], ours[name])
+
+
+def test_polars_nulls_are_missing():
+    ours = scene()
+    frame = pl.DataFrame(ours).with_columns(
+        pl.when(pl.arange(pl.len()) == 3).then(None).otherwise(pl.col("fx1")).alias("fx1")
+    )
+    assert np.flatnonzero(np.isnan(read_trial(frame, parse_rig({})).channels["fx1"])).tolist() == [3]
+
+
+def test_a_plain_task_takes_mapped_and_own_names():
+    table = {"stamp": np.arange(10) * 20.0, "F": np.arange(10.0), "other": np.ones(10)}
+    rig = parse_rig({"columns": {"t": {"from": "stamp", "unit": "ms"}, "force": {"from": "F", "unit": "mN"}}})
+    trial = read_trial(table, rig, PLAIN)
+    assert sorted(trial.channels) == ["force", "other"]
+    assert trial.rate == pytest.approx(50.0)
+    np.testing.assert_allclose(trial.channels["force"], np.arange(10) * 1e-3)
+
+
+def test_dates_become_seconds_since_the_first():
+    ours = scene(10)
+    stamps = np.datetime64("2026-11-23T15:00:00.5", "ns") + (ours["t"] * 1e9).astype("timedelta64[ns]")
+    for t in (
+        stamps,
+        np.array([f"{s}Z" for s in stamps], dtype=object),
+        pd.Series(stamps).dt.tz_localize("CET"),
+    ):
+        trial = read_trial({**ours, "t": t}, parse_rig({}))
+        np.testing.assert_allclose(trial.t, ours["t"], atol=1e-12)
+        assert trial.origin is not None
+    assert read_trial({**ours, "t": stamps}, parse_rig({})).origin == stamps[0].astype(int)
+
+
+def test_mappings_that_do_not_fit_the_file():
+    ours = scene()
+    with pytest.raises(InputError, match=r"column left: missing, but the rig maps x1 to it; expected one of"):
+        read_trial(ours, parse_rig({"columns": {"x1": "left"}}))
+    with pytest.raises(InputError, match=r"\[columns\] xl: is no channel of this hand or task; .*mean"):
+        read_trial(ours, parse_rig({"columns": {"xl": "x1"}}))
+
+
+def test_gripper_tolerance_and_mapping_stand_in_the_rig():
+    rig = parse_rig({
+        "tolerance": {"position": 1e-3, "force": 0.05},
+        "gripper": {"opening": "width", "wrench": ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], "tool_mass": 0.5,
+                    "centre_of_mass": [0, 0, 0.05]},
+    })  # fmt: skip
+    assert rig.tolerance.position == 1e-3
+    assert rig.tolerance.property is None
+    assert rig.gripper is not None
+    assert rig.gripper.channels == ("x", "y", "z", "width", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+    columns = {name: np.linspace(0, 1, 9) for name in ("t", *rig.gripper.channels)}
+    with pytest.raises(InputError, match="Fx, Fy, Fz: show no free motion"):
+        read_trial(columns, rig)
+
+
+def test_units():
+    assert si_factor("mm") == 1e-3
+    assert known_unit("Milliseconds") == "ms"
+    assert known_unit("N m") == "Nm"
+    assert known_unit("parsec") is None
+    for name in UNITS:
+        assert known_unit(name) == name
+    assert [measures(c) for c in ("t", "x1", "vy2", "fx1", "q12", "dq21", "force")] == [
+        "time", "length", "velocity", "force", "angle", "angular velocity", None]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("left_x_mm", "mm"), ("force [N]", "N"), ("t (ms)", "ms"), ("angle [°]", "deg"), ("time_ns", "ns"),
+     ("x1", None), ("speed_mm/s", "mm/s"), ("finger_left", None), ("state[3]", None)],
+)  # fmt: skip
+def test_unit_in_a_name(name, unit):
+    assert unit_in_name(name) == unit
+
+
+TWO = SequenceTask(("a", "b"), channels=("x", "f"))
+T = np.arange(12) * 0.05
+X = np.round(np.sin(T) * 3, 4)
+F = np.round(np.cos(T) * 1234.5, 3)
+
+
+def written(separator=",", decimal=".", head="t,x,f", before=(), after_header=(), comment_after=None):
+    rows = [separator.join(str(v).replace(".", decimal) for v in row) for row in zip(T, X, F, strict=True)]
+    if comment_after is not None:
+        rows.insert(comment_after, "# a remark; with, separators")
+    return "\n".join([*before, head.replace(",", separator), *after_header, *rows]) + "\n"
+
+
+LAYOUTS = {
+    "commas": written(),
+    "semicolons": written(";"),
+    "semicolons and decimal commas": written(";", ","),
+    "tabs": written("\t"),
+    "tabs and decimal commas": written("\t", ","),
+    "spaces": written("   "),
+    "comments before and between": written(";", ",", before=["# lab 3", "% 2026", ""], comment_after=4),
+    "header in a comment (numpy.savetxt)": written(",", head="# t,x,f"),
+    "header in a comment, spaces": written(" ", head="# t,x,f"),
+    "windows line ends": written(";").replace("\n", "\r\n"),
+    "quoted": written(head='"t","x","f"'),
+    "trailing separators": written().replace("\n", ",\n"),
+    "scientific": written().replace("0.05,", "5.0E-2,", 1),
+    "empty last rows": written(";") + ";;\n\n",
+    "the separator said first": "sep=;\n" + written(";", ","),
+    "any separator said first": "SEP=|\n" + written("|"),
+    "signs before the header and its first name": written(" ", head="# #t,x,f", before=["# lab 3, a stand"]),
+    "a remark behind the header in a comment": written(head="#t,x,f", after_header=["# one, two"]),
+    "separators behind the rows alone": written().replace("\n", ",\n").replace("f,\n", "f\n", 1),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layouts_hold_the_same_numbers(tmp_path, layout):
+    path = tmp_path / "a.csv"
+    path.write_text(LAYOUTS[layout])
+    trial = read_trial(path, task=TWO)
+    for found, planted in ((trial.t, T), (trial.channels["x"], X), (trial.channels["f"], F)):
+        np.testing.assert_allclose(found, planted, rtol=1e-12)
+
+
+EVEN = "t,x,f\n" + "".join(f"{t:.2f},1,{f:.3f}\n" for t, f in zip(T, F, strict=True))
+BROKEN_OFF = {
+    "in a row": (written() + "0.6,1", "row 14, the last, is cut off"),
+    "in a number": (EVEN + "0.6,1,12.", "row 14, the last, ends within a number"),
+    "in zero bytes": (written() + "\0" * 900, "ends in zero bytes"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", BROKEN_OFF)
+def test_what_was_broken_off_is_read_as_far_as_it_goes_and_said(tmp_path, how):
+    text, said = BROKEN_OFF[how]
+    (tmp_path / "a.csv").write_text(text)
+    trial = read_trial(tmp_path / "a.csv", task=TWO)
+    np.testing.assert_allclose(trial.t, T)
+    assert len(trial.warnings) == 1 and said in trial.warnings[0]
+
+
+def test_a_last_row_without_a_line_end_is_read(tmp_path):
+    (tmp_path / "a.csv").write_text(written()[:-1])
+    trial = read_trial(tmp_path / "a.csv", task=TWO)
+    assert (trial.t.size, trial.warnings) == (T.size, ())
+
+
+def test_spreadsheets_unicode_text(tmp_path):
+    (tmp_path / "a.txt").write_bytes(written("\t", ",").encode("utf-16"))
+    np.testing.assert_allclose(read_trial(tmp_path / "a.txt", task=TWO).channels["f"], F)
+
+
+def test_umlauts_of_spreadsheets(tmp_path):
+    text = written(";", ",", before=["# Prüfstand 3: Öffnung in °"])
+    (tmp_path / "a.csv").write_bytes(text.replace("f", "Öf").encode("cp1252"))
+    trial = read_trial(tmp_path / "a.csv", task=SequenceTask(("a",), channels=("x", "Öf")))
+    np.testing.assert_allclose(trial.channels["Öf"], F)
+    (tmp_path / "a.csv").write_bytes(b"\x00\xff\x01" + text.encode("cp1252"))
+    with pytest.raises(InputError, match=r"cannot be read .'utf-8' codec"):
+        read_trial(tmp_path / "a.csv", task=TWO)
+
+
+def test_a_row_of_units_is_believed(tmp_path):
+    (tmp_path / "a.tsv").write_text(written("\t", after_header=["[s]\t[mm]\t[mN]"]))
+    trial = read_trial(tmp_path / "a.tsv", task=TWO)
+    np.testing.assert_allclose(trial.channels["x"], X * 1e-3)
+    np.testing.assert_allclose(trial.channels["f"], F * 1e-3)
+    rig = parse_rig({"columns": {"x": {"unit": "cm"}}})  # what rig.toml says goes first
+    np.testing.assert_allclose(read_trial(tmp_path / "a.tsv", rig, TWO).channels["x"], X * 1e-2)
+
+
+def test_iso_stamps(tmp_path):
+    stamps = np.datetime64("2026-11-23T15:09:36.250") + (T * 1e6).astype("timedelta64[us]")
+    rows = [f"{s}Z,{x},{f}" for s, x, f in zip(stamps, X, F, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,x,f", *rows]))
+    trial = read_trial(tmp_path / "a.csv", task=TWO)
+    np.testing.assert_allclose(trial.t, T, atol=1e-9)
+    assert trial.origin == stamps[0].astype("datetime64[ns]").astype(int)
+
+
+def test_only_wanted_columns_are_read(tmp_path):
+    (tmp_path / "a.csv").write_text(written())
+    table = read_table(tmp_path / "a.csv", ["t", "absent"])
+    assert (list(table.columns), table.names) == (["t"], ("t", "x", "f"))
+
+
+REFUSED = [
+    (written(";", ",").replace("1234,5", "1234.5"),
+     r"row 2, column f: 1234.5 has a decimal point, others have commas; expected one kind"),
+    (written(";", ",").replace("1234,5", "1.234,5"), r"row 2, column f: 1.234,5 has a decimal point"),
+    (written(";", ",") + "0,6;abc;1,5\n", r"row 14, column x: abc is not a finite number"),
+    (written(before=["# one", "# two"], comment_after=3).replace("0.2,", "0.2.1,", 1),
+     r"row 9, column t: 0.2.1 is not a finite number"),
+    (written() + '0.6,"1\n2",3\n', r"row 14: a quoted cell does not end; expected one line a row"),
+    (written() + '0.6,1,"3\n0.7,1,2\n', r"row 14: a quoted cell does not end; expected one line a row"),
+    (written().replace("0.05,", "2026-11-23,", 1), r"row 2, column t: 0.0 is not a date|is not a finite"),
+    (written("\t").replace("\t", ",", 3), r"row \d: has \d cells; expected \d as in the header"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "line"), REFUSED)
+def test_refused_with_its_line(tmp_path, text, line):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"a\.csv: ({line})") as caught:
+        read_trial(path, task=TWO)
+    assert "\n" not in str(caught.value)

@@ -1,7 +1,5 @@
 """`hmmseg diagnose --simulator`: from logs to a document, and lines about options that do not go together."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,9 +1,5 @@
 """Figures are drawn, whole and from awkward results too, and say what they should."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -117,11 +113,6 @@ def test_corner_shows_cm_and_measured_values(tmp_path, texts):
     check_picture(tmp_path / "one.png")
 
 
-def test_corner_refuses_draws_that_are_not_the_names():
-    with pytest.raises(ValueError, match=r"draws of shape \(10, 2\) for 3 names"):
-        draw_corner(np.zeros((10, 2)), NAMES, plots.Path("never.png"))
-
-
 @pytest.mark.parametrize("actual", [None, {"block1": {"weight": (0.343, 0.0005), "width": (0.0159, 0.0001)}}])
 def test_estimates_with_null_and_bounded_properties(tmp_path, texts, actual):
     draw_estimates(PROPERTIES, actual, tmp_path / "estimates.png")
@@ -158,9 +149,3 @@ def test_predictive_band_and_its_coverage(tmp_path, texts):
     draw_predictive(T, [prediction, nothing], tmp_path / "predictive.png", make_segmentation())
     check_picture(tmp_path / "predictive.png")
     assert sum(text.endswith("% inside") for text in texts) == 1
-
-
-def test_the_packages_below_do_not_import_matplotlib():
-    modules = "hmmseg.segmentation.thresholds, estimation.paper_formulas"
-    code = f"import sys, {modules}; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,7 +1,5 @@
 """The frame of the commands: exit codes, one line of error, strict JSON, all files or none."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -29,16 +27,6 @@ def task(tmp_path) -> Path:
     path = tmp_path / "task.toml"
     path.write_text(TASK)
     return path
-
-
-def test_process_prints_only_json_on_standard_output(task):
-    done = run("decompose", str(task), "--json", "-", "--seed", "7")
-    assert done.returncode == 0
-    document = json.loads(done.stdout)
-    assert list(document)[:5] == ["format", "version", "seed", "warnings", "figures"]
-    assert document["format"] == "hmmseg.decompose/1"
-    assert (document["version"], document["seed"]) == (hmmseg.__version__, 7)
-    assert "Subtask" in done.stderr
 
 
 def test_process_at_fault_says_one_line_and_exits_with_2(tmp_path):

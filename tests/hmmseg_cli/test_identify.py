@@ -1,6 +1,4 @@
-"""segment, identify and demo on recordings of the stand-in rig: the outward contract, end to end."""
-
-from __future__ import annotations
+"""decompose, segment, identify and demo: the outward contract, end to end."""
 
 import json
 import math
@@ -11,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hmmseg.example import example_folder
 from hmmseg_cli.main import main
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
@@ -89,16 +88,6 @@ def test_identify_draws_figures_and_one_self_contained_page(identified):
     assert 'src="http' not in page and 'href="http' not in page
 
 
-def test_same_seed_same_answer_and_another_seed_another(tmp_path):
-    trial = str(NONE / "trial_03.csv")
-    runs = [
-        document("identify", trial, *RIG_AND_TASK, "--seed", seed, out=tmp_path / f"{i}.json")["properties"]
-        for i, seed in enumerate(("4", "4", "5"))
-    ]
-    assert runs[0] == runs[1]
-    assert runs[0]["block1"]["weight"]["mean"] != runs[2]["block1"]["weight"]["mean"]
-
-
 SINGLE = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
 
 
@@ -149,25 +138,6 @@ def test_demo_runs_on_the_packages_own_recordings(tmp_path, monkeypatch):
         assert low < true < high and high - low < 0.15 * true, name  # what their rig.toml states
 
 
-@pytest.mark.parametrize(
-    ("edit", "said"),
-    [
-        (lambda f: f.drop(columns="fx1"), "column fx1: missing"),
-        (lambda f: f.assign(t=f.t[::-1].to_numpy()), "row 3, column t"),
-        (lambda f: f.assign(q11=["bad", *f.q11[1:]]), "row 2, column q11"),
-        (lambda f: f.head(3), "has 3 samples"),
-        (lambda f: f.assign(fy2=np.nan), "column fy2: has no values"),
-    ],
-)
-def test_a_bad_trial_is_one_line_and_exit_2(tmp_path, capsys, edit, said):
-    path = tmp_path / "trial.csv"
-    edit(pd.read_csv(NONE / "trial_01.csv").astype({"q11": object})).to_csv(path, index=False)
-    assert main(["identify", str(path), *RIG_AND_TASK, "--json", str(tmp_path / "out.json")]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and said in error and "trial.csv" in error
-    assert not (tmp_path / "out.json").exists()
-
-
 def test_plain_tasks_and_block_tasks_are_kept_apart(tmp_path, capsys):
     task = tmp_path / "task.toml"
     task.write_text('sequence = ["approach", "insertion"]\n')
@@ -205,3 +175,86 @@ def test_plain_ordered_task_fits_saves_and_segments(tmp_path):
         assert [s["end"] for s in trial["segments"][:-1]] == pytest.approx([a, b], abs=0.06)
         assert trial["segments"][0]["object"] is None and trial["segments"][1]["state"] == "push"
         assert math.isfinite(trial["log_evidence"])
+
+
+PAPER = (example_folder() / "task.toml").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def decomposed(tmp_path, capsys, monkeypatch):
+    """Run the command on a task's text; returns its document and what people see."""
+
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def run(text: str) -> tuple[dict, str]:
+        (tmp_path / "task.toml").write_text(text)
+        assert main(["decompose", str(tmp_path / "task.toml"), "--json", str(tmp_path / "out.json")]) == 0
+        printed = capsys.readouterr()
+        assert printed.err == ""
+        return json.loads((tmp_path / "out.json").read_text()), printed.out
+
+    return run
+
+
+def test_equation_1_of_the_paper(decomposed):
+    document, printed = decomposed(PAPER)
+    assert document["equation"].split(",\n      ")[:4] == [
+        "T = { Pregrasp 1 = (free-motion, {∅})",
+        "Pickup 1 = (hold-on-ground 1, {height 2, friction 1})",
+        "Carry 1 = (hold-above-ground 1, {weight 1, width 1, friction 1})",
+        "Place 1 = (hold-on-ground 1, {height 2, friction 1})",
+    ]
+    assert document["equation"].endswith("Release 2 = (free-motion, {∅}) }")
+    assert document["equation"] in printed
+    assert "block1: weight in carry block1; " in printed.partition("┏")[0]  # in words first
+    (row,) = (line for line in printed.splitlines() if "│ carry block1" in line)
+    cells = [cell.strip() for cell in row.split("│")]
+    assert cells[3:7] == ["hold-above-ground", "vertical", "horizontal", ""]
+
+
+def test_document_of_the_paper(decomposed):
+    document, _ = decomposed(PAPER)
+    assert document["minimal"] == list(range(9))
+    assert document["height_equations"] == [
+        {"move": 1, "rise": {"block2": -1}},
+        {"move": 2, "rise": {"block1": 1}},
+    ]
+    assert (document["reasons"], document["notes"], document["repeat"]) == ({}, [], 1)
+    pickup = document["subtasks"][1]
+    assert {key: pickup[key] for key in ("index", "subtask", "object", "state", "move", "support")} == {
+        "index": 1, "subtask": "pickup", "object": "block1", "state": "hold-on-ground", "move": 1,
+        "support": "block2"}  # fmt: skip
+    assert pickup["constraints"] == ["block1-block2", "finger1-block1", "finger2-block1"]
+    assert [entry["property"] for entry in pickup["properties"] if entry["in_paper"]] == [
+        "block2.height", "block1.friction"]  # fmt: skip
+    assert pickup["properties"][1] == {
+        "property": "block2.height", "signals": ["vertical positions"], "with": [3], "kind": "value",
+        "given": [], "condition": None, "in_paper": True}  # fmt: skip
+    assert document["properties"]["block1"]["weight"] == {
+        "kind": "value", "evidence": [{"subtasks": [2], "signals": ["vertical forces"], "kind": "value",
+                                       "given": [], "condition": None}]}  # fmt: skip
+
+
+def test_names_reasons_and_notes(decomposed):
+    document, printed = decomposed(
+        'repeat = "unknown"\n[objects.cup]\non = "ground"\n[objects.lid]\non = "ground"\n'
+        '[[moves]]\nobject = "cup"\nto = "ground"\nslide = true\n'
+    )
+    assert (
+        "Slide cup = (sliding-on-ground cup, {friction cup, friction on ground cup})" in document["equation"]
+    )
+    assert document["properties"]["lid"]["weight"] is None
+    assert document["reasons"]["lid.weight"] == "no recorded move grips lid"
+    assert document["properties"]["cup"]["friction_on_ground"]["kind"] == "value"
+    assert document["repeat"] == "unknown"
+    assert "one round is decomposed" in printed
+    assert "lid.weight: no recorded move grips lid" in printed
+
+
+def test_plain_ordered_task(decomposed):
+    document, printed = decomposed('sequence = ["approach", "mating"]')
+    assert document["equation"] == "T = { approach = (approach, {∅}),\n      mating = (mating, {∅}) }"
+    assert document["properties"] == {}
+    assert document["notes"] == ["a plain ordered task has no block physics: no properties"]
+    assert "height_equations" not in document
+    assert "approach" in printed

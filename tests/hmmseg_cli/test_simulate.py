@@ -1,7 +1,5 @@
 """hmmseg simulate: trials in the input format, a replay, an animation, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -12,7 +10,7 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg_cli.main import main
-from simgap.world.animation import FRAMES, Scene, Trace, animate
+from simgap.world.animation import FRAMES
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.simulate import scene_files
 
@@ -98,25 +96,3 @@ def test_the_operator_does_as_told(tmp_path, inputs):
     assert grip.mean() == pytest.approx(1.5, abs=0.06)
     with Image.open(tmp_path / "out/trial_01.gif") as film:
         assert film.n_frames == pytest.approx(trial.t[-1] * FRAMES, abs=2)
-
-
-def test_an_animation_s_kind_is_its_suffix(tmp_path):
-    import numpy as np
-
-    from hmmseg.errors import InputError
-    from simgap.world.properties import PAPER_BLOCKS
-
-    t = np.linspace(0, 0.2, 5)
-    tips = np.tile([[0.11, 0.02], [0.13, 0.02]], (5, 1, 1))
-    scene = Scene(t, tips, np.tile([[0.12, 0.01]], (5, 1, 1)), {"b": PAPER_BLOCKS["block1"]},
-                  read_rig_text(tmp_path))  # fmt: skip
-    traces = [Trace("Grip [N]", [("", t, t)])]
-    with pytest.raises(InputError, match="unknown kind of animation"):
-        animate(tmp_path / "film.avi", scene, traces)
-    animate(tmp_path / "film.gif", scene, traces)
-    assert (tmp_path / "film.gif").stat().st_size > 1000
-
-
-def read_rig_text(folder):
-    (folder / "animated.toml").write_text(RIG)
-    return read_rig(folder / "animated.toml")

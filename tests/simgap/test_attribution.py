@@ -1,20 +1,56 @@
-"""Attribution against enumeration, closed forms, quadrature and planted effects."""
-
-from __future__ import annotations
+"""Attribution against enumeration, closed forms, quadrature and planted effects; what a verdict must say."""
 
 import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted_gaps import gap_of, linear, rows_of
+from scipy.stats import multivariate_normal
 
 from simgap.attribution.attribute import _examined, _predicting, _there, attribute, noise_of
-from simgap.attribution.heldout import Heldout
-from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
-from simgap.attribution.problem import Candidate, Gap, cosines
+from simgap.attribution.heldout import WANDER, Heldout, invariance, scatter_between
+from simgap.attribution.posterior import Background, Forms, fitted, forms, mode, quadratic_forms, screened
+from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import detected, leniently, sought, statistic, weights
-from simgap.attribution.verdict import known, significant
+from simgap.attribution.verdict import (
+    ALARM,
+    Explanation,
+    acting,
+    alike,
+    conclude,
+    known,
+    leading,
+    probabilities,
+    significant,
+)
+
+
+def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
+    """Rows of a small recording at 20 Hz, every cell with as many samples."""
+    trial, channel, part, k = (z.ravel() for z in np.indices((trials, channels, parts, samples)))
+    time = (part * samples + k) / 20.0
+    return Rows(trial, channel, part, time, tuple(f"t{i}" for i in range(trials)),
+                tuple(f"c{i}" for i in range(channels)), tuple(f"p{i}" for i in range(parts)))  # fmt: skip
+
+
+def linear(name: str, jacobian: np.ndarray, scale: float = 1.0, named: bool = True) -> Candidate:
+    """An effect that is linear in its parameters."""
+    k = jacobian.shape[1]
+    nothing, far = np.zeros(k), np.full(k, np.inf)
+    return Candidate(name, tuple(f"{name}{i}" for i in range(k)), nothing, nothing, np.full(k, scale),
+                     np.zeros(len(jacobian)), jacobian, -far, far, named=named)  # fmt: skip
+
+
+def gap_of(theta: dict[int, float], seed: int = 0, more: np.ndarray | float = 0.0, same: bool = False) -> Gap:
+    """A gap of four one-parameter effects, of which `theta` act; `same`: two of them are one."""
+    rng, rows = np.random.default_rng(seed), rows_of()
+    n = rows.time.size
+    push = rng.standard_normal((4, n)) * np.isin(rows.channel, (0, 1)) / 4
+    if same:
+        push[1] = push[0]
+    residual = rng.standard_normal(n) + sum(v * push[j] for j, v in theta.items()) + more
+    nuisance = (rows.channel == 2)[:, None] * np.ones((1, 1))
+    return Gap(rows, residual, nuisance, tuple(linear("abcd"[j], push[j][:, None]) for j in range(4)))
 
 
 def test_cosines_are_orthonormal_within_each_cell():
@@ -352,3 +388,129 @@ def test_the_level_of_the_noise_is_that_of_its_mean_square_in_small_groups_too()
         f = forms(gap)
         found.append(noise_of(f, fitted(f, ())) ** 2)
     assert np.mean(found) == pytest.approx(1.0, abs=0.04)
+
+
+def test_invariance_is_the_random_effects_likelihood():
+    gap = gap_of({0: 2.0}, seed=3)
+    f: Forms = forms(gap, Background.plain())
+    model = next(m for m in sought(f) if m.effects == (0,))
+    found = invariance(f, model, 0, gap.rows.trial)
+    push, left = gap.candidates[0].jacobian[:, 0], None
+    left = gap.residual - gap.nuisance @ model.x[:1] - push * model.x[1]
+    size = 1.01 * model.x[1] ** 2 + 1e-12
+    score = np.zeros(WANDER.size)
+    for trial in range(4):
+        mine = gap.rows.trial == trial
+        for i, wander in enumerate(WANDER):
+            covariance = np.eye(mine.sum()) + wander**2 * size * np.outer(push[mine], push[mine])
+            score[i] += multivariate_normal(np.zeros(mine.sum()), covariance).logpdf(left[mine])
+    same, other = WANDER <= 0.1, WANDER >= 0.5
+    one, several = (np.logaddexp.reduce(score[k]) - np.log(k.sum()) for k in (same, other))
+    assert found.log_bayes_factor == pytest.approx(float(one - several), abs=1e-6)
+    assert found.log_bayes_factor > 1 and found.p_value > 0.01
+    np.testing.assert_allclose(found.estimates[:, 0], 2.0, atol=4 * np.nanmax(found.sds))
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.3])
+def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
+    rows = rows_of(samples=30)
+    part = rows.channel * len(rows.parts) + rows.part
+    held, plain, widened = [], [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        push = np.ones(rows.time.size)
+        sizes = 2.0 * (1 + wander * rng.standard_normal(6))
+        residual = rng.standard_normal(rows.time.size) + sizes[part] * push
+        f = forms(Gap(rows, residual, np.zeros((rows.time.size, 0)), (linear("a", push[:, None]),)))
+        model = fitted(f, (0,))
+        more = scatter_between(f, model, 0, part)[0]
+        sd = np.sqrt(model.covariance[0, 0] + more)
+        held.append(abs(model.x[0] - 2.0) < 1.645 * sd)
+        plain.append(abs(model.x[0] - 2.0) < 1.645 * np.sqrt(model.covariance[0, 0]))
+        widened.append(more / model.covariance[0, 0])
+    # Parts that are off count for less, which leaves few: noise alone holds 11 of 60 with them, this 42.
+    assert sum(held) >= (40 if wander else 50)
+    assert sum(plain) < 20 if wander else np.median(widened) < 1
+
+
+def test_what_changes_sign_between_trials_is_no_cause():
+    rows = rows_of(samples=30)
+    push = np.ones(rows.time.size) * (rows.channel == 0)
+    sizes = np.array([3.0, -1.0, 2.5, 0.2])[rows.trial]
+    residual = np.random.default_rng(0).standard_normal(rows.time.size) + sizes * push
+    gap = Gap(rows, residual, np.zeros((rows.time.size, 0)), (linear("a", push[:, None]),))
+    f = forms(gap)
+    model = next(m for m in sought(f) if m.effects == (0,))
+    assert invariance(f, model, 0, rows.trial).log_bayes_factor < -3
+    assert attribute(gap, heldout=False).verdict == "unknown"
+
+
+SURE = 1e-12  # a p-value that leaves no doubt of a gap
+
+
+def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | None = None) -> Explanation:
+    effects = tuple(sorted(name))
+    return Explanation(effects, weight, effects if causes is None else causes, known)
+
+
+def test_probabilities_are_the_weights_where_every_set_is_known():
+    found = probabilities([one("a", 0.7), one("ab", 0.2), one("", 0.1)], SURE)
+    assert sum(found.values()) == pytest.approx(1.0)
+    assert found["a"] == pytest.approx(0.7) and found["a+b"] == pytest.approx(0.2)
+    assert found["unknown"] == pytest.approx(0.1) and found["none"] < 1e-6
+
+
+def test_what_a_set_is_not_known_to_explain_is_unknown():
+    found = probabilities([one("a", 0.8, 0.25), one("b", 0.2, 0.5)], SURE)
+    assert found["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
+    assert conclude([one("a", 0.8, 0.25), one("b", 0.2, 0.5)], SURE).verdict == "unknown"
+
+
+def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
+    sets = [one("a", 0.9), one("", 0.1)]
+    assert probabilities(sets, ALARM)["none"] == pytest.approx(0.5)
+    assert acting(sets, ALARM)["a"] == pytest.approx(0.45)
+    assert conclude(sets, 1.01 * ALARM).verdict == "none" and conclude(sets, 0.99 * ALARM).verdict == "named"
+
+
+def test_a_gap_that_does_not_matter_is_none_however_sure():
+    told = conclude([one("a", 1.0)], SURE, matters=False)
+    assert told.verdict == "none" and told.causes == () and told.probabilities["none"] > 0.99
+
+
+def test_forced_effects_are_named_whatever_the_gap():
+    assert conclude([one("ab", 1.0, 0.0)], 0.9, forced=("b", "a")).causes == ("a", "b")
+
+
+def test_sets_of_the_same_causes_count_together():
+    """Two sets whose smaller effects differ have the same cause, likelier than the single likeliest set."""
+    sets = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
+    assert leading(sets) == ("b",)
+    assert conclude(sets, SURE).causes == ("b",)
+    assert conclude(sets, SURE, chosen=("a",)).causes == ("a",)
+
+
+@pytest.mark.parametrize(("odds", "verdict"), [(19.0, "set"), (21.0, "named")])
+def test_what_takes_a_causes_place_is_told_down_to_one_in_twenty(odds, verdict):
+    weight = odds / (1 + odds)
+    told = conclude([one("a", weight), one("b", 1 - weight)], SURE)
+    assert told.verdict == verdict and told.indistinguishable == (("b",) if verdict == "set" else ())
+
+
+def test_an_effect_too_small_to_be_a_cause_is_no_cause_beside_an_alternative_either():
+    """Beside a and beside b stands the same small effect s: b takes a's place, s takes nobody's."""
+    sets = [one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))]
+    assert alike(sets, ("a",)) == ("b",)
+
+
+def test_a_larger_set_is_no_alternative():
+    assert alike([one("a", 0.5), one("bc", 0.5)], ("a",)) == ()
+
+
+def test_what_a_set_can_do_without_is_no_cause():
+    nested = [one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)]
+    assert conclude(nested, SURE).causes == ("a",)
+    assert conclude([one("ab", 0.96), one("a", 0.03)], SURE).causes == ("a", "b")  # ruled out
+    assert conclude([one("ab", 0.6), one("a", 0.3, 0.01)], SURE).causes == ("a", "b")  # it leaves too much
+    other = conclude([one("ab", 0.6), one("c", 0.3)], SURE)  # not a part of the set but an alternative to it
+    assert other.causes == ("a", "b") and other.indistinguishable == ("c",)

@@ -1,15 +1,11 @@
 """Noise that effects carry along, taken off the products of columns: closed forms and planted effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from demo_recordings import recorded
 
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import BlockTask, read_task
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
@@ -99,12 +95,8 @@ def test_an_effect_has_its_own_size(error):
 
 
 @pytest.fixture(scope="module")
-def given(shared):
-    folder = shared / "recordings/none_1"
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    assert isinstance(task, BlockTask)
-    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2, 3, 4)]
-    frame = double_precision(lambda: build(align(trials, task, rig)))()
+def given():
+    frame = double_precision(lambda: build(align(*recorded("none_1", 4))))()
     return double_precision(lambda: with_nuisances(problem(frame)))()
 
 

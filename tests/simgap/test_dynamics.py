@@ -1,14 +1,12 @@
 """The dynamics against closed forms, conservation laws and finite differences."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from simgap_scenes import FAR, at, evolve, scene, tips
 
-from simgap.world.dynamics import energy, interact
+from simgap.world.dynamics import FADE, energy, friction, interact, normal_force
 from simgap.world.properties import Block
 from simgap.world.virtual_model import rollout
 
@@ -167,19 +165,41 @@ def test_gradients_through_contact_agree_with_differences():
         assert float(value) == pytest.approx(float(loss(*up) - loss(*down)) / (2 * h), rel=1e-4)
 
 
-def test_gradients_are_finite_exactly_at_touch():
-    constants = scene()
-    state = at(constants, (0.0, 0.008))  # resting at depth 0, tips at depth 0
-
-    def total(weight, x):
-        fingers = tips(-0.01, 0.008, 0.01, 0.008)._replace(x=(-x, x))
-        _, loads = interact(constants._replace(weight=(weight,)), state, fingers)
-        return loads.fx[0] + loads.block_y[0]
-
-    for value in jax.grad(total, argnums=(0, 1))(jnp.asarray(0.4), jnp.asarray(0.01)):
-        assert np.isfinite(value)
+K, C = jnp.asarray(4000.0), jnp.asarray(8.0)
 
 
-def test_blocks_refuse_impossible_numbers():
-    with pytest.raises(ValueError, match="weight"):
-        dataclasses.replace(Block(0.4, 0.02, 0.016), weight=-1.0)
+def f(value: float) -> jax.Array:
+    return jnp.asarray(value)
+
+
+def test_a_spring_pushes_by_its_compression_and_never_pulls():
+    assert float(normal_force(K, C, f(1e-3), f(0.0))) == pytest.approx(4.0)
+    assert float(normal_force(K, C, f(1e-3), f(0.1))) == pytest.approx(4.8)
+    assert float(normal_force(K, C, f(-1e-3), f(5.0))) == 0.0
+    assert float(normal_force(K, C, f(1e-3), f(-5.0))) == 0.0
+
+
+def test_force_and_slope_are_continuous_enough_at_touch():
+    depths = jnp.linspace(-2 * FADE, 2 * FADE, 4001)
+    forces = jax.vmap(lambda d: normal_force(K, C, d, f(0.1)))(depths)
+    assert float(jnp.abs(jnp.diff(forces)).max()) < 1.1 * (4000 + 8 * 0.1 / FADE) * (4 * FADE / 4000)
+    slopes = jax.vmap(jax.grad(lambda d: normal_force(K, C, d, f(0.1))))(depths)
+    assert bool(jnp.isfinite(slopes).all())
+    assert np.isfinite(jax.grad(lambda d: normal_force(K, C, d, f(0.1)))(f(0.0)))
+
+
+def test_friction_sticks_below_the_cone_without_creeping():
+    deflection = f(2e-4)
+    for _ in range(100):
+        force, deflection = friction(f(2500.0), f(5.0), deflection, f(0.0), f(1.0))
+    assert float(deflection) == 2e-4
+    assert float(force) == pytest.approx(0.5)
+
+
+def test_friction_slips_at_the_cone_and_lets_go_without_load():
+    force, deflection = friction(f(2500.0), f(5.0), f(1e-3), f(0.01), f(1.0))
+    assert float(force) == 1.0
+    assert float(deflection) == pytest.approx(1.0 / 2500)
+    force, deflection = friction(f(2500.0), f(5.0), f(-1e-3), f(-0.01), f(0.0))
+    assert float(force) == 0.0
+    assert float(deflection) == 0.0

@@ -1,7 +1,5 @@
 """An effect is a plug-in: what it does stands in `simgap/effects`, and no other file lists it by its name."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 
@@ -30,8 +28,3 @@ def test_no_file_but_those_that_define_effects_names_one():
         if others:
             listed[str(path.relative_to(ROOT))] = others
     assert listed == {}
-
-
-def test_the_search_for_names_finds_them(tmp_path):
-    (tmp_path / "list.py").write_text('SENSORS = ("force_bias", "x")\nKEY = "link_length/1"\n')
-    assert named_in(tmp_path / "list.py", set(fitted())) == {"force_bias", "link_length"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from demo_recordings import RIG, TASK
@@ -17,7 +16,7 @@ from simgap.gap.sensor_noise import kinks, of_a_kink, pushed, speed_jumps
 from simgap.gap.twins import performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
-from tests.simgap.test_gap_effects import as_jax, performance, world_of
+from tests.simgap.test_gap_effects import performance, world_of
 
 BLOCKS = {"block1": Block(0.5, 0.018, 0.016), "block2": Block(0.6, 0.026, 0.016)}
 TWICE = OperatorSettings(pace=(1.8, 2.0))
@@ -57,9 +56,9 @@ def test_fast_work_leaves_little_but_noise_away_from_contact_changes(fast, chann
 
 
 def test_five_samples_give_slopes_to_fourth_order():
-    world = as_jax(world_of(performance(400)))
+    world = world_of(performance(400))
     t = np.asarray(world.t)
-    found, three = fivepoint(world, jnp.asarray(t**4)[..., None])
+    found, three = fivepoint(world, np.asarray(t**4)[..., None])
     exact = 4 * t**3
     assert np.abs(found[..., 0] - exact)[:, 2:-2].max() < 1e-9 * np.abs(exact).max()
     assert np.abs(three[..., 0] - exact)[:, 2:-2].max() > 1e-6 * np.abs(exact).max()

@@ -1,16 +1,12 @@
 """The fit on recordings: healthy ones are noise, a planted effect is found with its parameters."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from demo_recordings import RECORDINGS, recorded
 
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import BlockTask, read_task
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.effects import effect_named
@@ -20,11 +16,8 @@ from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import Start, derivatives, fit, neutral, problem, slots
 
 
-def read(folder, count=2):
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    assert isinstance(task, BlockTask)
-    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in range(1, count + 1)]
-    return build(align(trials, task, rig))
+def read(name):
+    return build(align(*recorded(name, 2)))
 
 
 def own(given, found, name):
@@ -36,8 +29,8 @@ def own(given, found, name):
 
 
 @pytest.fixture(scope="module")
-def healthy(shared):
-    given = problem(read(shared / "recordings/none_1"))
+def healthy():
+    given = problem(read("none_1"))
     return given, double_precision(fit)(given, Start((), neutral(given)))
 
 
@@ -55,9 +48,9 @@ def test_no_force_bias_is_found_in_a_healthy_recording(healthy):
 
 
 @double_precision
-def test_a_force_bias_is_recovered(shared):
-    given = problem(read(shared / "recordings/force_bias_1"))
-    labels = json.loads((shared / "recordings/labels.json").read_text())
+def test_a_force_bias_is_recovered():
+    given = problem(read("force_bias_1"))
+    labels = json.loads((RECORDINGS / "labels.json").read_text())
     truth = next(e for e in labels if e["case"] == "force_bias_1")["params"]["bias"]
     plain, biased = (fit(given, Start(e, neutral(given))) for e in ((), ("force_bias",)))
     np.testing.assert_allclose(list(own(given, biased, "force_bias").values()), truth, atol=0.004)
@@ -92,8 +85,8 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
 
 
 @double_precision
-def test_what_the_rig_admits_is_a_nuisance(shared):
-    frame = read(shared / "recordings/none_1")
+def test_what_the_rig_admits_is_a_nuisance():
+    frame = read("none_1")
     rig = frame.rig.model_copy(
         update={"systematic": frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})}
     )

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from demo_recordings import recorded
 
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import BlockTask, read_task
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
@@ -50,11 +45,7 @@ def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
 
 @pytest.fixture(scope="module")
 def given():
-    folder = Path(__file__).parents[2] / "recordings" / "none_1"
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    assert isinstance(task, BlockTask)
-    trials = [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in (1, 2)]
-    return double_precision(lambda: problem(build(align(trials, task, rig))))()
+    return double_precision(lambda: problem(build(align(*recorded("none_1", 2)))))()
 
 
 def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
@@ -121,16 +112,16 @@ def test_a_block_that_turns_frees_all_but_where_it_stands(given):
 def test_angles_in_doubt_widen_positions_by_what_they_move(given):
     """A variance of angles is that of the block's place and of the fingers' distance, by differences."""
     frame, variance, step = given.frame, 1e-6, 1e-6
-    world = jax.tree.map(lambda z: jnp.asarray(z, float), frame.world)
-    noise = jnp.asarray(np.where(frame.arrays.sd > 0, frame.arrays.sd, 1.0))
-    doubtful = world._replace(doubt_joints=jnp.full_like(world.joints, variance))
+    world = frame.world
+    noise = np.asarray(np.where(frame.arrays.sd > 0, frame.arrays.sd, 1.0))
+    doubtful = world._replace(doubt_joints=np.full_like(world.joints, variance))
     sure, wide = (
-        np.asarray(residuals(w, frame.arrays, jnp.asarray(given.centre), noise)[1]) for w in (world, doubtful)
+        np.asarray(residuals(w, frame.arrays, np.asarray(given.centre), noise)[1]) for w in (world, doubtful)
     )
     more = (wide - sure)[..., :4] * np.square(np.asarray(noise)[..., :4])
     expected = np.zeros_like(more)
     for k in range(4):
-        turned = world._replace(joints=world.joints.at[..., k].add(step))
+        turned = world._replace(joints=world.joints + step * np.eye(4)[k])
         x1, y1, x2, y2 = np.moveaxis(np.asarray((tips(turned)[0] - tips(world)[0]) / step), -1, 0)
         expected += variance * np.stack([(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], -1) ** 2
     firm = np.asarray(world.carry) > 0  # a block in the air is held firmly but at the ends
@@ -143,7 +134,7 @@ def test_angles_in_doubt_widen_positions_by_what_they_move(given):
 def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_no_weight(given):
     a, (column,) = given.frame.arrays, _inertial(given)
     there, free = given.whitening.weight > 0, a.phase[..., Phase.FREE] > 0
-    world = jax.tree.map(jnp.asarray, given.frame.world)
+    world = given.frame.world
     acceleration = np.asarray(gradient(world.t, tips(world)[1]))
     net = BEYOND * (acceleration[..., :2] + acceleration[..., 2:])
     out = np.zeros(there.shape)

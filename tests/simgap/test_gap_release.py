@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -25,8 +24,8 @@ MOVES = np.repeat(np.eye(2)[None, [0] * 10 + [1] * 10], 1, axis=0)  # (1, 20, 2)
 
 def grips(first: list[float]) -> np.ndarray:
     """Firmness (20,): one grip begins with the given ones and is 2 N, the other is 0.5 N."""
-    grip = jnp.asarray([[*first, *[2.0] * (10 - len(first)), *[0.5] * 10]])
-    return np.asarray(firmness(grip, jnp.ones_like(grip), jnp.asarray(MOVES)))[0]
+    grip = np.asarray([[*first, *[2.0] * (10 - len(first)), *[0.5] * 10]])
+    return np.asarray(firmness(grip, np.ones_like(grip), np.asarray(MOVES)))[0]
 
 
 @pytest.mark.parametrize(("grip", "holds"), [(0.3, False), (0.05, False), (1.6, True)])
@@ -41,8 +40,8 @@ def test_a_light_grip_is_firm_where_it_is_usual():
 
 
 def test_nothing_is_held_by_less_than_noise():
-    grip = jnp.full((1, 20), 0.5 * HELD)
-    assert (np.asarray(firmness(grip, jnp.ones_like(grip), jnp.asarray(MOVES))) < 0.1).all() and 0 < LOOSE < 1
+    grip = np.full((1, 20), 0.5 * HELD)
+    assert (np.asarray(firmness(grip, np.ones_like(grip), np.asarray(MOVES))) < 0.1).all() and 0 < LOOSE < 1
 
 
 def test_how_fast_a_block_comes_off_its_support_is_in_doubt():

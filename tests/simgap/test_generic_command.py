@@ -1,7 +1,5 @@
 """`hmmseg diagnose --against`: document, figures, page and refusals."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -53,21 +51,20 @@ def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):
     assert "--against SIM" in line and line.count("\n") == 1
 
 
-def test_measured_properties_do_not_go_along(folder, capsys):
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [
+        (["--actual", "actual.toml"], "does not go with --against"),
+        (["--healthy", "sim_04.csv"], "does not go with --against"),
+        (["--effect", "grip_slip"], "needs the virtual model"),
+        (["--against", "real_00.csv"], "the same trial as"),
+    ],
+)
+def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypatch, more, line):
+    monkeypatch.chdir(folder)
     (folder / "actual.toml").write_text("")
-    assert main(arguments(folder, "--actual", str(folder / "actual.toml"))) == 2
-    assert "does not go with --against" in capsys.readouterr().err
-
-
-def test_an_effect_of_the_virtual_model_is_refused(folder, capsys):
-    assert main(arguments(folder, "--effect", "grip_slip")) == 2
-    assert "needs the virtual model" in capsys.readouterr().err
-
-
-def test_a_trial_given_as_both_is_refused(folder, capsys):
-    args = arguments(folder)
-    assert main([*args, str(folder / "real_00.csv")]) == 2
-    assert "the same trial as" in capsys.readouterr().err
+    assert main(arguments(folder, *more)) == 2
+    assert line in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -94,23 +91,3 @@ def test_a_bias_is_named_with_figures_and_page(folder):
     page = (folder / "p.html").read_text()
     assert 'id="verdict"' in page and "force_bias" in page
     assert not re.search(r"(src|href)=\"(?!data:)", page)
-
-
-@pytest.mark.slow
-def test_block_tasks_may_be_compared_with_given_trials(shared, tmp_path):
-    """The stand-in's healthy recordings against themselves with fy1 biased."""
-    folder = shared / "recordings/none_1"
-    files = sorted(folder.glob("trial_*.csv"))[:4]
-    for path in files:
-        table = pd.read_csv(path)
-        table["fy1"] += 0.3
-        table.to_csv(tmp_path / f"biased_{path.name}", index=False)
-    biased = sorted(str(p) for p in tmp_path.glob("biased_*.csv"))
-    out = tmp_path / "d.json"
-    args = ["diagnose", *biased, "--task", str(folder / "task.toml"), "--rig", str(folder / "rig.toml"),
-            "--against", *map(str, files), "--json", str(out), "--quiet"]  # fmt: skip
-    assert main(args) == 0
-    document = json.loads(out.read_text())
-    z = {row["channel"] for row in document["where"]}
-    assert document["detection"]["p_value"] < 0.1
-    assert not z or "fy" in z

@@ -1,21 +1,18 @@
 """The generic diagnosis: features with known values, planted effects named, alike ensembles called alike."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from experiments.gap_generic import made as pairs_of_experiment
 from experiments.generic_ensembles import PLANTED, TASK, ensemble
+from experiments.generic_ensembles import made as case_of
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from simgap.generic.diagnose import detect, diagnose, diagnosed, gap_of, whitening
 from simgap.generic.effects import (
     Ring,
-    effects,
     fit_ring,
     from_swing,
     predicted,
@@ -175,7 +172,7 @@ def test_a_planted_effect_is_named_with_its_parameters(name):
 @pytest.mark.parametrize("pair", [("force_gain", "force_lag"), ("force_bias", "force_gain")])
 def test_two_planted_effects_are_both_named(pair):
     """What a gain does to noise, and a lag by parts of a sample, must not stand in for one of them."""
-    ensembles = pairs_of_experiment(101, {name: PLANTED[name] for name in pair}, False)
+    ensembles = case_of(101, {name: PLANTED[name] for name in pair}, False)
     assert diagnosed(ensembles).body["causes"] == list(pair)
 
 
@@ -235,11 +232,6 @@ def test_rates_may_differ():
     found = both(lay)
     top = lay.kind == FAST
     assert np.abs(found[0].mean(0) - found[1].mean(0))[top].mean() < 0.6  # averaged, not picked
-
-
-def test_every_candidate_says_what_it_does():
-    for name, candidate in effects().items():
-        assert candidate.name == name and candidate.says and candidate.shows and candidate.parameters
 
 
 def test_rings_begin_at_their_event(alike):

@@ -1,7 +1,5 @@
 """Friction that goes by load, speed and direction holds a joint and brakes it as closed forms say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

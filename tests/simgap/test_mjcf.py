@@ -1,7 +1,5 @@
 """MuJoCo models as simulators: maps, rollouts against closed forms, what is set and taken back, patches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -81,11 +79,14 @@ def test_what_is_set_is_taken_back(files):
     np.testing.assert_array_equal(before, after)
 
 
-def test_a_step_of_torque_is_held_as_the_steps_have_it():
+def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
     from simgap.simulators.mjcf.signals import Held
 
     held = Held(np.array([0.0, 0.005, 0.01]), np.arange(0, 0.012, 0.002))
     np.testing.assert_allclose(held(np.array([1.0, 3.0, 0.0])), [1, 1, 2, 3, 3, 0])
+    held = Held(np.array([0.0, 0.01, 0.02]), np.arange(0, 0.02, 0.005))  # a line is half a sample sooner
+    np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 1.0), [0.5, 1.5, 1.75, 1.25])
+    np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 0.5), [0.25, 0.75, 1.875, 1.625])
 
 
 @pytest.mark.parametrize(
@@ -200,14 +201,6 @@ def test_a_patch_touches_only_what_changes(files):
     again = option_set(text, {"timestep": "0.002"})
     assert again is not None and 'timestep="0.002"' in again
     mujoco.MjModel.from_xml_string(again)
-
-
-def test_a_line_between_samples_is_half_a_sample_sooner():
-    from simgap.simulators.mjcf.signals import Held
-
-    held = Held(np.array([0.0, 0.01, 0.02]), np.arange(0, 0.02, 0.005))
-    np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 1.0), [0.5, 1.5, 1.75, 1.25])
-    np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 0.5), [0.25, 0.75, 1.875, 1.625])
 
 
 def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files):

@@ -1,15 +1,11 @@
 """Identification and diagnosis stand on one alignment and one set of contact equations: they must agree."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from demo_recordings import recorded
 
 from estimation.identification import identify_aligned
 from hmmseg.errors import InputError
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import read_task
 from hmmseg.segmentation.align import align
 from simgap.api import diagnose
 from simgap.gap.frame import build
@@ -17,27 +13,24 @@ from simgap.gap.problem import Start, fit, neutral, problem
 from simgap.world.properties import Block
 from simgap.world.simulate import simulate_trials
 
-FOLDER = Path(__file__).parents[2] / "recordings/none_1"
 PROPERTIES = ("weight", "width", "height")
 DRAWN = {"block1": Block(0.71, 0.0231, 0.0142), "block2": Block(0.26, 0.0174, 0.0193)}
 
 
-def recorded(folder):
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    trials = [read_trial(path, rig) for path in sorted(folder.glob("trial_*.csv"))[:2]]
-    return align(trials, task, rig)
+def as_recorded():
+    return align(*recorded("none_1", 2))
 
 
-def simulated(folder):
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
+def simulated():
+    _, task, rig = recorded("none_1", 1)
     made = simulate_trials(task, rig, [DRAWN] * 3, [5, 6, 7], None)
     return align([one.trial for one in made], task, rig)
 
 
-@pytest.mark.parametrize("source", [recorded, simulated])
+@pytest.mark.parametrize("source", [as_recorded, simulated])
 def test_properties_without_an_effect_are_those_identified(source):
     """Each within one standard deviation of what `identify` says: two summaries of the same samples."""
-    aligned = source(FOLDER)
+    aligned = source()
     found = identify_aligned(aligned)
     given = problem(build(aligned))
     healthy = fit(given, Start((), neutral(given)))
@@ -50,7 +43,7 @@ def test_properties_without_an_effect_are_those_identified(source):
 
 
 def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
-    found = identify_aligned(recorded(FOLDER))
+    found = identify_aligned(as_recorded())
 
     def never(*args):
         raise AssertionError("aligned or identified again")
@@ -85,11 +78,11 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
 def test_an_effect_that_cannot_be_taken_is_said(name, wrong):
     """A property that nobody measured cannot be wrong, and a name that is misspelt means nothing."""
     with pytest.raises(InputError, match=wrong):
-        diagnose(recorded(FOLDER), effects=(name,))
+        diagnose(as_recorded(), effects=(name,))
 
 
 def test_an_effect_that_is_never_chosen_is_taken_where_asked_for():
     """And healthy recordings of one's own are the null."""
-    aligned = recorded(FOLDER)
+    aligned = as_recorded()
     found = diagnose(aligned, effects=("object_inertia",), healthy=aligned)
     assert abs(found.body["effects"]["object_inertia"]["parameters"]["scale"]["mean"] - 1) < 0.1

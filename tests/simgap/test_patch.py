@@ -1,7 +1,5 @@
 """--patch: the corrected rig.toml reads, and the model with it reproduces a recording better."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 

@@ -1,7 +1,5 @@
 """Planted parameters come back from a data sheet's, and what logs do not tell is said."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

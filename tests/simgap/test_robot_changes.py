@@ -1,7 +1,5 @@
 """What changed between two sets of logs: a small servo whose changes are planted, as oracle."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Robots that touch things: when, in words; poses that one instrument reads; what each log has of its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Diagnoses from logs to verdict, and how logs are held out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from simgap_swing import Swing, log

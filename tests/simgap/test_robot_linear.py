@@ -1,7 +1,5 @@
 """Windows, sensitivities and identifiability against closed forms and planted values."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

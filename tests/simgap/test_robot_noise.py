@@ -1,7 +1,5 @@
 """The noise of channels, learned from differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

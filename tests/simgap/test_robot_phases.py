@@ -1,7 +1,5 @@
 """Phases of a robot's logs by a task, and what of a simulator cannot be run."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from simgap_swing import Swing, log

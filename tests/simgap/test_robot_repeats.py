@@ -1,7 +1,5 @@
 """A model's error is the same each time the same motion is made, and repeats of it tell no more of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a robot's diagnosis leaves besides its document: history, the motion to run next, own units, Rerun."""
 
-from __future__ import annotations
-
 import json
 import sys
 from types import SimpleNamespace

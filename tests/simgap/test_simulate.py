@@ -7,13 +7,12 @@ from simgap_scenes import STACK
 
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
-from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import Finger, Noise, Rig, read_rig
-from hmmseg.io.task import GROUND, BlockTask, Move, read_task
+from hmmseg.io.rig import Finger, Noise, Rig
+from hmmseg.io.task import GROUND, BlockTask, Move
 from simgap.world.operator import OperatorSettings, minimum_jerk
 from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
-from simgap.world.simulate import scene_files, simulate_trial, simulate_trials, trial_files
+from simgap.world.simulate import simulate_trial, simulate_trials
 
 TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND}, (Move("a", GROUND), Move("b", "a"), Move("c", "b")))
 SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Move("b", "a")))
@@ -105,23 +104,6 @@ def test_a_cartesian_hand_records_positions():
     done = simulate_trial(STACK, rig, PAPER_BLOCKS, seed=0)
     assert set(done.trial.channels) >= {"x1", "vy2", "fx1"}
     assert done.trial.rate == pytest.approx(100.0)
-
-
-def test_files_are_read_back_as_they_were(tmp_path, stacked):
-    (tmp_path / "truth").mkdir()
-    texts = scene_files(STACK, RIG, PAPER_BLOCKS)
-    texts |= trial_files(1, stacked.trial, stacked.boundaries, stacked.seed)
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-    assert read_rig(tmp_path / "rig.toml") == RIG
-    assert read_task(tmp_path / "task.toml") == STACK
-    back = read_trial(tmp_path / "trial_01.csv", RIG)
-    np.testing.assert_allclose(back.channels["q11"], stacked.trial.channels["q11"], atol=1e-6)
-    np.testing.assert_allclose(back.t, stacked.trial.t, atol=1e-6)
-    truth = json.loads((tmp_path / "truth/trial_01.json").read_text())
-    np.testing.assert_allclose(truth["boundaries"], stacked.boundaries, atol=1e-6)
-    blocks = read_properties(tmp_path / "actual.toml", STACK)
-    assert blocks["block1"].weight == pytest.approx(0.343)
 
 
 def test_properties_come_from_the_json_of_identify(tmp_path):

@@ -1,16 +1,23 @@
-"""Statistics of healthy twins are kept for the code that made them."""
-
-from __future__ import annotations
+"""Twins: kept for the code that made them, and a recorded performance simulated once more."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Noise
 from hmmseg.segmentation.align import align
 from simgap.gap import twins
+from simgap.gap.frame import CHANNELS, build, thinned, without_dropouts
 from simgap.gap.search import search
+from simgap.gap.sensor_noise import sensor_sd
+from simgap.world.operator import OperatorSettings
+from simgap.world.properties import Block
+from simgap.world.replay import plan_again
+from simgap.world.simulate import SimulatedTrial, noise_sd, simulate_plans, simulate_trials
 
 
 def test_other_code_has_a_cache_of_its_own(monkeypatch):
@@ -28,3 +35,66 @@ def test_without_stated_noise_there_are_twins_too():
     twin = twins._recorded(found, range(1), 0)
     assert len(twin) == 1 and len(twin[0]) == 1
     assert np.isfinite(twin[0][0].channels["fx1"]).all()
+
+
+BLOCKS = {name: Block(0.5, 0.02 + 0.004 * k, 0.018, 0.7) for k, name in enumerate(TASK.objects)}
+FORCES = ("fx1", "fy1", "fx2", "fy2")
+
+
+@pytest.fixture(scope="module")
+def quick() -> SimulatedTrial:
+    """A hasty operator at 500 Hz."""
+    rig = RIG.model_copy(update={"rate": 500.0})
+    return simulate_trials(TASK, rig, [BLOCKS], [41], OperatorSettings(pace=(1.8, 1.8)))[0]
+
+
+def test_a_repetition_moves_and_presses_as_was_recorded(quick):
+    rig = RIG.model_copy(update={"rate": 500.0})
+    signals, noise = task_space(quick.trial, rig), noise_sd(rig, "force")
+    plan = plan_again(signals, TASK, BLOCKS, list(quick.boundaries), noise)
+    again = simulate_plans(TASK, rig, [plan], [BLOCKS], [42])[0]
+    np.testing.assert_allclose(again.boundaries, quick.boundaries, atol=0.025)
+    n = min(quick.trial.t.size, again.trial.t.size)
+    for c in FORCES:
+        apart = again.trial.channels[c][:n] - quick.trial.channels[c][:n]
+        assert np.sqrt(np.mean(apart**2)) < 0.15 * np.std(quick.trial.channels["fx1"])
+
+
+def test_a_reading_that_one_finger_lost_is_left_out(quick):
+    touch, leave = quick.boundaries[:2]
+    inside = np.flatnonzero((quick.trial.t > touch + 0.1) & (quick.trial.t < leave))[::9]
+    channels = {k: v.copy() for k, v in quick.trial.channels.items()}
+    for c in ("fx2", "fy2"):
+        channels[c][inside] = 0.002
+    left = without_dropouts(replace(quick.trial, channels=channels))
+    for c in FORCES:
+        assert (np.flatnonzero(np.isnan(left.channels[c])) == inside).all()
+    assert without_dropouts(quick.trial) is quick.trial  # no touch and no release is taken for one
+
+
+def test_what_pads_damp_is_in_doubt_and_quick_fingers_are_where_their_mean_is(quick):
+    rig = RIG.model_copy(update={"rate": 500.0})
+    frame = build(align([quick.trial], TASK, rig))
+    n, column, arrays = frame.lengths[0], CHANNELS.index("distance"), frame.arrays
+    phase = frame.world.ground[0, :n] + frame.world.carry[0, :n]
+    there = (arrays.there[0, :n, column] > 0) & (phase > 0)
+    signals = task_space(thinned(quick.trial, rig)[0], rig)
+    width = signals.distance + (signals.fx1 - signals.fx2) / rig.fingertip.normal_stiffness
+    own = np.array([BLOCKS[m.object].width for m in TASK.performed])[arrays.onehot[0, :n].argmax(axis=1)]
+    off = (width - own)[there]
+    plain, doubted = (sd[0, :n, column][there] for sd in (arrays.plain, arrays.sd))
+    assert (doubted / plain).max() > 2  # as fingers close
+    assert np.abs(off / doubted).max() < 3.5
+
+
+def test_means_of_speeds_that_a_drive_makes_of_angles_are_quieter_than_one():
+    rng, group, rate = np.random.default_rng(0), 17, 500.0
+    angles = 2e-4 * rng.standard_normal((200 * group + 1, 4))
+    rates = (np.diff(angles, axis=0) * rate).reshape(200, group, 4).mean(1)
+    joints = angles[1:].reshape(200, group, 4).mean(1)
+    stated = 2e-4 * rate * np.sqrt(2)
+    rig = RIG.model_copy(update={"noise": RIG.noise.model_copy(update={"velocity": stated})})
+    nothing = dict.fromkeys(("x", "vx", "force"), np.full(200, 0.01))
+    sd = sensor_sd(joints, rates, nothing, rig, group)
+    assert sd[:, 1] == pytest.approx(rates.std(), rel=0.35)  # successive means are not independent
+    assert (sd[:, 1] < 0.4 * stated / np.sqrt(group)).all()

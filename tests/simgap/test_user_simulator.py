@@ -1,7 +1,5 @@
 """A simulator read from a user's file, and every line that says what is wrong with one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

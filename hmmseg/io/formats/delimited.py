@@ -31,7 +31,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Layout:
-    """How one text file is laid out; line numbers count from 0.
+    """The layout of one text file; line numbers count from 0.
 
     `most`: cells of the longest row, of which those beyond the names are empty. `notes`: what was left out.
     """

@@ -214,7 +214,7 @@ class _Catalogue:
         says = "the simulator's own time step, relative"
         self.add("option.timestep", 0.5, says, low=-1.1, high=1.0)
         if self.simulator.driven:
-            # What comes half a sample later than in steps is a delay like any other, and told as one.
+            # What comes half a sample later than in steps is a delay like any other, and reported as one.
             says = "commands between samples: in steps (0), in lines (1, half a sample sooner)"
             self.add(HOLD, 0.5, says, low=0.0, high=1.0)
             says = "commands come later within the simulator's step, by this share of it"

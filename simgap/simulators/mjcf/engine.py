@@ -22,7 +22,7 @@ mujoco.set_mju_user_warning(_count)
 
 
 def warned() -> list[str]:
-    """What MuJoCo has warned of since this was asked for last, each thing once with how often."""
+    """MuJoCo's warnings since the last call, each once with its count."""
     found = [f"MuJoCo: {text} ({count} times)" for text, count in _WARNED.most_common()]
     _WARNED.clear()
     return found

@@ -173,7 +173,7 @@ class MjcfSimulator:
 
     @property
     def _partial(self) -> bool:
-        """Whether some of the state is told by no column."""
+        """Whether no column determines some of the state."""
         states = len(self.joints) + 6 * len(self.free)
         return states < self.model.nv or self.model.na > 0
 

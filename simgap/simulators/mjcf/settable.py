@@ -1,7 +1,7 @@
 """What of a MuJoCo model can be set: names such as `joint:elbow.damping`, their values, and how to set them.
 
 Everything of the catalogue is a field of the compiled model, set in place and taken back; any other attribute
-of MjSpec, given by name, is set there and compiled anew. Laws that go by the state are no field: `laws.py`.
+of MjSpec, given by name, is set there and recompiled. Laws that go by the state are no field: `laws.py`.
 """
 
 from __future__ import annotations

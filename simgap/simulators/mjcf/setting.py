@@ -14,7 +14,7 @@ from simgap.simulators.mjcf.engine import mujoco
 @dataclass(frozen=True)
 class Setting:
     """One thing that can be set. `get(model)` is its value, `put(model, value)` sets it in a compiled model;
-    `derived`: whether constants derived from it (mj_setConst) must be made anew. `xml`: the attribute, for a
+    `derived`: whether constants derived from it (mj_setConst) must be recomputed. `xml`: the attribute, for a
     patch, as (object kind, object name, attribute, index or None). `mixed`: what only comes in steps is mixed
     in proportion of two runs, without it and with it at this value."""
 

@@ -1,0 +1,318 @@
+"""The paper's method: states by thresholds and properties by its formulas, on signals with known answers."""
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation.paper_formulas import Estimate, FrictionBound, estimate_plugin
+from experiments.score_recordings import first_change_order
+from hmmseg.contact.decompose import ABOVE_GROUND, FREE, subtasks
+from hmmseg.errors import InputError
+from hmmseg.hand.signals import Signals
+from hmmseg.io.task import BlockTask, Move, SequenceTask
+from hmmseg.io.trial import Trial
+from hmmseg.segmentation.spans import Segmentation, Span
+from hmmseg.segmentation.thresholds import (
+    StateLabels,
+    agreement,
+    label_states,
+    monotone_order,
+    segment_qualitative,
+    threshold,
+)
+
+STACK = BlockTask(
+    {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
+)
+PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
+SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
+# fx1, fy1, fx2, fy2 [N], vx, vy [m/s] that show each state; s slides, 0 shows none.
+PATTERNS = {
+    "1": (0.0, 0.0, 0.0, 0.0, 0.2, 0.1),
+    "2": (2.0, 0.2, -2.0, 0.2, 0.2, 0.1),
+    "3": (2.0, -0.2, -2.0, 0.2, 0.0, 0.0),
+    "s": (2.0, -0.2, -2.0, -0.2, -0.2, 0.0),
+    "0": (2.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+}
+
+
+def make_signals(states: str, dt: float = 0.05) -> Signals:
+    columns = np.array([PATTERNS[s] for s in states]).T
+    fx1, fy1, fx2, fy2, vx, vy = columns
+    zero = np.zeros(len(states))
+    return Signals(
+        t=np.arange(len(states)) * dt, x1=zero, y1=zero, vx1=vx, vy1=vy, fx1=fx1, fy1=fy1,
+        x2=zero + 0.02, y2=zero, vx2=vx, vy2=vy, fx2=fx2, fy2=fy2,
+        sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01,
+    )  # fmt: skip
+
+
+def segment(states: str, task, **options):
+    signals = make_signals(states)
+    return segment_qualitative(Trial("made.csv", signals.t, {}), signals, task, **options)
+
+
+def starts(segmentation) -> list[float]:
+    return [span.start for span in segmentation.spans]
+
+
+def test_threshold_is_tri_valued_and_keeps_missing_samples_missing():
+    out = threshold(np.array([0.06, 0.05, 0.0, -0.05, -0.06, np.nan]), 0.05)
+    np.testing.assert_array_equal(out, [1, 0, 0, 0, -1, np.nan])
+
+
+def test_states_in_the_paper_s_numbering():
+    labels = label_states(make_signals("123s0"))
+    np.testing.assert_array_equal(labels.state, [1, 2, 3, 3, 0])
+    np.testing.assert_array_equal(labels.sliding, [False, False, False, True, False])
+
+
+@pytest.mark.parametrize(("state", "change", "options", "expected"), [
+    ("1", {"fx1": -0.06}, {}, 0), ("1", {"fy1": -0.06}, {}, 0), ("1", {"fx2": -0.06}, {}, 0),
+    ("1", {"fy2": -0.06}, {}, 0), ("3", {"vy1": 0.04, "vy2": 0.04}, {}, 3),
+    ("3", {"vy1": 0.06, "vy2": 0.06}, {}, 0), ("3", {"fy2": 0.3}, {}, 2),
+    ("2", {}, {"force_threshold": 0.5}, 0),
+    ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
+])  # fmt: skip
+def test_rules_ask_for_every_component_beyond_its_threshold(state, change, options, expected):
+    signals = replace(make_signals(state), **{name: np.array([value]) for name, value in change.items()})
+    assert label_states(signals, **options).state[0] == expected
+
+
+@pytest.mark.parametrize("state, name, expected", [
+    ("1", "fy2", 0), ("2", "fx1", 0), ("2", "fy1", 0), ("2", "vy1", 2), ("3", "vy2", 0),
+    ("3", "vx1", 3), ("s", "vx1", 3),
+])  # fmt: skip
+def test_missing_sample_is_unidentified_only_where_its_signal_is_needed(state, name, expected):
+    signals = replace(make_signals(state), **{name: np.array([np.nan])})
+    labels = label_states(signals)
+    assert labels.state[0] == expected
+    assert not labels.sliding[0]
+
+
+def test_clean_sequence_has_its_boundaries_half_way_between_samples():
+    out = segment("111" + "33" + "22222" + "333" + "11" + "333" + "2222" + "33" + "1111", STACK)
+    assert out.complete and out.log_evidence is None
+    assert [s.subtask for s in out.spans] == [s.name for s in subtasks(STACK)]
+    changes = np.cumsum([3, 2, 5, 3, 2, 3, 4, 2])
+    np.testing.assert_allclose(starts(out)[1:], (changes - 0.5) * 0.05)
+    np.testing.assert_allclose([s.start_sd for s in out.spans[1:]], 0.05 / math.sqrt(12))
+    widths = [s.start_90[1] - s.start_90[0] for s in out.spans[1:]]
+    np.testing.assert_allclose(widths, 0.9 * 0.05)
+    assert out.spans[0].start == 0.0 and out.spans[0].start_90 == (0.0, 0.0)
+    assert out.spans[-1].end == pytest.approx(27 * 0.05) and out.spans[-1].end_sd == 0.0
+
+
+def test_dropouts_between_subtasks_widen_their_boundary():
+    out = segment("1113300222233311", PICK)
+    assert out.spans[2].start == pytest.approx((4 + 7) / 2 * 0.05)
+    assert out.spans[2].start_sd == pytest.approx(3 * 0.05 / math.sqrt(12))
+
+
+def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
+    # The grip flickers to hold-above-ground and back before it lifts, as real grips do.
+    states = "11111" + "3233333" + "22222222" + "33333" + "1111"
+    monotone, first = segment(states, PICK), segment(states, PICK, order=first_change_order)
+    np.testing.assert_allclose(starts(monotone)[1:], (np.array([5, 12, 20, 25]) - 0.5) * 0.05)
+    # The plain rule takes the flicker for the carry, and the rest of the pickup for the place.
+    np.testing.assert_allclose(starts(first)[1:4], (np.array([5, 6, 7]) - 0.5) * 0.05)
+
+
+def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
+    carried = segment("1113s3222233s11", PICK)
+    assert carried.complete
+    slid = segment("111" + "33" + "ssss" + "33" + "11", SLIDE)
+    assert [s.subtask for s in slid.spans] == ["pregrasp", "pickup", "slide", "place", "release"]
+    np.testing.assert_allclose(starts(slid)[1:], (np.array([3, 5, 9, 11]) - 0.5) * 0.05)
+    np.testing.assert_allclose(
+        starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE, order=first_change_order)), starts(slid)
+    )
+
+
+def test_a_move_that_never_happens_fails_at_its_pickup_and_keeps_the_rest():
+    out = segment("1113322222333111111", STACK)
+    assert not out.complete and out.failed is not None
+    assert (out.failed.index, out.failed.subtask, out.failed.object) == (5, "pickup", "block2")
+    assert "hold-on-ground" in out.failed.reason and "0.05 N" in out.failed.reason
+    assert [s.subtask for s in out.spans] == ["pregrasp", "pickup", "carry", "place", "release"]
+    assert out.spans[-1].end == pytest.approx(18 * 0.05)
+    json.dumps(out.to_json(), allow_nan=False)
+
+
+def test_flicker_does_not_pass_for_a_later_move():
+    # Agreeing with the first 2 and 3 of the flicker would make the rest the moves of block2.
+    out = segment("1" * 30 + "2" + "3" * 12 + "2" * 30 + "3" * 12 + "1" * 30, STACK)
+    assert out.failed is not None and out.failed.index == 5
+    assert [s.object for s in out.spans] == ["block1"] * 5
+
+
+def test_an_unknown_number_of_repeats_is_counted():
+    task = replace(PICK, repeat="unknown")
+    for number in (1, 2, 3):
+        out = segment("111" + "3332222333111" * number, task)
+        assert out.complete and len(out.spans) == 1 + 4 * number
+
+
+def test_refused_input():
+    with pytest.raises(InputError, match=r"--force-threshold: found 0\.0; expected a number > 0"):
+        segment("111", PICK, force_threshold=0.0)
+    with pytest.raises(InputError, match="--velocity-threshold: found nan"):
+        segment("111", PICK, velocity_threshold=math.nan)
+    with pytest.raises(InputError, match="plain ordered task"):
+        segment("111", SequenceTask(("a", "b")))
+
+
+def best_agreement(agrees: np.ndarray) -> float | None:
+    """By enumeration: most agreeing samples of any order whose every subtask has one."""
+    length, count = agrees.shape
+    scores = []
+    for cuts in itertools.combinations(range(1, length), count - 1):
+        edges = (0, *cuts, length)
+        hits = [agrees[a:b, s].sum() for s, (a, b) in enumerate(itertools.pairwise(edges))]
+        if min(hits) > 0:
+            scores.append(sum(hits))
+    return max(scores) / length if scores else None
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from([0, 1, 2, 3]), min_size=8, max_size=12))
+def test_monotone_order_against_enumeration(states):
+    labels = StateLabels(np.array(states), np.zeros(len(states), dtype=bool))
+    steps = subtasks(PICK)
+    out, best = monotone_order(labels, steps), best_agreement(agreement(labels, steps))
+    assert out.complete == (best is not None)
+    if best is not None:
+        assert out.agreement == pytest.approx(best)
+        assert out.agreement >= first_change_order(labels, steps).agreement
+
+
+TOWER = BlockTask(
+    {"a": "b", "b": "c", "c": "ground"}, (Move("a", "ground"), Move("b", "ground"), Move("c", "a"))
+)
+WEIGHT = {"block1": 0.343, "block2": 0.437, "a": 0.2, "b": 0.3, "c": 0.4}
+WIDTH = {"block1": 0.0159, "block2": 0.0254, "a": 0.02, "b": 0.021, "c": 0.022}
+HEIGHT = {"block1": 0.016, "block2": 0.0127, "a": 0.01, "b": 0.011, "c": 0.013}
+PER_SUBTASK = 40
+# Height under the object at pickup and place, by move.
+RESTS = {
+    "stack": ((HEIGHT["block2"], 0.0), (0.0, HEIGHT["block1"])),
+    "tower": ((HEIGHT["b"] + HEIGHT["c"], 0.0), (HEIGHT["c"], 0.0), (0.0, HEIGHT["a"])),
+}
+
+
+def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segmentation]:
+    """One trial whose subtasks last 40 samples each, with scatter if a seed is given."""
+    steps = subtasks(task)
+    size = PER_SUBTASK * len(steps)
+    t = np.arange(size) * 0.05
+    zero = {name: np.zeros(size) for name in ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
+    s = Signals(t=t, **zero, **{n: np.zeros(size) for n in ("vx1", "vy1", "vx2", "vy2")},
+                **{f"sd_{n}": np.zeros(size) for n in ("x", "y", "vx", "vy")}, sd_force=0.01)  # fmt: skip
+    spans = []
+    for i, step in enumerate(steps):
+        inside = slice(i * PER_SUBTASK, (i + 1) * PER_SUBTASK)
+        start, end = t[inside][0] - 0.025, t[inside][-1] + 0.025
+        spans.append(
+            Span(step.name, step.object, step.state, start, end, 0.0, 0.0, (start, start), (end, end))
+        )
+        if step.state == FREE:
+            continue
+        assert step.move is not None
+        lift = 0.03 if step.state == ABOVE_GROUND else rests[step.move][step.name == "place"]
+        s.y2[inside] = s.y1[inside] = lift + 0.004
+        s.x2[inside] = WIDTH[step.object]
+        s.fx1[inside], s.fx2[inside] = 2.0, -2.0
+        vertical = WEIGHT[step.object] if step.state == ABOVE_GROUND else -0.1
+        s.fy1[inside] = s.fy2[inside] = vertical / 2
+        if step.state == ABOVE_GROUND:  # lift-off and impact, within the trimmed 5 %
+            s.fy1[inside.start], s.fy1[inside.stop - 1] = 0.5, 0.6
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        s = replace(s, **{n: getattr(s, n) + rng.normal(0, 0.01, size) for n in ("fy1", "fy2")})
+    return s, Segmentation("made.csv", 20.0, None, tuple(spans))
+
+
+@pytest.mark.parametrize("task, rests", [(STACK, RESTS["stack"]), (TOWER, RESTS["tower"])])
+def test_exact_signals_give_the_planted_properties(task, rests):
+    signals, segmentation = make(task, rests)
+    out = estimate_plugin([signals], [segmentation], task)
+    for name in task.objects:
+        for key, planted in (("weight", WEIGHT), ("width", WIDTH), ("height", HEIGHT)):
+            estimate = out.properties[name][key]
+            assert isinstance(estimate, Estimate), out.reasons
+            assert estimate.mean == pytest.approx(planted[name], rel=1e-9)
+        bound = out.properties[name]["friction"]
+        assert isinstance(bound, FrictionBound) and bound.lower_bound == pytest.approx(0.3)  # 0.6 / 2
+    assert out.reasons == {}
+
+
+def test_trim_leaves_out_five_percent_at_either_end():
+    signals, segmentation = make(STACK, RESTS["stack"])
+    carry = slice(2 * PER_SUBTASK, 3 * PER_SUBTASK)
+    third = signals.fy1.copy()
+    third[carry.start + 2] += 3.6  # the first sample behind the trimmed two of forty
+    out = estimate_plugin([replace(signals, fy1=third)], [segmentation], STACK)
+    assert out.properties["block1"]["weight"].mean == pytest.approx(0.343 + 3.6 / 36)
+
+
+def test_standard_deviation_is_the_samples_and_trials_pool_by_mean():
+    made = [make(STACK, RESTS["stack"], seed) for seed in range(8)]
+    signals, segmentations = [list(column) for column in zip(*made, strict=True)]
+    each = [estimate_plugin([s], [g], STACK).properties["block1"]["weight"] for s, g in made]
+    pooled = estimate_plugin(signals, segmentations, STACK).properties["block1"]["weight"]
+    assert pooled.mean == pytest.approx(np.mean([e.mean for e in each]))
+    assert pooled.sd == pytest.approx(0.01 * math.sqrt(2), rel=0.15)
+    assert pooled.standard_error == pytest.approx(0.01 * math.sqrt(2 / (36 * 8)), rel=0.15)
+    document = pooled.to_json()
+    assert document["interval_95"][1] - pooled.mean == pytest.approx(1.959964 * pooled.standard_error)
+    assert pooled.mean - document["interval_68"][0] == pytest.approx(0.994458 * pooled.standard_error)
+
+
+def test_dropouts_and_missing_samples_are_left_out():
+    signals, segmentation = make(STACK, RESTS["stack"])
+    state = np.where(np.abs(signals.fx1) > 1, np.where(signals.fy > 0, 2, 3), 1)
+    wild, gap = 2 * PER_SUBTASK + 10, 2 * PER_SUBTASK + 11
+    fy1 = signals.fy1.copy()
+    fy1[wild], fy1[gap] = 50.0, np.nan
+    state[[wild, gap]] = 0
+    labels = StateLabels(state, np.zeros(state.size, dtype=bool))
+    out = estimate_plugin([replace(signals, fy1=fy1)], [segmentation], STACK, [labels])
+    assert out.properties["block1"]["weight"].mean == pytest.approx(0.343)
+    assert out.properties["block1"]["friction"].lower_bound == pytest.approx(0.3)
+
+
+def test_what_the_task_or_the_recording_withholds_is_none_with_a_reason():
+    pick = BlockTask({"block": "ground"}, (Move("block", "ground"),))
+    steps = subtasks(pick)
+    stack, segmentation = make(STACK, RESTS["stack"])
+    names = {"block1": "block", "block2": "block"}
+    spans = tuple(replace(s, object=names[str(s.object)]) for s in segmentation.spans[: len(steps)])
+    out = estimate_plugin([stack], [replace(segmentation, spans=spans)], pick)
+    assert out.properties["block"]["height"] is None
+    assert "height" in out.reasons["block.height"]
+    assert out.properties["block"]["weight"] is not None
+
+    half = replace(segmentation, spans=segmentation.spans[:5])  # the second move is missing
+    out = estimate_plugin([stack], [half], STACK)
+    assert out.properties["block1"]["height"] is None and out.properties["block2"]["weight"] is None
+    assert out.properties["block2"]["height"].mean == pytest.approx(HEIGHT["block2"])
+    assert set(out.reasons) == {f"block2.{p}" for p in ("weight", "width", "friction")} | {"block1.height"}
+    json.dumps(out.to_json(), allow_nan=False)
+
+    slide = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
+    assert "block" in estimate_plugin([stack], [replace(half, spans=())], slide).reasons["block.weight"]
+
+
+def test_heights_that_only_sums_reveal_are_not_guessed():
+    reversal = BlockTask(TOWER.initial, (Move("a", "ground"), Move("b", "a"), Move("c", "b")))
+    h = HEIGHT
+    signals, segmentation = make(reversal, ((h["b"] + h["c"], 0.0), (h["c"], h["a"]), (0.0, h["a"] + h["b"])))
+    out = estimate_plugin([signals], [segmentation], reversal)
+    assert [out.properties[name]["height"] for name in "abc"] == [None] * 3
+    assert "together with the height of c" in out.reasons["b.height"]
