@@ -108,14 +108,13 @@ real: $(INSTALLED)  ## recordings of real robots, in folders of RECORDINGS; fill
 	$(BIN)/python -m experiments.real.hiro_snap $(REAL)/hiro_snap
 	$(BIN)/python -m experiments.real.robot_gap $(REAL)/xl330_pendulum --figures docs/figures
 	$(BIN)/python -m experiments.real.xl330_sheet $(REAL)/xl330_pendulum --diagnose --output experiments/results/xl330_sheet.json
-	$(BIN)/python -m experiments.real.contactnets $(REAL)/contactnets --figures docs/figures
 	$(BIN)/python -m experiments.write_tables
 
 wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and of our own; the figures of docs/wrist.md
 	$(BIN)/python -m experiments.wrist $(RECORDINGS)
 
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
-	$(BIN)/python -m experiments.readme_figures $(SET)
+	$(BIN)/python -m experiments.readme_figures $(LOGS)
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
 
 results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/

@@ -21,7 +21,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from experiments.saving import save
-from experiments.scoring import boundaries_covered, boundary_residuals
+from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
+from experiments.table_text import load, markdown, milliseconds, percent
 from experiments.worlds import WORLDS, Replicate, replicates
 from hmmseg.segmentation.spans import Segmentation
 
@@ -164,6 +165,29 @@ def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _covered(row: dict[str, Any], level: str) -> str:
+    share, error = row[f"coverage_{level}"], row[f"se_{level}"]
+    return "" if share is None else f"{100 * share:.0f} ± {100 * error:.0f} %"
+
+
+def table() -> str | None:
+    """docs/tables/worlds.csv: a row a world; `needed`: the factor at which intervals hold as stated."""
+    found = load("calibration_worlds")
+    if found is None:
+        return None
+    rows = []
+    for name, s in found["rows"].items():
+        rms = [percent(s[p]["rms"], 2) if p in s else "" for p in PROPERTIES]
+        needed = ["" if s[k] is None else f"x{s[k]:.2f}" for k in ("needed_95", "needed_90")]
+        cover = [_covered(s, level) for level in ("68", "95", "90")]
+        median = "" if s["boundary_median"] is None else milliseconds(s["boundary_median"])
+        cells = [*rms, *cover[:2], needed[0], cover[2], needed[1], median]
+        rows.append([name, f"{s['trials']} ({s['misfits']})", *cells])
+    head = ["world", "trials (misfits)", *(f"{p} rms" for p in PROPERTIES), "68 % cover", "95 % cover",
+            "needed", "boundaries, 90 % cover", "needed", "median"]  # fmt: skip
+    return markdown(head, rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -27,8 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.fuzz_damage import BINARIES, TABLES, TEXTS
-from experiments.fuzz_scene import Scene
+from experiments.fuzz_files import BINARIES, TABLES, TEXTS, Scene
 from hmmseg.errors import InputError
 
 HAND = ("--task", "task.toml", "--rig", "rig.toml")

@@ -4,7 +4,7 @@
 
 Four trials of every case, without `--actual` and with it, in one warm process. These recordings were in
 view while the diagnosis was built: they show that it works, the blind check shows how well. Writes
-experiments/results/gap_recordings.json (FILE with --json), and prints how many of each tier are right.
+experiments/results/gap_recordings.json (FILE with --json).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from estimation.report import read_actual
-from experiments.blind_check.tables import in_short as blind_check
+from experiments.blind_check.tables import describe as describe_blind
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
 from experiments.table_text import load, markdown
@@ -26,24 +26,6 @@ from simgap.gap.diagnose import diagnose
 
 RESULT = Path(__file__).parent / "results" / "gap_recordings.json"
 TRIALS = 4
-
-
-def tier_of(effects: Sequence[str]) -> str:
-    """none, single, pair or outside (an effect that the catalogue does not have)."""
-    if not effects:
-        return "none"
-    if any(e.startswith("x_") for e in effects):
-        return "outside"
-    return "single" if len(effects) == 1 else "pair"
-
-
-def right(tier: str, effects: Sequence[str], found: dict[str, Any]) -> bool:
-    """Whether a verdict is right: a set that holds a single cause is."""
-    if tier in ("none", "outside"):
-        return found["verdict"] == {"none": "none", "outside": "unknown"}[tier]
-    if tier == "single" and found["verdict"] == "set":
-        return effects[0] in [*found["causes"], *found["partners"]]
-    return sorted(found["causes"]) == sorted(effects)
 
 
 def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dict[str, Any]:
@@ -96,7 +78,7 @@ def _verdict(found: dict[str, Any]) -> str:
     return " + ".join(found["causes"]) or found["verdict"]
 
 
-def in_short() -> str | None:
+def describe() -> str | None:
     """docs/results.md: how often the diagnosis is right."""
     found = load("gap_recordings")
     if found is None:
@@ -119,7 +101,7 @@ def in_short() -> str | None:
         f"{quiet} of {len(healthy)} healthy ones called healthy, of {len(affected)} with one effect "
         f"{right['blind']} named without knowing the blocks' properties ({sets} more as a set that holds "
         f"the cause), {right['actual']} with them; {slowest:.0f} s of processor at most for four trials."
-        f"{blind_check()}"
+        f"{describe_blind()}"
     )
 
 
@@ -149,13 +131,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
                   row[key]["wall"], "s", flush=True)  # fmt: skip
         rows.append(row)
         save(options.json, {"rows": rows})  # after every case: what is there so far counts
-    for tier in ("none", "single", "pair", "outside"):
-        mine = [row for row in rows if tier_of(row["effects"]) == tier]
-        told = [
-            f"{key} {sum(right(tier, row['effects'], row[key]) for row in mine)}"
-            for key in ("blind", "actual")
-        ]
-        print(f"{tier}: right {', '.join(told)} of {len(mine)}")
 
 
 if __name__ == "__main__":

@@ -32,13 +32,13 @@ EXACT = 1e-9  # numerics: relative; digits that a step which only moves code may
 Json = Any  # what the json module reads and writes
 
 
-def rounded(value: Json) -> Json:
-    """The same with ten significant digits."""
+def rounded(value: Json, digits: int = 10) -> Json:
+    """The same with so many significant digits."""
     if isinstance(value, dict):
-        return {key: rounded(each) for key, each in value.items()}
+        return {key: rounded(each, digits) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [rounded(each) for each in value]
-    return float(f"{value:.10g}") if isinstance(value, float) else value
+        return [rounded(each, digits) for each in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 
 def identified(name: str) -> Json:

@@ -26,6 +26,7 @@ from estimation.design import PROPERTIES, Design, Nuisance, Unknown
 from estimation.posterior import posterior
 from estimation.sampler import sample
 from experiments.saving import save
+from experiments.table_text import load, markdown, percent
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "sbc.json"
@@ -122,6 +123,16 @@ def ranked(first: int, num: int) -> list[dict[str, Any]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(out) + "\n", encoding="utf-8")
     return out
+
+
+def table() -> str | None:
+    """docs/tables/sbc.csv: ranks of drawn data sets."""
+    found = load("sbc")
+    if found is None:
+        return None
+    rows = [[prop, f"{s['count']}", f"{s['p_value']:.2f}", percent(s["coverage_68"], 1),
+             percent(s["coverage_95"], 1)] for prop, s in found["properties"].items()]  # fmt: skip
+    return markdown(["property", "data sets", "p of uniform ranks", "68 % cover", "95 % cover"], rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

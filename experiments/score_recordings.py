@@ -13,13 +13,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from estimation.paper_formulas import estimate_plugin
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
 from experiments.scoring import (
+    PROPERTIES,
     boundaries_covered,
     boundary_residuals,
     property_scores,
@@ -27,6 +26,7 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
+from experiments.table_text import load, markdown, milliseconds, percent
 from hmmseg.contact.decompose import Subtask, subtasks
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import (
@@ -39,6 +39,7 @@ from hmmseg.segmentation.thresholds import (
 )
 
 RESULTS = Path(__file__).parent / "results"
+HEAD = ("trials complete", "boundary, median", "95th percentile", *PROPERTIES)
 Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
 
 
@@ -121,33 +122,25 @@ def summarise(scores: Sequence[dict]) -> dict:
     }
 
 
-def table(method: str, rows: Sequence[tuple[str, dict]]) -> Table:
-    """Summaries for people to read."""
-    out = Table(title=method, title_justify="left")
-    heads = (
-        "case",
-        "complete",
-        "median [ms]",
-        "95 % [ms]",
-        "coverage 90 %",
-        "weight rms",
-        "width rms",
-        "height rms",
-    )
-    for head in heads:
-        out.add_column(head, justify="left" if head == "case" else "right")
-    for name, summary in rows:
-        b, p = summary["boundaries"], summary["properties"]
-        cells = [f"{summary['complete']}/{summary['trials']}"]
-        cells += [_cell(b[key], 1e3, ".1f") for key in ("median", "percentile_95")]
-        cells += [_cell(b["coverage_90"], 100, ".0f", " %")]
-        cells += [_cell(p[key].get("rms"), 100, ".2f", " %") for key in ("weight", "width", "height")]
-        out.add_row(name, *cells)
-    return out
+def cells(s: dict) -> list[str]:
+    """A summary's cells, under HEAD."""
+    b, p = s["boundaries"], s["properties"]
+    rms = [percent(p[k]["rms"], 2) if "rms" in p[k] else "none" for k in PROPERTIES]
+    times = [milliseconds(b[k]) if b[k] is not None else "none" for k in ("median", "percentile_95")]
+    return [f"{s['complete']} of {s['trials']}", *times, *rms]
 
 
-def _cell(value: float | None, factor: float, form: str, unit: str = "") -> str:
-    return "" if value is None else f"{value * factor:{form}}{unit}"
+def table() -> str | None:
+    """docs/results.md: the model against the paper's method, on every recording."""
+    methods = {"hmm": "this model", "qualitative": "thresholds, best monotone order",
+               "first-change": "thresholds, first change (the paper)"}  # fmt: skip
+    rows = []
+    for name, label in methods.items():
+        found = load(f"score_{name}")
+        if found is None:
+            return None
+        rows += [[label, group, *cells(found["summary"][group])] for group in ("healthy", "all")]
+    return markdown(["method", "recordings", *HEAD], rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -165,8 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows = [(score["case"], summarise([score])) for score in scores]
         together = {"all": scores, "healthy": [score for score in scores if score["healthy"]]}
         summaries = {key: summarise(group) for key, group in together.items() if group}
-        Console(width=120).print(table(name, [*rows, *summaries.items()]))
-        options.output.mkdir(parents=True, exist_ok=True)
+        shown = [[case, *cells(summary)] for case, summary in [*rows, *summaries.items()]]
+        print(markdown([name, *HEAD], shown), flush=True)
         document = {"method": name, "pooled": options.pooled, "seed": options.seed,
                     "summary": summaries, "cases": scores}  # fmt: skip
         save(options.output / f"score_{name}.json", _null(document))

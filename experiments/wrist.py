@@ -29,8 +29,8 @@ from experiments.table_text import RESULTS, load, markdown, milliseconds, percen
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
+from hmmseg.io.formats import read_table
 from hmmseg.io.rig import Rig, parse_rig, read_rig
-from hmmseg.io.table import Table
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.segmentation.align import align
 
@@ -110,14 +110,8 @@ def _arm_case(recordings: Sequence, rig: Rig, source: Path) -> dict:
 
 def _offset(file: Path) -> dict[str, np.ndarray]:
     """Columns of a recording with UNTARED added to its wrench."""
-    table: Table = _table(file)
-    return {name: values + UNTARED.get(name, 0.0) for name, values in table.columns.items()}
-
-
-def _table(file: Path) -> Table:
-    from hmmseg.io.formats import read_table
-
-    return read_table(file, None)
+    columns = read_table(file, None).columns
+    return {name: values + UNTARED.get(name, 0.0) for name, values in columns.items()}
 
 
 def synthetic(name: str, count: int, seed: int = 0) -> dict:

@@ -20,6 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from experiments.saving import save
+from experiments.table_text import load, markdown, percent
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_commands.json"
 REPEATS = 3
@@ -66,6 +67,25 @@ def staged(stages: dict[str, str], files: dict[str, str]) -> dict[str, dict[str,
         totals.append(min(processor(["-c", "\n".join(lines)]) for _ in range(REPEATS)))
     each = [after - before for before, after in pairwise(totals)]
     return {name: {"processor": s, "share": s / totals[-2]} for name, s in zip(stages, each, strict=True)}
+
+
+def table() -> str | None:
+    """docs/benchmarks.md: commands on one 10 s trial, by stage."""
+    found = load("benchmark_commands")
+    if found is None:
+        return None
+    tables = [
+        markdown(
+            [f"stage of `{command}`", "processor", "share"],
+            [[name, f"{1e3 * s['processor']:.0f} ms", percent(s["share"], 0)] for name, s in stages.items()],
+        )
+        for command, stages in found["stages"].items()
+    ]
+    told = "; ".join(
+        f"`hmmseg {name}` {v['warm']:.1f} s warm, {v['first']:.0f} s the first time ever"
+        for name, v in found["commands"].items()
+    )
+    return "\n\n".join([*tables, f"Whole commands, processor: {told}."])
 
 
 def main() -> None:

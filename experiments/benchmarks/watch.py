@@ -24,6 +24,7 @@ import numpy as np
 
 from experiments.recordings import list_cases
 from experiments.saving import save
+from experiments.table_text import load, markdown, percent
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
@@ -129,6 +130,35 @@ def summary(errors: list[tuple[float, float]]) -> dict:
         "q90_ms": float(1e3 * np.quantile(np.abs(e), 0.9)),
         "within_2_sd": float((np.abs(e) <= 2 * sd).mean()),
     }  # fmt: skip
+
+
+def table() -> str | None:
+    """docs/watch.md: what `make bench-watch` measured."""
+    found = load("watch")
+    if found is None:
+        return None
+    time, lag, apart = found["timing"], found["by_lag"], found["apart_from_off_line"]
+    rows = [
+        [f"{time['rows']:,} rows at {time['rate']:.0f} Hz, processor a row, median",
+         f"{time['median_us']:.0f} µs"],
+        ["... 99.9 % of rows within", f"{time['q999_us']:.0f} µs"],
+        ["... rows within 1 ms", percent(time["within_1ms"], 2)],
+        ["... growth of memory over the last eight minutes",
+         f"{time['memory_mb'][-1] - time['memory_mb'][1]:.0f} MB"],
+        ["error of a boundary at a lag of 1 s, median and 90 %",
+         f"{lag['1.0']['median_ms']:.1f} and {lag['1.0']['q90_ms']:.1f} ms"],
+        ["... of the whole recording off line",
+         f"{lag['off line']['median_ms']:.1f} and {lag['off line']['q90_ms']:.1f} ms"],
+        ["boundaries within two standard deviations of the truth (off line)",
+         f"{percent(lag['1.0']['within_2_sd'], 0)} ({percent(lag['off line']['within_2_sd'], 0)})"],
+        ["... and of those off line, of both", percent(apart["within_2_sd"], 0)],
+        ["weights within two standard deviations of the truth",
+         f"{percent(found['weight_within_2_sd'], 0)} of {found['weights']}"],
+        ["last verdict (fits or not) as off line",
+         f"{found['same_verdict']} of {found['recordings']} recordings"],
+        ["fitting recordings with a passing false alarm", f"{len(found['alarms_on_fitting'])}"],
+    ]  # fmt: skip
+    return markdown(["", "measured"], rows)
 
 
 def main() -> None:

@@ -6,9 +6,8 @@
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
 
 generate prints the seal's hash; diagnose reads user folders only and may be stopped and started again;
-open writes cases with their answers beside
-them, as other folders of recordings have them; score opens the seal,
-checks the hash and writes all figures. docs/blind_check.md has the protocol.
+open writes cases with their answers beside them, as other folders of recordings have them; score opens the
+seal, checks the hash and writes all figures. docs/blind_check.md has the protocol.
 """
 
 from __future__ import annotations
@@ -30,66 +29,58 @@ RESULTS = Path(__file__).resolve().parents[1] / "results" / "blind_check.json"
 def main(args: Sequence[str] | None = None) -> int:
     """Run one step of the protocol."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    steps = parser.add_subparsers(dest="step", required=True)
-    make = steps.add_parser("generate")
-    make.add_argument("--cases", type=int, default=300)
+    steps = parser.add_subparsers(required=True)
+    make, plain = steps.add_parser("generate"), steps.add_parser("open")
+    for drawn, cases, step in ((make, 300, _generate), (plain, 40, _open)):
+        drawn.set_defaults(step=step)
+        drawn.add_argument("--cases", type=int, default=cases)
+        drawn.add_argument("--seed", type=int, required=True)
+        drawn.add_argument("--out", type=Path, required=True)
+        drawn.add_argument("--fastest", type=float, default=float("inf"), help="no world samples faster [Hz]")
     make.add_argument("--outside", type=Path, help="kinds of effects kept apart until they are scored")
-    make.add_argument("--seed", type=int, required=True)
-    make.add_argument("--out", type=Path, required=True)
-    make.add_argument("--fastest", type=float, default=float("inf"), help="no world samples faster [Hz]")
-    plain = steps.add_parser("open")
-    plain.add_argument("--cases", type=int, default=40)
     plain.add_argument("--tiers", nargs="+", default=["healthy"], choices=sorted(TIERS))
-    plain.add_argument("--seed", type=int, required=True)
-    plain.add_argument("--out", type=Path, required=True)
-    plain.add_argument("--fastest", type=float, default=float("inf"), help="no world samples faster [Hz]")
     run = steps.add_parser("diagnose")
+    run.set_defaults(step=_diagnose)
     run.add_argument("--cases", type=Path, required=True)
     run.add_argument("--out", type=Path, required=True)
     run.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after so long")
     judge = steps.add_parser("score")
+    judge.set_defaults(step=_score)
     judge.add_argument("--sealed", type=Path, required=True)
     judge.add_argument("--results", type=Path, required=True)
     judge.add_argument("--json", type=Path, default=RESULTS)
     judge.add_argument("--only", nargs="+", default=[], help="cases FROM:TO only: a run that was cut short")
     given = parser.parse_args(args)
-    step = {"generate": _generate, "open": _open, "diagnose": _diagnose, "score": _score}
-    return step[given.step](given)
+    given.step(given)
+    return 0
 
 
-def _tell(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def _tell(done: int, of: int, text: str = "") -> None:
+    print(f"{done}/{of} {text}", file=sys.stderr, flush=True)
 
 
-def _generate(given: argparse.Namespace) -> int:
+def _generate(given: argparse.Namespace) -> None:
     from experiments.blind_check.generate import generate, outside_of
 
-    tell = lambda k, n: _tell(f"{k}/{n}")  # noqa: E731
-    print(
-        generate(given.cases, given.seed, given.out, tell, outside_of(given.outside), fastest=given.fastest)
-    )
-    return 0
+    kinds = outside_of(given.outside)
+    print(generate(given.cases, given.seed, given.out, _tell, kinds, fastest=given.fastest))
 
 
-def _open(given: argparse.Namespace) -> int:
-    from experiments.blind_check.open_folder import write_open
+def _open(given: argparse.Namespace) -> None:
+    from experiments.blind_check.generate import write_open
 
     shares = {tier: TIERS[tier] for tier in given.tiers}
-    tell = lambda k, n: _tell(f"{k}/{n}")  # noqa: E731
-    write_open(given.out, given.cases, given.seed, shares, given.fastest, tell)
-    return 0
+    write_open(given.out, given.cases, given.seed, shares, given.fastest, _tell)
 
 
-def _diagnose(given: argparse.Namespace) -> int:
+def _diagnose(given: argparse.Namespace) -> None:
     from experiments.blind_check.diagnose import diagnose_cases
 
-    tell = lambda k, n, text: _tell(f"{k}/{n} {text}")  # noqa: E731
-    done = diagnose_cases(given.cases, given.out, tell, given.seconds)
+    done = diagnose_cases(given.cases, given.out, _tell, given.seconds)
     print(f"the first {done} cases are diagnosed")
-    return 0
 
 
-def _score(given: argparse.Namespace) -> int:
+def _score(given: argparse.Namespace) -> None:
     from experiments.blind_check.score import score
 
     ranges = [(int(a), int(b)) for a, b in (r.split(":") for r in given.only)]
@@ -98,7 +89,6 @@ def _score(given: argparse.Namespace) -> int:
     print(everything(found))
     print(f"\nSeal {found['seal']['sha256'][:12]} holds; diagnosed by code {found['code'][:12]}.")
     print(_published())
-    return 0
 
 
 def _published() -> str:

@@ -1,4 +1,9 @@
-"""Write a set: user folders under cases/, what was done under sealed/, its hash for all to see."""
+"""Write a set, sealed or open.
+
+Sealed (`generate`): user folders under cases/, what was done under sealed/, its hash for all to see. Open
+(`write_open`): folders of recordings with their answers beside the trials, for scripts that judge those.
+Whoever changes code by such a folder draws another one to judge the change.
+"""
 
 from __future__ import annotations
 
@@ -46,6 +51,51 @@ def generate(
         if progress is not None:
             progress(k + 1, len(cases))
     return seal(out, {"seed": seed, "cases": labels}, secrets.token_hex(16))
+
+
+def write_open(
+    out: Path,
+    count: int,
+    seed: int,
+    shares: Mapping[str, int],
+    fastest: float = float("inf"),
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """OUT/CASE (rig.toml, task.toml, trial_NN.csv, truth/trial_NN.json) and OUT/labels.json.
+
+    `shares` of the tiers as in `experiments.blind_check.cases.TIERS`; cases already written are kept.
+    """
+    nominal = load_rig(NOMINAL / "rig.toml")
+    cases = draw_cases(count, seed, nominal, shares=shares, fastest=fastest)
+    for k, case in enumerate(cases):
+        folder = out / case.name
+        if not (folder / "truth").exists():
+            trials = record_case(case, nominal)
+            write_folder(folder, case, trials, nominal)
+            _write_truth(folder, trials)
+        if progress is not None:
+            progress(k + 1, count)
+    labels = json.dumps([_open_label(case) for case in cases], indent=1)
+    (out / "labels.json").write_text(labels + "\n", encoding="utf-8")
+
+
+def _write_truth(folder: Path, trials: list[Recorded]) -> None:
+    (folder / "truth").mkdir()
+    for k, trial in enumerate(trials):
+        text = json.dumps({"boundaries": [round(b, 6) for b in trial.boundaries]})
+        (folder / "truth" / f"trial_{k + 1:02d}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _open_label(case: Case) -> dict:
+    blocks = {
+        n: {"weight": b.weight, "width": b.width, "height": b.height, "mu": b.friction}
+        for n, b in case.blocks.items()
+    }
+    return {
+        "case": case.name, "tier": case.tier, "effects": list(case.effects) or ["none"],
+        "params": case.effects, "blocks": blocks, "brackets": case.world.brackets(),
+        "world": asdict(case.world),
+    }  # fmt: skip
 
 
 def outside_of(file: Path | None) -> Mapping[str, Made]:

@@ -98,7 +98,7 @@ def by_circumstance() -> str | None:
     return None if found is None else everything(found)
 
 
-def in_short() -> str:
+def describe() -> str:
     """docs/results.md: the blind check in a few sentences; nothing where it is spent."""
     found = fresh()
     if found is None:

@@ -1,6 +1,6 @@
 """Snap assembly by a HIRO robot: boundaries found against the controller's labels.
 
-    python -m experiments.real.hiro_snap FOLDER [--seeds N] [--kinds KIND ...] [--output FILE.json]
+    python -m experiments.real.hiro_snap FOLDER [--seeds N] [--output FILE.json]
 
 FOLDER holds the published trials (Biomimetics and Intelligent Robotics Lab, REAL_HIRO_ONE_SA_SUCCESS;
 one folder a trial with R_Torques.dat, R_CartPos.dat, R_State.dat, 200 Hz). The start of every trial is
@@ -160,10 +160,10 @@ def summary(rows: list[dict]) -> dict:
     }
 
 
-def run(folder: Path, seeds: int, kinds: list[str]) -> dict:
+def run(folder: Path, seeds: int) -> dict:
     """All results of the experiment."""
     document: dict = {"format": "experiments.hiro_snap/1", "seeds": seeds, "max_crop": MAX_CROP, "kinds": {}}
-    for name in kinds:
+    for name in SHOWN:
         kind = KINDS[name]
         trials = read_kind(folder, name)
         entry: dict = {
@@ -217,11 +217,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=2, help="random crops and halvings")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=["real_guarded", "real_pivot"])
     parser.add_argument("--output", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    document = run(arguments.folder, arguments.seeds, arguments.kinds)
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    document = run(arguments.folder, arguments.seeds)
     save(arguments.output, document)
 
 

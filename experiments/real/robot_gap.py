@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.golden import rounded
 from experiments.saving import save
 from hmmseg_cli.gap_figures import draw_before_after, draw_course
 from simgap.report.robot import courses
@@ -25,7 +26,7 @@ from simgap.simulators.recording import read_recording
 from simgap.simulators.user import load_simulator
 
 HERE = Path(__file__).resolve().parent
-RESULTS = HERE.parent / "results"
+RESULT = HERE.parent / "results" / "xl330.json"
 SIMULATOR, LOGS = "xl330.py:Pendulum", "xl330_*.csv"
 KEPT = (
     "verdict",
@@ -63,16 +64,7 @@ def summary(found: RobotDiagnosis) -> dict:
             for gain in sorted(set(gains or ())):
                 mine = np.isin(rows.log, np.flatnonzero(np.array(gains) == gain))
                 out.setdefault("rms_by_gain", {})[str(gain)] = rms(mine)
-    return rounded(out)
-
-
-def rounded(value: Any) -> Any:
-    """Numbers to five significant digits, through dicts and lists."""
-    if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [rounded(v) for v in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+    return rounded(out, 5)
 
 
 def run(folder: Path, only: Sequence[str] = ()) -> RobotDiagnosis:
@@ -89,29 +81,19 @@ def gains_of(names: Sequence[str]) -> list[int] | None:
     return [int(g.group(1)) for g in found if g] if all(found) else None
 
 
-def published(found: RobotDiagnosis, name: str, output: Path | None, figures: Path | None) -> None:
-    """Write the summary, and the figures NAME_signal.png and NAME_before_after.png where asked for."""
-    save(output or RESULTS / f"{name}.json", summary(found))
-    if figures is not None:
-        widest = max(courses(found, {}), key=lambda c: c.over)
-        draw_course(widest, found, figures / f"{name}_signal.png")
-        draw_before_after(found, figures / f"{name}_before_after.png")
-
-
-def asked(doc: str) -> argparse.Namespace:
-    """The command line: FOLDER, --output and --figures."""
-    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--output", type=Path)
-    parser.add_argument("--figures", type=Path, help="folder that figures go to, such as docs/figures")
-    parser.add_argument("--drawn", action="store_true", help="draw what was found before, where that serves")
-    return parser.parse_args()
-
-
 def main() -> None:
-    """Run on a folder and write the results."""
-    given = asked(__doc__ or "")
-    published(run(given.folder), "xl330", given.output, given.figures)
+    """Run on a folder and write the summary, and with --figures both figures of the docs."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--output", type=Path, default=RESULT)
+    parser.add_argument("--figures", type=Path, help="folder that figures go to, such as docs/figures")
+    given = parser.parse_args()
+    found = run(given.folder)
+    save(given.output, summary(found))
+    if given.figures is not None:
+        widest = max(courses(found, {}), key=lambda c: c.over)
+        draw_course(widest, found, given.figures / "xl330_signal.png")
+        draw_before_after(found, given.figures / "xl330_before_after.png")
 
 
 if __name__ == "__main__":

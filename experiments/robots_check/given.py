@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, getrusage
 from typing import Any
 
+from experiments.benchmarks.commands import processor
 from experiments.saving import save
 
 OUT = Path(__file__).resolve().parents[1] / "results" / "robots_check_given.json"
@@ -27,24 +25,11 @@ def diagnosed(case: Path) -> dict[str, Any]:
     """The document, with processor seconds of the whole command."""
     with tempfile.TemporaryDirectory() as place:
         target = Path(place) / "found.json"
-        files = [str(p) for p in sorted(case.glob("train_*.csv"))]
-        model = ["--mjcf", str(case / "robot.xml"), "--map", str(case / "map.toml")]
-        command = [
-            sys.executable,
-            "-m",
-            "hmmseg_cli.main",
-            "diagnose",
-            *files,
-            *model,
-            "--json",
-            str(target),
-            "--quiet",
-        ]
-        before = getrusage(RUSAGE_CHILDREN)
-        subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
-        after = getrusage(RUSAGE_CHILDREN)
-        found = json.loads(target.read_text(encoding="utf-8"))
-    return found | {"seconds": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+        logs = [str(p) for p in sorted(case.glob("train_*.csv"))]
+        model = ["--model", str(case / "robot.xml"), "--map", str(case / "map.toml")]
+        command = ["-m", "hmmseg_cli.main", "diagnose", *logs, *model, "--json", str(target), "--quiet"]
+        seconds = processor(command)
+        return json.loads(target.read_text(encoding="utf-8")) | {"seconds": seconds}
 
 
 def right(found: dict[str, Any], truth: list[list[str]]) -> bool:

@@ -9,9 +9,7 @@ import numpy as np
 from scipy.stats import beta
 
 NUMERICS = "option."  # steps and integrators do differ: naming them is no false alarm
-FLOOR = (
-    15.0  # nats: of a fault that shows less, even one who knows all else could not be sure among a hundred
-)
+FLOOR = 15.0  # nats; of a fault that shows less, not even one who knows all else could be sure
 
 
 def share(hits: int, of: int) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.blind_check.tables import fresh
-from experiments.estimates import Estimates, summarise_estimates
+from experiments.calibration import Estimates, summarise_estimates
 from experiments.real import hiro_snap
 from experiments.table_text import as_csv, covered, markdown
 from experiments.worlds import Deviations, deviated, scene, simulated_cases

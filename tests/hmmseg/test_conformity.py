@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from misfit_edits import EDITS, FORCES, join, let_go
 
-from experiments.misfit_edits import EDITS, FORCES, join, let_go
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, Cell, World, replicates, scene, trials_of
 from hmmseg.hand.read import read_trial

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from misfit_edits import join, let_go
 
-from experiments.misfit_edits import join, let_go
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
