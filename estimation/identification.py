@@ -79,9 +79,17 @@ class Identification(Tabled):
         return self.aligned.segmentations
 
     def of(self, obj: str, prop: str) -> np.ndarray:
-        """Posterior draws (num_draws,) of one property [N, m].
+        """Posterior draws of one property.
 
-        KeyError where it is undetermined, saying why, or where there is none of that name, with the nearest.
+        Args:
+            obj: Name of the object.
+            prop: `weight`, `width` or `height`.
+
+        Returns:
+            Draws (num_draws,) [N or m].
+
+        Raises:
+            KeyError: The property is undetermined (with the reason), or no object or property has that name.
         """
         for name, known in ((obj, self.task.objects), (prop, tuple(UNITS))):
             if name not in known:
