@@ -255,7 +255,7 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(steps: tuple[Subtask, ...], task: BlockTask, obj: str, prop: str) -> list[str]:
-    """Names of the subtasks whose samples tell this property, as `carry block1`."""
+    """Names of the subtasks whose samples determine this property, as `carry block1`."""
     rises = dict(height_equations(task))
 
     def tells(s: Subtask) -> bool:
