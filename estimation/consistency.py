@@ -57,7 +57,7 @@ WELL_MADE = {
 # prior: sds of what is misstated, in the same units
 SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
 BRIEF = 5  # numerics: samples that are no glitch
-FEWEST = 8  # numerics: samples of a carry that tell a slope
+FEWEST = 8  # numerics: samples of a carry that determine a slope
 BESIDE = 3e-3  # chosen: m below a grip in which a block that stands on another surely is itself
 
 
@@ -110,7 +110,7 @@ def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], desi
 
 
 def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
-    """All ties that a recording tells anything of."""
+    """All ties that a recording determines."""
     if not any(one.trial.inertia is not None for one in aligned.trials):  # a wrist's fingers are made up
         yield from _sideways(aligned.rig, weighed)
         if not aligned.late:

@@ -34,7 +34,7 @@ class World(NamedTuple):
     `couple` [m]: how far the mass lies right of the middle.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
-    `doubt_joints` [rad^2] (T, N, 4): variance of what a correction cannot tell of angles.
+    `doubt_joints` [rad^2] (T, N, 4): variance that a correction leaves in angles.
     `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (6,): 1 where a candidate delays or
     smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE, SMOOTH, CREEPING,
     SLIDING, RINGING, YIELDING), so that equations without it are not evaluated.

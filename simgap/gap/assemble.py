@@ -105,7 +105,7 @@ NOISE_BANDS = 6  # numerics: of which medians are taken
 SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
 OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it
 FEWEST = 12  # numerics: coefficients of a band
-CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they tell nothing of it
+CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they say nothing of it
 
 
 def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
@@ -183,7 +183,7 @@ Other = TypeVar("Other")
 
 # numerics: signs of draws by places; products of what has different places cancel over the draws
 SIGNS = np.array([[1, 1], [1, -1]], float)
-SIZES = (1.0, -0.25)  # numerics: sds of noise of a draw; both tell whether it acts in proportion
+SIZES = (1.0, -0.25)  # numerics: sds of noise of a draw; both show whether it acts in proportion
 ALIKE = 0.5  # numerics: by which share of the larger both may differ
 
 

@@ -267,7 +267,7 @@ def _followed(
     """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
 
     The state is where a grip holds its block; it walks by SLIDE from one sample to the next where pads slide
-    at either. A grip's first value sets it and tells nothing.
+    at either. A grip's first value sets it and says nothing.
     """
     from simgap.recursions import innovations
 

@@ -106,7 +106,7 @@ def of_a_kink(group: int) -> tuple[float, float]:
     return tuple(float(np.sqrt(np.square(rule).sum() / bend)) for rule in (mean, slope))  # type: ignore
 
 
-UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
+UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples determines,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
 FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
@@ -209,7 +209,7 @@ def mean_of(s: Signals, name: str) -> np.ndarray:
 def between_samples(
     t: np.ndarray, force: np.ndarray, free: np.ndarray, starting: np.ndarray, boundaries: np.ndarray
 ) -> np.ndarray:
-    """What no model of coarse samples can tell (N, 4) of net fx, net fy, grip and shear [N].
+    """What no model of coarse samples determines (N, 4) of net fx, net fy, grip and shear [N].
 
     A share of the largest change from sample to sample, two samples around, more of it where a carry is
     `starting` or ending; and just after a grip a share of what is still recorded, for it tells of forces
