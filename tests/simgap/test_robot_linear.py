@@ -245,9 +245,6 @@ def test_what_is_no_sequence_and_what_is_no_column_is_said():
 
 
 def test_a_model_that_explodes_at_a_candidate_is_said_and_the_others_go_on():
-    from simgap.robot_effects import candidates
-    from simgap.robot_effects.base import Setting
-
     class Explosive(Swing):
         parameters = Swing.parameters | {"charge": Parameter(0.0, 1.0)}
 
