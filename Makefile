@@ -114,7 +114,7 @@ wrist: $(INSTALLED)  ## grippers with a sensor in the wrist, of RECORDINGS and o
 	$(BIN)/python -m experiments.wrist $(RECORDINGS)
 
 readme-figures: $(INSTALLED)  ## the README's pictures, with a scripted session of hmmseg play (needs Chromium)
-	$(BIN)/python -m experiments.readme_figures $(SET)
+	$(BIN)/python -m experiments.readme_figures $(LOGS)
 	$(BIN)/python -m experiments.play_session build/played --gif docs/figures/play.gif
 
 results: $(INSTALLED)  ## scores, calibration and benchmarks; fills the tables of README and docs/

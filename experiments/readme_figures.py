@@ -1,8 +1,8 @@
-"""The README's figures: pictures of the demo and of a diagnosis of one given faulty robot, in docs/figures.
+"""The README's figures: pictures of the demo and of a calibrated servo, in docs/figures.
 
-python -m experiments.readme_figures [ROBOTS]
+python -m experiments.readme_figures [LOGS]
 
-ROBOTS: the folder of faulty robots of experiments.robots_check.given; without it only the demo's.
+LOGS: the folder of the servo's logs of experiments.real.xl330_sheet; without it only the demo's.
 """
 
 from __future__ import annotations
@@ -28,11 +28,9 @@ def drawn(words: list[str], picture: str, name: str) -> None:
 def main() -> None:
     """Draw them."""
     drawn(["demo"], "trial_01_segments.png", "demo_segments.png")
-    for robots in sys.argv[1:]:
-        case = Path(robots) / "coulomb"
-        logs = sorted(map(str, case.glob("train_*.csv")))
-        model = ["--mjcf", str(case / "robot.xml"), "--map", str(case / "map.toml")]
-        drawn(["diagnose", *logs, *model], "gap_signal.png", "robot_signal.png")
+    for logs in sys.argv[1:]:
+        script = [sys.executable, "-m", "experiments.real.xl330_sheet"]
+        subprocess.run([*script, logs, "--figure", str(DOCS / "servo.png")], check=True)
 
 
 if __name__ == "__main__":

@@ -305,7 +305,7 @@ def _numerics(body: Body) -> str:
         for name, text in known.items()
         if (v := (body.get("numerics") or {}).get(name)) and abs(v["after"]) > 0.05
     ]
-    return f"Fitted along, and no cause: {'; '.join(said)}." if said else ""
+    return f"Fitted as well, and never a cause: {'; '.join(said)}." if said else ""
 
 
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:

@@ -1,9 +1,10 @@
 """The servo of `xl330.py` as an MJCF model from its data sheet: calibrated, and diagnosed.
 
-    python -m experiments.real.xl330_sheet FOLDER [--diagnose] [--output FILE.json]
+    python -m experiments.real.xl330_sheet FOLDER [--diagnose] [--output FILE.json] [--figure FILE.png]
 
 FOLDER has the logs xl330_*.csv; rows with the drive switched off are left out, as the model has no column for
-that. Logs are left out of the fit one by one, and run freely from their first sample.
+that. Logs are left out of the fit one by one, and run freely from their first sample. The figure shows one
+that was left out: recorded, by the data sheet, and by the model calibrated on the others.
 """
 
 from __future__ import annotations
@@ -13,15 +14,20 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from experiments.golden import rounded
 from experiments.real.xl330 import FULL
 from experiments.saving import save
+from hmmseg.plot.style import BLUE, INK, ORANGE, canvas
 from simgap.robot_effects import STATED, UNMEASURED, effects_of
-from simgap.robots.calibrate import calibrate
+from simgap.robots.calibrate import LONGEST, calibrate
 from simgap.robots.diagnose import diagnose
-from simgap.simulators.mjcf.load import load_mjcf
+from simgap.robots.model import Composed
+from simgap.robots.rows import noises
+from simgap.simulators.mjcf.load import Loaded, load_mjcf
+from simgap.simulators.recording import Recording
 
 # 0.52 N m and 104 rpm at 5 V, so at 7.3 V about 0.76 N m and 15.9 rad/s; rotor and friction are guesses.
 MODEL = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 -9.81"/>
@@ -44,12 +50,35 @@ def prepared(folder: Path, into: Path) -> list[Path]:
     return out
 
 
+def draw(loaded: Loaded, logs: list[Recording], left_out: Recording, path: Path) -> None:
+    """A log that no fit saw, run freely from its first sample."""
+    effects = effects_of(loaded.simulator, logs, loaded.effects(logs), UNMEASURED)
+    found = calibrate(loaded.simulator, logs, effects, judged=False)
+    mine = found.composed.effects
+    whole = Composed.of(loaded.simulator, [left_out], mine, noises(loaded.simulator, logs), LONGEST)
+    curves = {
+        "model from the data sheet": (ORANGE, {n: e.neutral() for n, e in mine.items()}),
+        "calibrated on other logs": (BLUE, found.point),
+    }
+    with canvas(path, height=2.4) as figure:
+        axes = figure.add_subplot()
+        axes.plot(left_out.t, np.rad2deg(left_out["position"]), color=INK, lw=1.6, label="recorded")
+        for label, (colour, point) in curves.items():
+            for window, run in zip(whole.windows, whole.read(whole.run(point), point), strict=True):
+                if run is not None:
+                    times = left_out.t[window.begin : window.end]
+                    axes.plot(times, np.rad2deg(run["position"]), color=colour, label=label)
+        axes.set(xlabel="time [s]", ylabel="angle [deg]")
+        axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--diagnose", action="store_true")
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     out: dict = {}
     with tempfile.TemporaryDirectory() as name:
@@ -58,6 +87,9 @@ def main() -> None:
         (into / "map.toml").write_text(MAP, encoding="utf-8")
         loaded = load_mjcf(into / "servo.xml", into / "map.toml")
         logs = [loaded.read(path) for path in prepared(given.folder, into)]
+        if given.figure:
+            draw(loaded, logs[:-1], logs[-1], given.figure)
+            return
         more = loaded.effects(logs)
         for what, patterns in (("stated", STATED), ("stated and lacking", UNMEASURED)):
             begun = time.process_time()

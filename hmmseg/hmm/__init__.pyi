@@ -8,5 +8,4 @@ from hmmseg.hmm.learn import Durations as Durations
 from hmmseg.hmm.learn import Emission as Emission
 from hmmseg.hmm.learn import em as em
 from hmmseg.hmm.results import Alignment as Alignment
-from hmmseg.hmm.results import Alignments as Alignments
 from hmmseg.hmm.results import Posterior as Posterior

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from hmmseg.hmm import recursions
 from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
-from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Posterior
+from hmmseg.hmm.results import Alignment, AlignmentPosterior, Posterior
 
 SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
 TOGETHER = 64  # numerics: recordings of one shape that make one call; what is over is done one by one
@@ -42,33 +42,20 @@ def ladder(num_samples: int) -> int:
     return -(-num_samples // step) * step
 
 
-def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
-            parallel: bool | None = None) -> Any:  # fmt: skip
+def viterbi(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
+            parallel: bool | None = None) -> Alignment:  # fmt: skip
     """The most probable alignment; a tie goes to staying.
 
     Args:
-        log_likelihoods: (num_samples, num_states). Several recordings, not under jit: a sequence of such
-            arrays, or (num_recordings, num_samples, num_states) with `lengths` (num_recordings,).
-        chain: one, or one for each recording.
-        lengths: how many samples are no padding; all unless given.
+        log_likelihoods: (num_samples, num_states).
+        chain: of as many states.
+        length: how many samples are no padding; all unless given.
         parallel: see the module.
-
-    Returns:
-        Alignment, of several recordings Alignments.
 
     Raises:
         InfeasibleAlignment, ValueError: see the module.
     """
-    if _single(log_likelihoods, chain):
-        return _run(_viterbi, log_likelihoods, chain, lengths, parallel)
-    tables, chains = recordings(log_likelihoods, chain, lengths)
-    found = run_many(_viterbi, tables, chains, parallel=parallel)
-    num_states = chains[0].num_states if chains else 0
-    return Alignments(
-        np.array([a.starts for a in found], np.int64).reshape(len(found), num_states),
-        np.array([a.num_samples for a in found], np.int64),
-        np.array([a.log_prob for a in found], float),
-    )
+    return _run(_viterbi, log_likelihoods, chain, length, parallel)
 
 
 def log_evidence(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
@@ -148,10 +135,6 @@ def _align(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> t
 # How they are called.
 
 
-def _single(log_likelihoods: Any, chain: Any) -> bool:
-    return getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, Chain)
-
-
 def _run(core: Callable, log_likelihoods: Any, chain: Chain, length: Any, parallel: bool | None,
          inside: Callable | None = None) -> Any:  # fmt: skip
     """The core on one recording: traced where anything of it is, else compiled, as NumPy arrays."""
@@ -159,7 +142,9 @@ def _run(core: Callable, log_likelihoods: Any, chain: Chain, length: Any, parall
     if not any(isinstance(leaf, Tracer) for leaf in leaves):
         table = checked(log_likelihoods, chain)
         if length is not None:
-            table = table[: _checked_length(int(length), len(table))]
+            if not 0 < int(length) <= len(table):
+                raise ValueError(f"length: {length}, expected 1 to {len(table)}")
+            table = table[: int(length)]
         return run_many(core, [table], [chain], parallel=parallel)[0]
     x = jnp.asarray(log_likelihoods)
     _check_shape(x, chain)
@@ -199,29 +184,6 @@ def _check_shape(ll: Any, chain: Chain) -> None:
         )
 
 
-def _checked_length(length: int, num_samples: int, recording: str = "") -> int:
-    if not 0 < length <= num_samples:
-        raise ValueError(f"lengths: {length}{recording}, expected 1 to {num_samples}")
-    return length
-
-
-def recordings(log_likelihoods: Any, chain: Chain | Sequence[Chain],
-               lengths: Sequence[int] | np.ndarray | None) -> tuple[list, list]:  # fmt: skip
-    """Checked tables and chains of several recordings."""
-    tables = list(log_likelihoods)
-    if lengths is not None:
-        if len(lengths) != len(tables):
-            raise ValueError(f"lengths: {len(lengths)} given, expected {len(tables)}, one a recording")
-        tables = [
-            ll[: _checked_length(n, len(ll), f" for recording {i}")]
-            for i, (ll, n) in enumerate(zip(tables, lengths, strict=True))
-        ]
-    chains = [chain] * len(tables) if isinstance(chain, Chain) else list(chain)
-    if len(chains) != len(tables):
-        raise ValueError(f"chain: {len(chains)} given, expected {len(tables)}, one a recording")
-    return [checked(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
-
-
 def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Chain],
              parallel: bool | None = None) -> list:  # fmt: skip
     """The core on checked recordings, each padded to the ladder: one program for all of one shape.
@@ -258,12 +220,13 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Chai
 
 
 def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
-    """`viterbi` and `smooth` of several recordings, as EM takes them."""
+    """`viterbi` and `smooth` of several recordings, each with its chain, as EM takes them."""
+    tables = [checked(ll, chain) for ll, chain in zip(log_likelihoods, chains, strict=True)]
     return [
         AlignmentPosterior(
             posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
         )
-        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
+        for best, posterior in run_many(_align, tables, chains)
     ]
 
 
@@ -301,6 +264,4 @@ def _trimmed(result: Any, n: int) -> Any:
         return Posterior(float(result.log_evidence), result.smoothed[:n], moves)
     if isinstance(result, Alignment):
         return Alignment(result.starts.astype(np.int64), int(result.num_samples), float(result.log_prob))
-    if isinstance(result, Alignments):
-        return Alignments(result.starts.astype(np.int64), result.num_samples, result.log_prob)
     return float(result)

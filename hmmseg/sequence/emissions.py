@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from hmmseg.hmm import Chain
-from hmmseg.hmm.chain import jumps_between
+from hmmseg.hmm import Chain, left_to_right
 
 DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
 ONE_CELL = 1e-9  # numerics: a state without even so much weight is left as it is
@@ -186,37 +185,21 @@ def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) 
     return Detectors(half, mean, spread, usual, np.zeros(len(mean)))
 
 
-@dataclass(frozen=True)
-class Transitions:
-    """Band-limited transitions, of which a chain of hmmseg.hmm is made.
-
-    `bands[d]` (num_states - d,): log weight of going from k to k + d between neighbouring cells;
-    `log_initial`, `log_final` (num_states,).
-    """
-
-    bands: tuple[np.ndarray, ...]
-    log_initial: np.ndarray
-    log_final: np.ndarray
-
-    def chain(self, crossing: np.ndarray | None = None) -> Chain:
-        """The chain; with log weights (num_cells - 1, num_boundaries) of crossing each boundary, if given.
-
-        Who skips subtasks crosses their boundaries.
-        """
-        stay, advance, *skips = self.bands
-        if crossing is not None:
-            total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
-            advance, *skips = (band + total[:, d:] - total[:, : total.shape[1] - d]
-                               for d, band in enumerate(self.bands[1:], 1))  # fmt: skip
-        return Chain(stay, advance, skips or None, log_initial=self.log_initial, log_final=self.log_final)
-
-
-def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Transitions:
-    """Transitions from mean durations [cells] and the probability that an optional state occurs."""
+def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Chain:
+    """The chain of mean durations [cells] and the probability that an optional state occurs."""
     there = np.where(np.asarray(optional, bool), np.clip(presence, 1e-12, 1 - 1e-12), 1.0)
-    jumps, initial, final = jumps_between(there)
-    leave = 1.0 / np.maximum(mean_cells, 1.5)
-    stay = np.log1p(-leave)
-    stay[-1] = 0.0  # the last state lasts as long as the recording does
-    bands = [np.log(leave[: jump.size]) + jump for jump in jumps]
-    return Transitions((stay, *bands), initial, final)
+    return left_to_right(np.maximum(mean_cells, 1.5), there)
+
+
+def detecting(chain: Chain, crossing: np.ndarray) -> Chain:
+    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary.
+
+    Who skips subtasks crosses their boundaries.
+    """
+    total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
+    stay, *jumps = chain.bands
+    advance, *skips = (
+        band + total[:, d:] - total[:, : total.shape[1] - d] for d, band in enumerate(jumps, 1)
+    )
+    ends = {"log_initial": chain.log_initial, "log_final": chain.log_final}
+    return Chain(stay, advance, skips or None, **ends)

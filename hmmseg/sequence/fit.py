@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hmm.chain import Chain
 from hmmseg.hmm.inference import align
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.task import SequenceTask
@@ -26,7 +27,7 @@ from hmmseg.sequence.courses import (
     naming,
     probabilities,
 )
-from hmmseg.sequence.emissions import Detectors, StudentEmissions, Transitions, from_weights, learn
+from hmmseg.sequence.emissions import Detectors, StudentEmissions, detecting, from_weights, learn
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures, feature_map, features
 from hmmseg.sequence.learner import FLOORS, Learner
 from hmmseg.sequence.model import NamedCourse, SequenceModel, misfit_scores, optional_states, usual_misfit
@@ -130,14 +131,14 @@ def forbidden(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) 
 
 def choose_detectors(values: list[np.ndarray], boundaries: list[np.ndarray], edges: list[np.ndarray],
                      paths: list[np.ndarray], temper: float, floor: float,
-                     law: Transitions) -> Detectors | None:  # fmt: skip
+                     law: Chain) -> Detectors | None:  # fmt: skip
     """Detectors whose window and weights place held-out labels best (each trial left out once).
 
     The score is the log probability of the labelled cell edge and its neighbours, so weights that
     make boundaries overconfident lose. None for a single subtask. One labelled trial cannot be left
     out: then the middle window with the emissions' own share of independent observations.
     """
-    num_states = len(law.log_initial)
+    num_states = law.num_states
     if num_states == 1:
         return None
     channels = [v[:, : v.shape[1] // 2] for v in values]
@@ -161,7 +162,7 @@ def choose_detectors(values: list[np.ndarray], boundaries: list[np.ndarray], edg
 
 
 def _held_out(values, channels, cells, paths, half, temper, floor,
-              law: Transitions) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+              law: Chain) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Mean log probability of held-out labels for every pair of weights, and their extra scatter.
 
     The scatter (num_weights, num_state_weights, num_boundaries) [cells] is what the squared
@@ -170,11 +171,11 @@ def _held_out(values, channels, cells, paths, half, temper, floor,
     parts = []
     for i in range(len(values)):
         rest = [j for j in range(len(values)) if j != i]
-        onehot = np.eye(len(law.log_initial))[np.concatenate([paths[j] for j in rest])]
+        onehot = np.eye(law.num_states)[np.concatenate([paths[j] for j in rest])]
         emissions = from_weights(np.vstack([values[j] for j in rest]), onehot, floor, temper)
         detectors = learn([channels[j] for j in rest], [shown(cells[j]) for j in rest], half)
         ll, ratios = emissions.log_likelihoods(values[i]), detectors.log_ratios(channels[i])
-        parts += [(s * ll, law.chain(w * ratios)) for w in WEIGHTS for s in STATE_WEIGHTS]
+        parts += [(s * ll, detecting(law, w * ratios)) for w in WEIGHTS for s in STATE_WEIGHTS]
     aligned = align([p[0] for p in parts], [p[1] for p in parts])
     grid = (len(values), len(WEIGHTS), len(STATE_WEIGHTS))
     per_trial = grid[1] * grid[2]

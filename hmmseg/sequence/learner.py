@@ -14,7 +14,7 @@ from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.sequence.emissions import (
     Detectors,
     StudentEmissions,
-    Transitions,
+    detecting,
     from_weights,
     independent_share,
     residuals,
@@ -59,13 +59,13 @@ class Learner:
         return np.maximum(cells, 1.5), presence
 
     def align(
-        self, emissions: StudentEmissions, law: Transitions, detectors: Detectors | None = None
+        self, emissions: StudentEmissions, law: Chain, detectors: Detectors | None = None
     ) -> tuple[AlignmentPosterior, ...]:
         """Alignments of all trials, in which no state is where labels forbid it."""
         states = _Emission(self, detectors, emissions, 0.0)
         return expectation(states, _Durations(self, detectors, law), len(self.values))
 
-    def law(self, probability: Sequence[np.ndarray]) -> Transitions:
+    def law(self, probability: Sequence[np.ndarray]) -> Chain:
         """How states follow each other, from posterior state probabilities."""
         return transitions(*self.durations(probability), self.optional)
 
@@ -131,11 +131,11 @@ class _Durations:
 
     learner: Learner
     detectors: Detectors | None
-    law: Transitions
+    law: Chain
 
     def chain(self, trial: int) -> Chain:
         d = self.detectors
-        return self.law.chain(None if d is None else d.crossing(self.learner.values[trial]))
+        return self.law if d is None else detecting(self.law, d.crossing(self.learner.values[trial]))
 
     def updated(self, responsibilities: Sequence[np.ndarray]) -> _Durations:
         return replace(self, law=self.learner.law(self.learner.as_labelled(responsibilities)))

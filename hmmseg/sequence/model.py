@@ -16,13 +16,14 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hmm import dense as ergodic
+from hmmseg.hmm.chain import Chain
 from hmmseg.hmm.inference import align
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
-from hmmseg.sequence.emissions import Detectors, StudentEmissions, Transitions, transitions
+from hmmseg.sequence.emissions import Detectors, StudentEmissions, detecting, transitions
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.tables import Tabled
 
@@ -59,7 +60,7 @@ class SequenceModel(Tabled):
     sure: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
-    def transitions(self) -> Transitions:
+    def transitions(self) -> Chain:
         """Transitions between neighbouring cells, without boundary detectors."""
         return transitions(self.mean_cells, self.presence, optional_states(self.task, self.settled))
 
@@ -91,8 +92,8 @@ class SequenceModel(Tabled):
         law, d = self.transitions, self.detectors
         lls = [self.emissions.log_likelihoods(trial.values) for trial in trials]
         if d is None:
-            return align(lls, [law.chain()] * len(lls))
-        chains = [law.chain(d.crossing(trial.values)) for trial in trials]
+            return align(lls, [law] * len(lls))
+        chains = [detecting(law, d.crossing(trial.values)) for trial in trials]
         return align([d.state_weight * ll for ll in lls], chains)
 
 
@@ -116,7 +117,7 @@ class NamedCourse:
         count = len(self.mean_cells)
         law = transitions(self.mean_cells, np.ones(count), [False] * count)
         ll = self.emissions.log_likelihoods(trial.values)
-        return align([ll], [law.chain()])[0]
+        return align([ll], [law])[0]
 
 
 def optional_states(task: SequenceTask, settled: bool) -> list[bool]:

@@ -275,7 +275,7 @@ def _by_name(
     nameless = [m for m in models if len(parts[m.effects]) < len(m.effects)]
     if not nameless:
         return parts
-    best = next((m for m in sought(f, named=True) if m.effects), None)
+    best = next((m for m in sought(f, 1, named=True) if m.effects), None)
     if best is not None:
         names = shares(f, best, by_group, rng)
         for m in nameless:

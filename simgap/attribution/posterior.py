@@ -173,6 +173,19 @@ class Forms:
     lenient: bool = False
     modes: dict[tuple[int, ...], Model] = field(init=False, default_factory=dict)
 
+    def triangle(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Products (G, P) of pairs of columns, twice those of two different ones."""
+        taken = np.take(
+            self.product.reshape(self.count.size, -1), first * self.product.shape[1] + second, axis=1
+        )
+        return taken * np.where(first == second, 1.0, 2.0)
+
+    @cached_property
+    def of_nuisances(self) -> np.ndarray:
+        """Products (G, P) of all pairs of nuisances."""
+        first, second = np.triu_indices(self.spectrum.num_nuisances)
+        return self.triangle(1 + first, 1 + second)
+
     @cached_property
     def extra(self) -> np.ndarray:
         """Mean variance (J, G) that each candidate adds to a group."""
@@ -274,12 +287,17 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
 
 @dataclass(frozen=True)
 class QuadraticForms:
-    """The quadratic forms of one set: square (G,), pull (G, n), bend (G, n n) of its coordinates x (n,)."""
+    """The quadratic forms of one set by group: square (G,), pull (G, n) and bend of its coordinates x (n,).
+
+    `bend`: two parts (G, .) of the products' upper triangles, those off the diagonal twice: of the nuisances
+    alone, which all sets have, and what the set's own coordinates add; `pairs` (2, .): their coordinates.
+    """
 
     effects: tuple[int, ...]
     square: np.ndarray
     pull: np.ndarray
-    bend: np.ndarray
+    bend: tuple[np.ndarray, np.ndarray]
+    pairs: tuple[np.ndarray, np.ndarray]
     low: np.ndarray
     high: np.ndarray
     blocks: dict[int, np.ndarray]
@@ -287,12 +305,15 @@ class QuadraticForms:
 
     def energy(self, x: np.ndarray) -> np.ndarray:
         """Squares (G,) of what is left at x."""
-        return np.maximum(self.square - 2 * self.pull @ x + self.bend @ np.outer(x, x).ravel(), 0.0)
+        usual, own = self.bend
+        each, known = x[self.pairs[0]] * x[self.pairs[1]], usual.shape[1]
+        return np.maximum(self.square - 2 * self.pull @ x + usual @ each[:known] + own @ each[known:], 0.0)
 
     def weighed(self, precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Curvature (n, n) and pull (n,) with groups of these precisions (G,) together."""
-        size = self.low.size
-        return (precision @ self.bend).reshape(size, size), precision @ self.pull
+        matrix = np.zeros((self.low.size, self.low.size))
+        matrix[self.pairs] = np.concatenate([precision @ part for part in self.bend])
+        return (matrix + matrix.T) / 2, precision @ self.pull
 
 
 def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
@@ -303,11 +324,14 @@ def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
     sign = np.array([1.0, *(-1.0 for _ in effects)])
     square = np.einsum("i,gij,j->g", sign, f.product[:, constant[:, None], constant], sign)
     pull = np.einsum("i,gij->gj", sign, f.product[:, constant[:, None], free])
-    # One row a group: sums over groups, and squares, are then products of a matrix and a vector.
-    places = (free[:, None] * f.product.shape[1] + free).ravel()
-    bend = np.take(f.product.reshape(f.count.size, -1), places, axis=1)
+    (first, second), (one, other) = np.triu_indices(z), np.triu_indices(free.size)
+    first, second = np.append(first, one[other >= z]), np.append(second, other[other >= z])
+    known = f.of_nuisances.shape[1]
+    bend = f.triangle(free[first[known:]], free[second[known:]])
     limits, blocks = _limits(f, effects, z), coordinates(f, effects)
-    return QuadraticForms(effects, square, pull, bend, *limits, blocks, f.shift(effects))
+    return QuadraticForms(
+        effects, square, pull, (f.of_nuisances, bend), (first, second), *limits, blocks, f.shift(effects)
+    )
 
 
 def mode(
@@ -356,30 +380,50 @@ def screened(f: Forms, model: Model, sets: Sequence[tuple[int, ...]]) -> np.ndar
     """
     z, (groups, size) = f.spectrum.num_nuisances, f.product.shape[:2]
     summed = (model.precision @ f.product.reshape(groups, -1)).reshape(size, size)
-    base = np.concatenate([np.arange(1 + z), *(f.spectrum.own[j] for j in model.effects)]).astype(int)
-    rows = np.ascontiguousarray(np.moveaxis(f.product[:, base], 1, 0)).reshape(base.size, -1)
-    out = np.zeros(len(sets))
+    combined, found = np.zeros((len(sets), size)), []
     for k, effects in enumerate(sets):
         own = [f.spectrum.own[j] for j in effects]
         free = np.concatenate([np.arange(1, 1 + z), *(mine[1:] for mine in own)]).astype(int)
-        combined = np.zeros(size)
-        combined[[0, *(mine[0] for mine in own)]] = 1.0, *(-1.0 for _ in own)
+        combined[k, [0, *(mine[0] for mine in own)]] = 1.0, *(-1.0 for _ in own)
         blocks, (low, high) = coordinates(f, effects), _limits(f, effects, z)
         prior = np.ones(free.size)
         for mine in blocks.values():
             prior[mine] = 1 + mine.size
         matrix = summed[np.ix_(free, free)] + np.diag(prior)
-        x, held = least(matrix, summed[free] @ combined, low, high)
-        combined[free] = -x
-        new = np.setdiff1d(np.flatnonzero(combined), base)
-        with_base = (combined[base] @ rows).reshape(groups, size)
-        energy = with_base[:, base] @ combined[base] + 2 * with_base[:, new] @ combined[new]
-        energy += f.product[:, new[:, None], new] @ combined[new] @ combined[new]
-        density = f.marginal(effects, np.maximum(energy, 0.0))[0].sum()
+        x, held = least(matrix, summed[free] @ combined[k], low, high)
+        combined[k, free] = -x
         for mine in blocks.values():
             matrix[mine, mine] += (1 + mine.size) / (1 + x[mine] @ x[mine]) - prior[mine]
-        out[k] = density + _log_prior(x, z, blocks) + _volume(matrix, ~held, z) + _known(f, effects)
-    return out
+        found.append(_log_prior(x, z, blocks) + _volume(matrix, ~held, z) + _known(f, effects))
+    energy = _energies(f, model, sets, combined)
+    each = zip(sets, energy, strict=True)
+    return np.array(found) + [f.marginal(effects, mine)[0].sum() for effects, mine in each]
+
+
+def _energies(f: Forms, model: Model, sets: Sequence[tuple[int, ...]], combined: np.ndarray) -> np.ndarray:
+    """Squares (S, G) that S neighbours of a set leave, of columns `combined` (S, M) so.
+
+    Products of what the set has itself are taken from memory once, and those of what is new once for all
+    neighbours with the same new effects.
+    """
+    base = np.concatenate(
+        [np.arange(1 + f.spectrum.num_nuisances), *(f.spectrum.own[j] for j in model.effects)]
+    )
+    first, second = np.triu_indices(base.size)
+    at = combined[:, base.astype(int)]
+    out = (at[:, first] * at[:, second]) @ f.triangle(base[first], base[second]).T
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for k, effects in enumerate(sets):
+        alike.setdefault(tuple(j for j in effects if j not in model.effects), []).append(k)
+    for added, mine in alike.items():
+        if added:
+            new = np.concatenate([f.spectrum.own[j] for j in added])
+            old, more = at[mine], combined[np.ix_(mine, new)]
+            for ours, product in ((2 * old, f.product[:, base[:, None], new]),
+                                  (more, f.product[:, new[:, None], new])):  # fmt: skip
+                both = (ours[:, :, None] * more[:, None, :]).reshape(len(mine), -1)
+                out[mine] += both @ product.reshape(f.count.size, -1).T
+    return np.maximum(out, 0.0)
 
 
 def _volume(matrix: np.ndarray, loose: np.ndarray, z: int) -> float:

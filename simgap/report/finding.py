@@ -201,13 +201,13 @@ def sentences(body: Body) -> list[str]:
 def changed(body: Body) -> list[str]:
     """What two sets of logs tell of a robot that may have changed between them."""
     if body["verdict"] == "none":
-        return ["Nothing that these logs can tell: the new ones are met as the old ones are."]
+        return ["No change that these logs can show: the model fits the new ones as well as the old ones."]
     if body["verdict"] == "unknown":
         over = body["remainder"]["rms_over_noise"]
-        best = [f"The best that is known, {text}, leaves too much." for text in body["changes"]]
-        return [f"New logs are missed by {over:.2g} times what old ones are.", *best]
+        best = [f"The best known explanation, {text}, leaves too much." for text in body["changes"]]
+        return [f"The model's error on the new logs is {over:.2g} times that on the old ones.", *best]
     p = p_text(body["detection"]["p_value"])
-    out = [f"Changed: {'; '.join(body['changes'])} ({p} that nothing did)."]
+    out = [f"Changed: {'; '.join(body['changes'])} ({p} if nothing changed)."]
     if body["verdict"] == "set":
         others = ", ".join(body["indistinguishable"]) or "the same in other parts"
         out.append(f"These logs cannot tell it from a change of {others}.")
@@ -221,8 +221,8 @@ def doubted(body: Body) -> list[str]:
     if not doubts:
         return []
     if not best.get("effects"):
-        return [f"With the model calibrated {doubts}."]
-    return [f"The best that is known, {plain_name('+'.join(best['effects']))}, is doubted: {doubts}."]
+        return [f"With the model calibrated, {doubts}."]
+    return [f"The best known explanation, {plain_name('+'.join(best['effects']))}, is doubtful: {doubts}."]
 
 
 def of_robot(body: Body) -> bool:
@@ -269,7 +269,7 @@ def remains(body: Body) -> list[str]:
     if not rest or rest.get("share") is None or body["verdict"] == "none" or "changes" in body:
         return []
     noise = rest.get("rms_over_noise")
-    size = f" All that is left is {plain(noise)} times the noise." if noise else ""
+    size = f" The whole residual is {plain(noise)} times the noise." if noise else ""
     if body["verdict"] == "unknown":
         return [f"{percent(rest['share'])} of the gap is left after every likely cause.{size}"]
     p = rest.get("p_value")
@@ -277,9 +277,7 @@ def remains(body: Body) -> list[str]:
     if rest["share"] < 0.01 and not _noise(rest):
         return [f"Under 1 % of the gap remains{sure}, which is more than noise.{size}"]
     if _noise(rest):
-        return [
-            f"What remains, {percent(rest['share'])} of the gap, does not stand out of the noise{sure}.{size}"
-        ]
+        return [f"What remains, {percent(rest['share'])} of the gap, is within the noise{sure}.{size}"]
     return [
         f"{percent(rest['share'])} of the gap remains{sure}.{size}",
         *moving({"where": rest.get("where") or []}, of="what remains"),
@@ -302,8 +300,8 @@ def settles(body: Body, weighed: bool) -> str:
     if weighed or not unsure or not any(e.get("property_shift") for e in body["effects"].values()):
         return ""
     return (
-        "Weigh and measure the blocks and pass them with --actual: an error of the sensors can hide in a "
-        "weight or a size that is fitted along."
+        "Weigh and measure the blocks and pass them with --actual: a sensor error can hide in a "
+        "fitted weight or size."
     )
 
 
@@ -328,11 +326,11 @@ def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]], of: str) -> 
     share = share_of(cells)
     largest = max(cells, key=lambda c: c["share"])
     low, high = largest["band"]
-    verb = "moves otherwise"
+    verb = "moves differently"
     if high is None or high <= SLOW:
         verb = "is off"
     elif low >= SLOW:
-        verb = f"moves otherwise above {plain(low, 2)} Hz"
+        verb = f"moves differently above {plain(low, 2)} Hz"
     trials = len({c["trial"] for c in cells})
     often = f"{trials} trial{'s' if trials > 1 else ''}"
     return f"{what[0].upper()}{what[1:]} {verb} {when(subtask)}: {percent(share)} of {of}, in {often}."

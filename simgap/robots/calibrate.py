@@ -170,6 +170,7 @@ def calibrate(
     effects: Mapping[str, RobotEffect],
     *,
     length: float | None = None,
+    begin: Point | None = None,
     tell: Progress = silent,
     judged: bool = True,
 ) -> Calibration:
@@ -180,35 +181,40 @@ def calibrate(
         recordings: its logs; with one or two, stretches of them are held out.
         effects: by name; those that are not fitted along are left out.
         length: s of windows that lead near.
+        begin: where to begin, if that is near already; effects in it that are not fitted along stay there.
         tell: hears what is being done.
         judged: whether it is fitted anew without each log in turn, to say how far that is from it.
 
     Raises:
         InputError: nothing is uncertain, or the simulator diverges.
     """
-    mine = {n: e for n, e in effects.items() if e.fitted}
-    if all(_numeric(simulator, e) for e in mine.values()):
+    mine = {n: e for n, e in effects.items() if e.fitted or n in (begin or {})}
+    fitted = [n for n, e in mine.items() if e.fitted]
+    if all(_numeric(simulator, mine[n]) for n in fitted):
         raise InputError("calibrate", "nothing of the model is uncertain", "uncertain = [..] in the map")
     noise = noises(simulator, recordings)
-    point: Point = {n: e.neutral() for n, e in mine.items()}
+    point: Point = {n: (begin or {}).get(n, e.neutral()) for n, e in mine.items()}
+    stated = [n for n in fitted if not any(fnmatchcase(n, p) for p in LACKING)]
     tell("windows")
     windows = Composed.of(simulator, recordings, mine, noise, LENGTH if length is None else length)
-    linear = linearise(windows, point, [])
-    stated = [n for n in mine if not any(fnmatchcase(n, p) for p in LACKING)]
-    whiten = covariances(windows, linear).whitener()
-    near = moved_to(windows, linear, whiten, point, stated, STEPS).point
+    near, steps = point, AGAIN
+    if begin is None:
+        linear = linearise(windows, point, [])
+        whiten = covariances(windows, linear).whitener()
+        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS).point, STEPS
     tell("whole logs")
     whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
-    begin = min((near, point), key=lambda p: _cost(whole, p))
-    if not np.isfinite(_cost(whole, begin)):  # nothing follows a whole log freely: windows are all there is
-        whole, begin = windows, near
-    found, linear, whiten = _least_squares(whole.moved(begin), {n: begin[n] for n in stated}, STEPS)
-    if _over_noise(linear) > LEAVES and len(stated) < len(mine):
-        found, linear, whiten = _least_squares(whole.moved(found), {**point, **found}, STEPS)
+    start = min((near, point), key=lambda p: _cost(whole, p))
+    if not np.isfinite(_cost(whole, start)):  # nothing follows a whole log freely: windows are all there is
+        whole, start = windows, near
+    found, linear, whiten = _least_squares(whole.moved(start), start, steps, stated)
+    if _over_noise(linear) > LEAVES and len(stated) < len(fitted):
+        found, linear, whiten = _least_squares(whole.moved(found), found, STEPS, fitted)
+        stated = fitted
     tell("what the logs tell")
-    names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten)
+    names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten, stated)
     tell("held-out logs")
-    before, after = _held_out(whole.moved(found), found) if judged else ({}, {})
+    before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})
     return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
 
 
@@ -291,24 +297,27 @@ def _whitener(composed: Composed, linear: Linear) -> Whiten:
     return whiten
 
 
-def _least_squares(composed: Composed, point: Point, steps: int) -> tuple[Point, Linear, Whiten]:
-    """Where squares are least, from a point, the gap there and how rows are whitened."""
+def _least_squares(
+    composed: Composed, point: Point, steps: int, free: Sequence[str]
+) -> tuple[Point, Linear, Whiten]:
+    """Where squares are least, from a point of which some effects are free, the gap there and how rows are
+    whitened."""
     linear = linearise(composed, point, [])
     for _ in range(ROUNDS if steps == STEPS else 1):
-        point = moved_to(composed, linear, _whitener(composed, linear), point, steps=steps).point
+        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps).point
         linear = linearise(composed, point, [], linear.starts)
     return point, linear, _whitener(composed, linear)
 
 
 def _told(
-    composed: Composed, point: Point, linear: Linear, whiten: Whiten
+    composed: Composed, point: Point, linear: Linear, whiten: Whiten, free: Sequence[str]
 ) -> tuple[tuple[tuple[str, str], ...], np.ndarray, np.ndarray, np.ndarray]:
     """Names and priors' sd (p,) of all parameters, the logs' information of them in these units, and their
     covariance."""
-    names = tuple((e, p) for e in point for p in composed.effects[e].parameters)
+    names = tuple((e, p) for e in free for p in composed.effects[e].parameters)
     sd = np.array([composed.effects[e].parameters[p].sd for e, p in names])
     base, columns = base_at(composed, point), np.zeros((linear.residual.size, len(names)))
-    for effect in point:
+    for effect in free:
         mine, step = np.array([e == effect for e, _ in names]), None
         for _ in range(2):  # by a usual step, and by one as fine as the parameter is told
             one = vary(composed, base, linear.starts, effect, step=step, shifted=False)
@@ -320,7 +329,9 @@ def _told(
     return names, sd, information, np.linalg.inv(information + np.eye(sd.size)) * np.outer(sd, sd)
 
 
-def _held_out(composed: Composed, found: Point) -> tuple[dict[str, float], dict[str, float]]:
+def _held_out(
+    composed: Composed, found: Point, free: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float]]:
     """Root mean squares by channel of free runs along logs that a fit did not see, before and after."""
     rows, nominal = composed.rows, {n: composed.effects[n].neutral() for n in found}
     before = rows.observed - base_at(composed, nominal).rows
@@ -328,7 +339,7 @@ def _held_out(composed: Composed, found: Point) -> tuple[dict[str, float], dict[
     for number in np.unique(fold):
         mine = fold == number
         seen = composed.along(np.unique(rows.log[~mine]).tolist())
-        point, _, _ = _least_squares(seen, found, AGAIN)
+        point, _, _ = _least_squares(seen, found, AGAIN, free)
         part = composed.along(np.unique(rows.log[mine]).tolist())
         after[mine] = rows.observed[mine] - base_at(part, point).rows
     return _rms(composed, before), _rms(composed, after)

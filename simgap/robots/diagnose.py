@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 
 from hmmseg.errors import InputError, nearest
 from simgap.progress import Progress, silent
-from simgap.robot_effects import LACKING, STATED, UNMEASURED, doubted, effects_of
+from simgap.robot_effects import STATED, UNMEASURED, doubted, effects_of
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.heldout import Shrinkage, folds_of, shrinkage
@@ -97,7 +96,6 @@ def diagnose(
             raise InputError(f"--effect {name}", "is no candidate", nearest(name, list(effects)))
     length = getattr(simulator, "window", None) if length is None else length
     given = {} if length is None else {"length": length}
-    tell("calibration")
     calibrated = _Calibrated(simulator, recordings, effects, length)
     whole = Composed.of(simulator, recordings, effects, noise, **given)
     whole = replace(whole, motion=motions(whole))
@@ -115,8 +113,8 @@ def diagnose(
 
 
 class _Calibrated:
-    """The model with what nobody measured fitted: `found`, None where there is nothing of the kind. Called,
-    it gives the point, with what models lack fitted too: that is for where a search leaves a gap."""
+    """The model with what nobody measured fitted: `found`, None where there is nothing of the kind or before
+    it was sought."""
 
     def __init__(
         self,
@@ -126,20 +124,25 @@ class _Calibrated:
         length: float | None,
     ) -> None:
         self._given = simulator, recordings, effects, length
-        self.found = self._by(STATED)
+        self.found: Calibration | None = None
 
     def __call__(self) -> Point:
-        if any(fnmatchcase(n, p) for n in self._given[2] for p in LACKING):
-            self.found = self._by(UNMEASURED)
+        """By all that nobody measured and that models lack, from the model as it comes: for where a search
+        from there leaves a gap."""
+        self.found = self._by(UNMEASURED, None)
         return {} if self.found is None else self.found.point
 
-    def _by(self, patterns: Sequence[str]) -> Calibration | None:
+    def about(self, point: Point) -> Calibration | None:
+        """Where no search needed it, by what models state about the point that one found."""
+        return self.found or self._by(STATED, point)
+
+    def _by(self, patterns: Sequence[str], begin: Point | None) -> Calibration | None:
         simulator, recordings, effects, length = self._given
         wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
         numerics = getattr(simulator, "numerics", ())
         if not any(e.fitted and not any(p in numerics for p in e.model.values()) for e in wide.values()):
             return None
-        return calibrate(simulator, recordings, wide, length=length, judged=False)
+        return calibrate(simulator, recordings, wide, length=length, begin=begin, judged=False)
 
 
 def _diagnosed(
@@ -175,7 +178,8 @@ def _diagnosed(
     tell("how far")
     far = shrinkage(best, nothing, composed, fold) if best.names else None
     verdict = verdict_on(search, best, far, phases, seed, bool(forced))
+    tell("calibration")
     return RobotDiagnosis(
         composed, phases, search, best, verdict, far if verdict.causes else None, search.identifiable,
-        next_log(search, best, verdict), calibrated.found, tuple(warnings),
+        next_log(search, best, verdict), calibrated.about(best.point), tuple(warnings),
     )  # fmt: skip

@@ -128,19 +128,19 @@ class Composed:
         """True channels of every window from these starts; None where a rollout diverged."""
         out = self._rolled(self._without_dear(point), self.windows, starts)
         for name, theta in point.items():
-            if self._dear(name):
+            if self.dear(name):
                 neutral = self.effects[name].neutral()
                 for short, value in theta.items():
                     out = self.stepped(out, name, short, value - neutral[short])
         return out
 
-    def _dear(self, effect: str) -> bool:
+    def dear(self, effect: str) -> bool:
         """Whether an effect of the simulator's own numerics costs another run of every window."""
         dear = getattr(self.simulator, "dear", getattr(self.simulator, "numerics", ()))
         return any(p in dear for p in self.effects[effect].model.values())
 
     def _without_dear(self, point: Point) -> Point:
-        return {n: v for n, v in point.items() if not self._dear(n)}
+        return {n: v for n, v in point.items() if not self.dear(n)}
 
     def stepped(
         self, true: Sequence[Channels | None], name: str, short: str, by: float

@@ -11,7 +11,7 @@ where another would is no measure of either. What was fitted exactly on the way 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -43,7 +43,6 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are ju
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
-CANCEL = 64  # numerics: pairs that nearly cancel, rolled out along their difference
 LEAVES = (
     2.0  # numerics: squares over the noise's; a set that leaves more may be better begun from the calibration
 )
@@ -52,6 +51,7 @@ JOINED = " against "
 NEAR = 10.0  # numerics: nats by which straight lines may be wrong of what takes a cause's place
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better to be gone on with
+AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: of an iteration that settles sooner
 BORNE_OUT = 0.05  # chosen: chance of held-out gains as good without any
 MANY = 80  # numerics: candidates of which all pairs are tried
@@ -131,14 +131,22 @@ class Search:
         return best
 
     def _from_other_ends(self, best: Settled) -> Settled:
-        """The same set begun with the simulator's numbers at their other ends: commands in steps are nearly
-        those in lines that come later, and no small step leads from one to the other."""
-        for name in filter(self.composed.numeric, self.along):
-            for short, known in self.composed.effects[name].parameters.items():
+        """The same set from the other ends of how the simulator takes its commands, where straight lines from
+        there promise more: commands in steps are nearly those in lines that come later, and no small step
+        leads from one to the other."""
+        effects = self.composed.effects
+        for name in (n for n in self.along if self.composed.numeric(n) and not self.composed.dear(n)):
+            for short, known in effects[name].parameters.items():
                 if np.isfinite([known.low, known.high]).all():
                     near_low = best.point[name][short] < 0.5 * (known.low + known.high)
                     other = {**best.point[name], short: known.high if near_low else known.low}
-                    best = self.settled(best.names, {**best.point, name: other}, [best.whiten], best.score)
+                    point = {**best.point, name: other}
+                    there = replace(best, composed=best.composed.moved(point), point=point)
+                    sets, levels = self.place(there, best.names)
+                    score, k = max((float(sets.scores([best.names], k)[0]), k) for k in range(len(levels)))
+                    if score > best.score + NEAR:
+                        begin = point_of(effects, sets.fit(best.names, k), best.names, self.along)
+                        best = self.settled(best.names, begin, levels[k], best.score)
         return best
 
     def _calibrated(self) -> Settled | None:
@@ -150,17 +158,12 @@ class Search:
             return None
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
-        whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
-        sets, levels, effects = self.place(whole, names)
-        score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(levels)))
-        while names:
-            fewer = [tuple(n for n in names if n != out) for out in names]
-            scores = sets.scores(fewer, level)
-            if scores.max() < score:
-                break
-            names, score = fewer[int(scores.argmax())], float(scores.max())
-        begin = point_of(effects, sets.fit(names, level), names, self.along)
-        return self.settled(names, begin, [whole.whiten, levels[-1]])
+        whole = self.settled(names, begin, self.known[frozenset()].covariances.whitener())
+        sets, levels = self.place(whole, names)
+        level = max(range(len(levels)), key=lambda k: float(sets.scores([names], k)[0]))
+        names = sets.pruned(names, level)
+        begin = point_of(self.composed.effects, sets.fit(names, level), names, self.along)
+        return self.settled(names, begin, whole.whiten)
 
     def _off(self, name: str, values: Mapping[str, float]) -> bool:
         known = self.composed.effects[name].parameters
@@ -169,14 +172,14 @@ class Search:
     def forced(self, names: Names) -> Settled:
         """A given set at its best, and those with one less."""
         nothing = self.nothing()
-        sets, levels, effects = self.place(nothing, self.wanted)
+        sets, levels = self.place(nothing, self.wanted)
         scores = [sets.scores([names], level)[0] for level in range(len(levels))]
         level = int(np.argmax(scores))
-        begin = point_of(effects, sets.fit(names, level), names, self.along)
-        found = self.settled(names, begin, [levels[k] for k in {level, len(levels) - 1}])
+        begin = point_of(self.composed.effects, sets.fit(names, level), names, self.along)
+        found = self.settled(names, begin, levels[level])
         for out in names if len(names) > 1 else ():
             rest = tuple(n for n in names if n != out)
-            self.settled(rest, without(found.point, out), [found.whiten])
+            self.settled(rest, without(found.point, out), found.whiten)
         return found
 
     def nothing(self) -> Settled:
@@ -188,25 +191,21 @@ class Search:
             self.composed = wobbling(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
         self.starts = dict(linear.starts)
-        return self.settled((), point, [covariances(self.composed, linear).whitener()])
+        return self.settled((), point, covariances(self.composed, linear).whitener())
 
-    def settled(
-        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
-    ) -> Settled:
-        """A set at its best, from a start: by each of these scales, and once more by what that leaves. What
-        stays further behind a `rival`'s score than that can mend is not gone on with."""
+    def settled(self, names: Names, begin: Point, whiten: Whitener, rival: float = -np.inf) -> Settled:
+        """A set at its best, from a start: whitened by what was left there, and anew by what it leaves itself
+        until that settles. What stays further behind a `rival`'s score than that can mend is not gone on
+        with."""
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        here, best, key = self.composed.moved(begin), None, frozenset(names)
-        for whiten in scales:
-            one = self._judged(here, names, self._moved(here, begin, whiten))
-            best = one if best is None or one.score > best.score else best
-            if best.score < rival - NEAR:
-                break
-        assert best is not None
-        if best.score >= rival - NEAR:
-            there = self.composed.moved(best.point)
+        here, key = self.composed.moved(begin), frozenset(names)
+        best = self._judged(here, names, self._moved(here, begin, whiten))
+        for _ in range(AGAIN if best.score >= rival - NEAR else 0):
+            there, before = self.composed.moved(best.point), best.score
             again = self._judged(there, names, self._moved(there, best.point, best.whiten))
             best = max((best, again), key=lambda one: one.score)
+            if best.score < before + NEAR:
+                break
         if key not in self.known or self.known[key].score < best.score:
             self.known[key] = best
         return self.known[key]
@@ -245,7 +244,7 @@ class Search:
             score += len(wide) * ALONE - 1e3 * linear.dropped
         return Settled(composed, names, point, linear, cov, off, wide, whiten, sets, score)
 
-    def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener], dict[str, RobotEffect]]:
+    def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
         """All candidates about a point, by the discrepancy there and less of it.
 
         Those that do not act yet are secants of their usual size: a joint that sticks follows no small
@@ -274,16 +273,18 @@ class Search:
             self.diverged = tuple(n for n in names if n not in linear.moved)
         linear = self._where_they_act(composed, base, linear, sets, held)
         linear, both = self._together(composed, base, linear, sets, held)
-        effects, every = {**composed.effects, **both}, [*usable, *both]
-        return Sets.of(effects, linear, levels, every, self.fold, self.log_odds), levels, effects
+        every = [*usable, *both]
+        return Sets.of(composed.effects | both, linear, levels, every, self.fold, self.log_odds), levels
 
     def _together(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
     ) -> tuple[Linear, dict[str, RobotEffect]]:
-        """Pairs of candidates that nearly cancel, as one each: in their difference what counts is how each
-        bends, which no straight line has. They are rolled out along it."""
+        """What an encoder misreads and what its servo's command is off by, where they nearly cancel, as one
+        each: the loop closes over the encoder, so that the joint is elsewhere and hardly a number shows it.
+        What counts is how each bends, which no straight line has: they are rolled out along their
+        difference."""
         more, both = {}, {}
-        for one, other, against in cancelling(sets)[:CANCEL]:
+        for one, other, against in cancelling(sets, composed.effects):
             name = f"{one}{JOINED}{other}"
             if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
                 continue
@@ -293,7 +294,7 @@ class Search:
             moved = self.columns[name]
             if moved is not None:
                 more[name] = moved
-                both[name] = RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
+                both[name] = _sized(name)
         return linear.with_moved(more), both
 
     def _difference(
@@ -347,27 +348,35 @@ class Search:
 
     def _better(self, at: Settled, best: Settled) -> Settled | None:
         """A set that is better than the best where it is fitted, proposed about where another is."""
-        sets, levels, effects = self.place(at, self.wanted)
-        names = [n for n in sets.names if JOINED not in n]
+        sets, levels = self.place(at, self.wanted)
+        names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
         if len(names) <= MANY:
             near += pairs(at.names, names)
+        near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
         own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
         level = [int(k) for k in score.argmax(0)]
         promised = score.max(0) - own + at.score - best.score
-        found = []
+        least = BETTER
+        if at is not best:  # what straight lines miss of the best they miss of what takes its place, too
+            known = score.max(0)[[{*names} == {*best.names} for names in near]]
+            least = min(0.0, *(known - own + at.score - best.score)) - NEAR
+        effects = self.composed.effects | {n: _sized(n) for n in self.against}
+        tried, found = 0, best
         for k in np.argsort(-promised):
-            if len(found) >= TRIED or promised[k] < (BETTER if at is best else -NEAR):
+            if tried >= TRIED or promised[k] < least:
                 break
             begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
-            one = self._apart(near[k], begin)
-            if frozenset(one) in self.known or (at is not best and {*best.names} < {*one}):
+            names = self._apart(near[k], begin)
+            if frozenset(names) in self.known or (at is not best and {*best.names} < {*names}):
                 continue
-            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
-            found.append(self.settled(one, begin, scales, best.score))
-        good = [s for s in found if self._is_better(s, best)]
-        return max(good, key=lambda s: s.score, default=None)
+            one, tried = self.settled(names, begin, levels[level[k]], best.score), tried + 1
+            if one.score > found.score and self._is_better(one, best):
+                found = one
+                if at is best and one.score > best.score + NEAR:  # about it all others are proposed anew
+                    break
+        return None if found is best else found
 
     def gains(self, one: Settled, other: Settled, by: Settled) -> np.ndarray:
         """Log densities (folds,) of each fold given the others, of one set over those of another, both by the
@@ -412,12 +421,17 @@ class Search:
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
             less = self.known.get(frozenset(rest)) or self.settled(
-                rest, without(best.point, out), [best.whiten]
+                rest, without(best.point, out), best.whiten
             )
-            there = self._better(less, best)
+            there = less if self._is_better(less, best) else self._better(less, best)
             if there is not None:
                 return there
         return None
+
+
+def _sized(name: str) -> RobotEffect:
+    """Two effects as one, by how much of both acts."""
+    return RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
 
 
 def _prior_constants(sizes: Sequence[int]) -> float:

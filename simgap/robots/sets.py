@@ -121,6 +121,18 @@ class Sets:
         score, x, covariance, spread = self._evidence([names], level, None, kept=True)
         return Evidence(float(score[0]), x[0], covariance[0], spread[0])
 
+    def pruned(self, names: Names, level: int) -> Names:
+        """What is left of a set when the one that it needs least is taken out again and again, as long as
+        that makes it likelier."""
+        score = float(self.scores([names], level)[0])
+        while names:
+            fewer = [tuple(n for n in names if n != out) for out in names]
+            scores = self.scores(fewer, level)
+            if scores.max() < score:
+                break
+            names, score = fewer[int(scores.argmax())], float(scores.max())
+        return names
+
     def held_out(self, names: Names, level: int) -> np.ndarray:
         """Log density (folds,) of each fold given the others."""
         whole = self.scores([names], level)[0]
@@ -246,9 +258,9 @@ def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
     return {n: v for n, v in point.items() if n != out}
 
 
-def cancelling(sets: Sets) -> list[tuple[str, str, float]]:
-    """Pairs of candidates of one parameter whose columns nearly cancel, those most alike first, and how much
-    of the second, in usual sizes, goes against one of the first."""
+def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str, str, float]]:
+    """Pairs of a read-out's and a command's effect, of one parameter each, whose columns nearly cancel, and
+    how much of the second, in usual sizes, goes against one of the first."""
     first = 1 + sets.along + np.concatenate([[0], np.cumsum([1 + k for k in sets.size])]).astype(int)
     single = [j for j, k in enumerate(sets.size) if k == 1]
     at = np.array([first[j] + 1 for j in single])
@@ -258,10 +270,11 @@ def cancelling(sets: Sets) -> list[tuple[str, str, float]]:
     alike = product / np.where(np.outer(seen, seen), np.outer(length, length), np.inf)
     found = []
     for i, j in zip(*np.triu_indices(len(at), 1), strict=True):
-        if ALIKE < abs(alike[i, j]) < SAME:
-            against = -alike[i, j] * length[i] / length[j]
-            found.append((abs(alike[i, j]), sets.names[single[i]], sets.names[single[j]], float(against)))
-    return [one[1:] for one in sorted(found, reverse=True)]
+        one, other = sets.names[single[i]], sets.names[single[j]]
+        closed = {(e.reads, e.command is not None) for e in (effects[one], effects[other])}
+        if closed == {(True, False), (False, True)} and ALIKE < abs(alike[i, j]) < SAME:
+            found.append((one, other, float(-alike[i, j] * length[i] / length[j])))
+    return found
 
 
 # Which parameters these logs can tell, and which only together: read off sensitivities before any fit.

@@ -11,6 +11,7 @@ import pytest
 import hmmseg.hmm as hmm
 from hmmseg.hmm.dense import log_evidence as dense_evidence
 from hmmseg.hmm.dense import viterbi as dense_viterbi
+from hmmseg.hmm.inference import align
 
 
 def random_problem(num_timesteps, num_subtasks, seed=0, num_skips=0):
@@ -151,41 +152,32 @@ def test_recordings_of_many_lengths_equal_one_by_one(single):
     kind = np.float32 if single else np.float64
     trials = [rng.normal(size=(n, 4)).astype(kind) for n in (4, 9, 300, 7, 5000)]
     chain = hmm.left_to_right([20.0, 5.0, 30.0, 10.0])
-    padded = np.full((len(trials), 5000, 4), 7.0, dtype=kind)
-    for row, trial in zip(padded, trials, strict=True):
-        row[: len(trial)] = trial
-    together = hmm.viterbi(trials, chain)
-    assert len(together) == len(trials)
-    for batch in (together, hmm.viterbi(padded, chain, lengths=[len(t) for t in trials])):
-        for each, trial in zip(batch, trials, strict=True):
-            alone = hmm.viterbi(trial, chain)
-            assert each.starts.tolist() == alone.starts.tolist()
-            assert each.log_prob == alone.log_prob
-            assert each.num_samples == len(trial)
+    for each, trial in zip(align(trials, [chain] * len(trials)), trials, strict=True):
+        alone = hmm.viterbi(trial, chain)
+        padded = np.concatenate([trial, np.full((3, 4), 7.0, kind)])
+        assert hmm.viterbi(padded, chain, len(trial)).starts.tolist() == alone.starts.tolist()
+        assert each.path.tolist() == alone.path.tolist() and each.log_prob == alone.log_prob
+        np.testing.assert_array_equal(each.smoothed, hmm.smooth(trial, chain).smoothed)
     bad = [*trials, np.full((5, 4), -np.inf, kind)]
     with pytest.raises(hmm.InfeasibleAlignment):
-        hmm.viterbi(bad, chain)
+        align(bad, [chain] * len(bad))
     bad[0] = trials[0].copy()
     bad[0][1, 2] = np.nan
     with pytest.raises(ValueError, match=r"\[1, 2\]"):
-        hmm.viterbi(bad, chain)
+        align(bad, [chain] * len(bad))
 
 
-def test_boundaries_come_with_their_confidence():
+def test_boundaries_come_with_their_intervals():
     ll, bands = random_problem(8, 3, seed=9)
     paths, weights, log_evidence, *_ = brute(ll, bands)
     p = np.exp(weights - log_evidence)
     starts = np.array([[np.argmax(path >= k) for k in (1, 2)] for path in paths])
     chain = chain_of(bands)
-    posterior, best = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
-    for within in (0, 1, 3, 20):
-        expected = [p[abs(starts[:, k] - best.starts[k + 1]) <= within].sum() for k in (0, 1)]
-        np.testing.assert_allclose(posterior.confidence(best, within), expected, atol=1e-12)
-    for q in (0.05, 0.5, 0.95):
-        expected = [min(s for s in range(1, 8) if p[starts[:, k] <= s].sum() >= q) for k in (0, 1)]
-        assert posterior.start_quantiles(q).tolist() == expected
-    assert posterior.start_intervals(0.9).tolist() == np.stack(
-        [posterior.start_quantiles(0.05), posterior.start_quantiles(0.95)], 1).tolist()  # fmt: skip
+    for level in (0.5, 0.9):
+        ends = [(1 - level) / 2, (1 + level) / 2]
+        expected = [[min(s for s in range(1, 8) if p[starts[:, k] <= s].sum() >= q) for q in ends]
+                    for k in (0, 1)]  # fmt: skip
+        assert hmm.smooth(ll, chain).start_intervals(level).tolist() == expected
 
 
 def test_optional_states_may_be_passed_over():
@@ -224,9 +216,7 @@ def test_optional_states_may_be_passed_over():
         (lambda: hmm.viterbi(np.zeros((3, 2)), hmm.left_to_right([1, 1, 1])), "2 states, expected"),
         (lambda: hmm.smooth(np.zeros(3), hmm.left_to_right([1])), r"log_likelihoods: shape \(3,\)"),
         (lambda: hmm.smooth(np.zeros((9, 2)), hmm.Chain(np.zeros((4, 2)), [0.0])), "9 samples, expected 5"),
-        (lambda: hmm.viterbi([np.zeros((3, 1))], [hmm.left_to_right([1])] * 2), "2 given, expected 1"),
-        (lambda: hmm.viterbi(np.zeros((1, 3, 1)), hmm.left_to_right([1]), [4]), "4 for recording 0"),
-        (lambda: hmm.viterbi(np.zeros((1, 3, 1)), hmm.left_to_right([1]), [3, 3]), "2 given, expected 1"),
+        (lambda: hmm.viterbi(np.zeros((3, 1)), hmm.left_to_right([1]), 4), "length: 4, expected 1 to 3"),
         (lambda: hmm.left_to_right([2.0, 3.0], [1.0]), r"presence: shape \(1,\), expected \(2,\)"),
         (lambda: hmm.left_to_right([2.0], [0.0]), r"probabilities in \(0, 1\]"),
         (lambda: hmm.smooth(np.full((3, 1), np.inf), hmm.left_to_right([1])), r"NaN or \+inf at \[0, 0\]"),

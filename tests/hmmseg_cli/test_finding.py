@@ -109,7 +109,7 @@ def test_no_more_is_said_of_noise_and_one_probability_of_a_cause():
     own = {"force_gain": {"probability": 0.8, "share": 0.38, "interval_90": [0.3, 0.4]}}
     found = body("named", ["force_gain"], remainder=left, attribution=own)
     assert "larger gap" not in headline(found)
-    assert remains(found) == ["What remains, 62 % of the gap, does not stand out of the noise (p = 1.0)."]
+    assert remains(found) == ["What remains, 62 % of the gap, is within the noise (p = 1.0)."]
     assert chances(found) == {"force_gain": 0.93}
     assert "--actual" in settles(found, weighed=False) and settles(found, weighed=True) == ""
 
@@ -147,7 +147,9 @@ def test_an_unknown_gap_says_what_moves():
     first, second = moving(found)
     assert first == ("The height difference of the fingers is off while you carry block1: 61 % of the gap, "
                      "in 2 trials.")  # fmt: skip
-    assert second.startswith("The net vertical force moves otherwise while you press block1 down: under 1 %")
+    assert second.startswith(
+        "The net vertical force moves differently while you press block1 down: under 1 %"
+    )
     assert "what acts there" in to_do(found)[-1]
     assert remains(found) == ["70 % of the gap is left after every likely cause."]
 
@@ -188,7 +190,7 @@ ROBOT = {
 
 def test_an_unknown_gap_of_a_robot_names_the_best_and_why_it_is_none():
     said = " ".join([*sentences(ROBOT), *remains(ROBOT)])
-    assert "slew: rotor inertia, is doubted: 11.5 times the noise is left" in said
+    assert "slew: rotor inertia, is doubtful: 11.5 times the noise is left" in said
     assert "while it moves: 100 % of the gap" in said
     shown = page(ROBOT, Setting(["a.csv"], ["moving"]), lambda path: None)
     assert "None explains a hundredth of the gap" in shown and "68 %" not in shown
@@ -218,4 +220,4 @@ def test_what_remains_is_called_noise_by_its_p_value_alone():
         "Under 1 % of the gap remains (p = 1e-15), which is more than noise."
     ]
     left["remainder"]["p_value"] = 0.6
-    assert "does not stand out of the noise (p = 0.60)" in remains(body("named", ["cable_force"], **left))[0]
+    assert "is within the noise (p = 0.60)" in remains(body("named", ["cable_force"], **left))[0]

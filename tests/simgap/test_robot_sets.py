@@ -5,6 +5,8 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
+from simgap.effect import Parameter
+from simgap.robot_effects.base import RobotEffect
 from simgap.robots.sets import Sets, cancelling, neighbours, pairs
 from simgap.robots.whiten import Block, Covariances, Discrepancy, Source
 
@@ -57,11 +59,15 @@ def test_bounds_hold_and_many_sets_are_as_each_alone(drawn):
     assert sets.held_out(("a",), 0).sum() > sets.held_out((), 0).sum() + 10
 
 
-def test_pairs_that_nearly_cancel_are_found(drawn):
+def test_what_an_encoder_and_a_command_do_against_each_other_is_found(drawn):
     columns, residual, fold = drawn
     columns[:, 2] = -2.0 * columns[:, 1] + 0.1 * columns[:, 2]
-    ((one, other, against),) = cancelling(sets_of(columns, residual, fold))
+    parameter, same = {"x": Parameter(0.0, 1.0)}, lambda *values: values[-2]
+    read, moved = RobotEffect("", "", parameter, read=same), RobotEffect("", "", parameter, command=same)
+    sets = sets_of(columns, residual, fold)
+    ((one, other, against),) = cancelling(sets, {"a": read, "b": moved, "c": moved})
     assert (one, other) == ("a", "b") and against == pytest.approx(0.5, rel=0.05)
+    assert not cancelling(sets, {"a": moved, "b": moved, "c": read})
 
 
 def block(window: int) -> Block:
