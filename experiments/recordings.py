@@ -58,7 +58,7 @@ def read_case(folder: Path) -> Case:
     files = sorted(folder.glob("trial_*.csv"))
     trials = tuple(read_trial(file, rig) for file in files)
     signals = tuple(task_space(trial, rig) for trial in trials)
-    truth = tuple(_read_boundaries(folder / "truth" / f"{file.stem}.json") for file in files)
+    truth = tuple(read_boundaries(folder / "truth" / f"{file.stem}.json") for file in files)
     blocks = {}
     if (folder / "actual.toml").exists():
         blocks = read_actual(folder / "actual.toml", task.objects)
@@ -74,7 +74,8 @@ def read_case(folder: Path) -> Case:
     return Case(folder.name, rig, task, trials, signals, truth, blocks, effects)
 
 
-def _read_boundaries(path: Path) -> tuple[float, ...] | None:
+def read_boundaries(path: Path) -> tuple[float, ...] | None:
+    """True boundaries [s] of a file in truth/, NaN of one that never came; None without the file."""
     if not path.exists():
         return None
     times = json.loads(path.read_text(encoding="utf-8"))["boundaries"]

@@ -22,11 +22,8 @@ def minute() -> str | None:
     found = load("benchmark_robot")
     if found is None:
         return None
-    runs = {"whole": found["whole"]}
-    if "interrupted" in found:
-        runs |= {k: found["interrupted"][k] for k in ("first", "again")}
-    label = {"whole": "in one go", "first": "interrupted half way", "again": "the same command again"}
-    rows = [[label[k], f"{v['processor']:.0f} s", f"{v['wall']:.0f} s"] for k, v in runs.items()]
+    whole = found["whole"]
+    rows = [["in one go", f"{whole['processor']:.0f} s", f"{whole['wall']:.0f} s"]]
     note = (
         f"A log of {found['seconds']:.0f} s at {found['rate']:.0f} Hz of six joints; {found['cores']} cores, "
         f"on which on average {found['load'][1]:.0f} processes ran, these among them. Planted: "
@@ -112,12 +109,6 @@ def given() -> str | None:
         others = f"; or {', '.join(one['indistinguishable'])}" if one["indistinguishable"] else ""
         rows.append([name, one["verdict"], causes + others, "yes" if one["right"] else "no",
                      f"{one['over_noise']:.2f}", f"{one['seconds']:.0f} s"])  # fmt: skip
-    head = [
-        "case",
-        "verdict",
-        "causes, with their parameters",
-        "as the answer",
-        "left, over noise",
-        "processor",
-    ]
+    head = ["case", "verdict", "causes, with their parameters", "as the answer", "left, over noise",
+            "processor"]  # fmt: skip
     return markdown(head, rows)

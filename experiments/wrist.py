@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation.identification import identify_aligned
+from experiments.recordings import read_boundaries
 from experiments.saving import save
 from experiments.scoring import (
     boundaries_covered,
@@ -102,9 +103,7 @@ def _arm_case(recordings: Sequence, rig: Rig, source: Path) -> dict:
     blocks = json.loads((source / "truth.json").read_text())
     known = {name: {k: (block[k], 0.0) for k in ("weight", "width", "height")}
              for name, block in blocks.items()}  # fmt: skip
-    truths = [
-        json.loads(path.read_text())["boundaries"] for path in sorted(source.glob("truth/trial_*.json"))
-    ]
+    truths = [read_boundaries(path) for path in sorted(source.glob("truth/trial_*.json"))]
     return score(recordings, rig, task, truths, known)
 
 

@@ -183,7 +183,6 @@ def main() -> None:
         print(by, out[by], flush=True)
         if given.output is not None:
             save(given.output, {**out, "logs": rows})
-            pd.DataFrame(rows).to_csv(given.output.with_suffix(".csv"), index=False)
 
 
 if __name__ == "__main__":

@@ -269,7 +269,6 @@ def main() -> None:
         if given.output is not None:
             settings = {"part": given.part, "seed": given.seed, "drawn": given.cases}
             save(given.output, {**settings, "figures": summary(out), "cases": out})
-            pd.DataFrame([_row(c) for c in out]).to_csv(given.output.with_suffix(".csv"), index=False)
     for figure in summary(out):
         low, high = figure["interval_90"]
         hits = f"{figure['hits']} of {figure['of']} ({low:.2f} to {high:.2f})"
@@ -281,7 +280,7 @@ def _text(ratios: dict[str, float]) -> str:
 
 
 def _row(one: dict[str, Any]) -> dict[str, Any]:
-    """A line of the CSV."""
+    """A line for people."""
     sizes = [
         f"{n} x{s['ratio']:.3f} ({s['interval'][0]:.3f} to {s['interval'][1]:.3f})"
         for n, s in one["sizes"].items()
