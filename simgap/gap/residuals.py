@@ -307,7 +307,7 @@ def residuals(
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = arrays.phase[..., Phase.PLACE]
-    offset = block_offset(y2 - y1, fy1, fy2, pads_give)
+    offset = block_offset(y2 - y1, fy1, fy2, pads_give) + world.hang * width * world.carry
     x = block_x((x1 + x2) / 2, fx1, fx2, pads_give)
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
