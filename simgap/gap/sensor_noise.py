@@ -179,17 +179,16 @@ def residual_noise(one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndar
 
 
 def motion_doubt(
-    s: Signals, one: dict[str, np.ndarray], step: float, group: int, pad: Fingertip
+    s: Signals, one: dict[str, np.ndarray], push: np.ndarray, step: float, group: int, pad: Fingertip
 ) -> np.ndarray:
     """How far (N, C) residuals are off beyond noise where motion is not what equations take it for, sd.
 
-    Fingers that push a block move it, and speeds that change within a sample, as that of a pressed fingertip
-    that is released, no rule gives; while pads give way quickly, their damping bears a part of the force.
-    Samples are means over `group` finer ones.
+    Blocks that fingers `push` (N,) [m] rock, and speeds that change within a sample, as that of a pressed
+    fingertip that is released, no rule gives; while pads give way quickly, their damping bears a part of the
+    force. Samples are means over `group` finer ones.
     """
     root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))
-    push = pushed(mean_of(s, "x"), one["x"] / root2)
-    out[:, 0], out[:, 1], out[:, 3] = np.hypot(NUDGE, push), ROCKING * push, 2 * ROCKING * push
+    out[:, 0], out[:, 1], out[:, 3] = NUDGE, ROCKING * push, 2 * ROCKING * push
     damped = FOAM / step * changes(np.stack([s.fx1, s.fy1, s.fx2, s.fy2], 1), one["force"])
     normal, shear = damped[:, ::2] / pad.normal_stiffness, damped[:, 1::2] / pad.shear_stiffness
     for channel, each in ((0, normal / 2), (1, shear / 2), (2, normal), (3, shear)):

@@ -12,7 +12,7 @@ from tests.simgap.test_gap_effects import performance, world_of
 
 
 def _cost(values, weight, sd, slip, grips) -> float:
-    out, factor = _followed(*(np.asarray(z)[None] for z in (values, weight, sd, slip, grips)))
+    out, factor = _followed(*(np.asarray(z)[None] for z in (values, weight, sd, SLIDE * slip, grips)))
     out, factor = np.asarray(out)[0], np.asarray(factor)[0]
     return float(0.5 * ((out / sd) ** 2 / factor + np.log(factor)).sum())
 
