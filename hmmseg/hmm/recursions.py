@@ -4,7 +4,7 @@ Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods, a row
 missing; `w` (num_timesteps
 - 1 or 1, num_bands, num_states) log weights by their target, w[t, d, k] of going from k - d to k between
 the samples t and t + 1, -inf where k < d, one row where they do not vary; `n` int32, how many rows are
-no padding. A table of the recursion has a row for every timestep; what stands beyond row n - 1 means
+no padding. A table of the recursion has a row for every timestep; what lies beyond row n - 1 means
 nothing.
 
 A chain is triangular: no path returns to a state it has left. So there are two ways to run it. Row by

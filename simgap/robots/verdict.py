@@ -84,7 +84,7 @@ def verdict_on(
     doubts = _absurd(search.composed.effects, best, causes)
     right = 0.0 if doubts else known(left, 1.0 - left)
     others = _alternatives(search, best)
-    # What is too small to be told, and what takes its place, is no cause and stands in for none.
+    # What is too small to report, and its replacements, is no cause and replaces none.
     small = {*best.names} - {*causes}
     small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
     sets = _explanations(others, best, small - {*causes}, right)
@@ -180,7 +180,7 @@ def _absurd(effects: Mapping[str, RobotEffect], best: Settled, causes: Sequence[
 
 
 def _where(search: Search, one: Settled, phases: Phases) -> tuple[Cell, ...]:
-    """Cells in which what a set leaves stands out of the noise."""
+    """Cells in which what a set leaves exceeds the noise."""
     composed, rows = search.composed, one.linear.rows
     whiten: Whitener = one.covariances.whitener()
     white = whiten(np.nan_to_num(one.linear.residual))
