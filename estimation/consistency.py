@@ -220,8 +220,8 @@ def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[
         error = max(spread, float(np.sqrt(np.median(variances[:, k])))) / np.sqrt(len(slopes))
         text = (
             f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
-            f"block {axis}, which no block does: joint angles, links or bases are farther off than [systematic] in "
-            "rig.toml admits"
+            f"block {axis}, which no block does: joint angles, links or bases are farther off than "
+            "[systematic] in rig.toml admits"
         )
         yield Tie("rigidity", steep, error, ("width", "height"), text, _made(rig))
 
