@@ -184,7 +184,7 @@ class Change:
     """Contacts made, or broken, at one boundary: of two, the last one made and the first one broken count.
 
     `timing` [s] is the uncertainty of the forces' own clock. `slips` [m]: at which penetration each contact
-    that is broken slides. `unmoved`: the contacts, had the block stood still where it rests later.
+    that is broken slides.
     """
 
     contacts: tuple[Penetration, ...]
@@ -193,7 +193,6 @@ class Change:
     kind: Kind
     timing: float
     slips: tuple[float, ...] = ()
-    unmoved: tuple[Penetration, ...] = ()
 
     @property
     def sort(self) -> tuple[Kind, int]:
@@ -223,12 +222,11 @@ def cut(change: Change) -> Change | None:
     if not near.size:
         return None
     index = index[near[0] : near[-1] + 2]
-    contacts, unmoved = (
-        tuple(replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
-              for c in each)
-        for each in (change.contacts, change.unmoved)
-    )  # fmt: skip
-    return replace(change, contacts=contacts, unmoved=unmoved)
+    contacts = tuple(
+        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
+        for c in change.contacts
+    )
+    return replace(change, contacts=contacts)
 
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
@@ -282,7 +280,6 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
 
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
 VIEWS = (0.6, 0.2, 0.2)
-STOOD = 0.5  # prior: that a block stood still until the later finger touched it
 FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 
 
@@ -293,16 +290,10 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
     silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
     meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
 
-    Of two touches the later comes when both fingers are the block's width apart, as the first pushes the
-    block; or, of a heavy block in soft pads and touches some ms apart, before it has moved (STOOD).
+    Of two touches the later comes when both fingers are the block's width apart: the first pushes the block.
     """
-    contacts, unmoved = (
-        [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in each]
-        for each in (change.contacts, change.unmoved)
-    )
+    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
     views, weight = [contacts], (1.0,)
-    if unmoved:
-        views, weight = [contacts, unmoved], (1 - STOOD, STOOD)
     if change.slips:
         sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
         opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]

@@ -278,13 +278,16 @@ def noise_sd(values: np.ndarray) -> float:
     return float(white_sd(there)) if there.size > 2 else np.nan
 
 
-def thin(signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf) -> Signals:
+def thin(
+    signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf, rate: float | None = None
+) -> Signals:
     """Signals read at a rate of at most `max_rate` [Hz], each reading a mean over up to `window` s.
 
     White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing.
-    A short window keeps what changes within a reading apart.
+    A short window keeps what changes within a reading apart. `rate` [Hz]: of the recording that the signals
+    are a piece of; their own median otherwise.
     """
-    rate = float(1.0 / np.median(np.diff(signals.t)))
+    rate = float(1.0 / np.median(np.diff(signals.t))) if rate is None else rate
     group = group_size(rate, max_rate)
     if group <= 1:
         return signals

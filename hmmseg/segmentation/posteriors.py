@@ -57,11 +57,10 @@ class Contacts:
         timing = self.sensing.delay_sd
         if FREE in (before.state, after.state):
             making = before.state == FREE
-            rests = (after if making else before).state == ON_GROUND
+            rests = not making and before.state == ON_GROUND
             fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
             if making:
-                pushed = tuple(self._finger(i, stretch, making, False) for i in (0, 1))
-                return cut(Change(pushed, prior, making, "impact", timing, unmoved=fingers if rests else ()))
+                return cut(Change(fingers, prior, making, "impact", timing))
             slips = tuple(self._slip(i, stretch) for i in (0, 1))
             return cut(Change(fingers, prior, making, "smooth", timing, slips))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
