@@ -189,10 +189,6 @@ def possible_share(shares: np.ndarray, variances: np.ndarray) -> float:
 
 
 BEFORE = 4  # numerics: samples before the touch from which the fingers' height at it is extrapolated
-SURE, RELIEVED = (
-    4.0,
-    0.25,
-)  # chosen: noise sds, and share of the load, that a support bears once it is touched
 LEAST_GIVE = 1e-6  # numerics: m; a push that squeezes nothing shows nothing
 
 
