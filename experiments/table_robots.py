@@ -38,10 +38,10 @@ def check() -> str | None:
     found = load("robots_check")
     if found is None:
         return None
-    told: dict[str, Any] = {**found, **found["named_right_by_kind"]}
+    shares: dict[str, Any] = {**found, **found["named_right_by_kind"]}
     rows = []
     for key, (label, goal) in GOALS.items():
-        one = told[key]
+        one = shares[key]
         if not one["of"]:
             continue
         low, high = (100 * v for v in one["interval_90"])
@@ -52,7 +52,7 @@ def check() -> str | None:
     counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
     note = (
         f"{found['cases']} cases ({counts}; {found['below_the_floor']} of {found['faults']} faults show less "
-        f"than the floor of {found['floor']:g} nats and are not asked); in brackets 90 % intervals. "
+        f"than the floor of {found['floor']:g} nats and are not counted); in brackets 90 % intervals. "
         f"Processor time a case: {seconds}. "
         f"Code of {found['made_by']}."
     )
@@ -91,7 +91,7 @@ def bam() -> str | None:
             ours, other = (1e3 * one["rms"][pair[n]] for n in ("one", "other"))
             less = f"{1e3 * pair['less']:.1f} ({low:.1f} to {high:.1f})"
             rows.append([words, pair["other"], f"{ours:.1f}", f"{other:.1f}", less])
-    head = ["left out in turn", "beside", "ours [mrad]", "it [mrad]", "difference"]
+    head = ["left out in turn", "compared with", "ours [mrad]", "its [mrad]", "difference"]
     note = f"In brackets 95 % intervals by a paired bootstrap. Code of {found['made_by']}."
     return f"{markdown(head, rows)}\n\n{note}"
 
