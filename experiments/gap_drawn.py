@@ -88,7 +88,7 @@ def table() -> str | None:
         line("healthy: none", ["healthy"], "quiet"),
         line("single: named alone", ["single"], "named"),
         line("single: named alone, or in a set", ["single"], "named", "set"),
-        line("single: others beside it", ["single"], "beside others"),
+        line("single: named with others", ["single"], "beside others"),
         line("single: unknown", ["single"], "unknown"),
         line("single: not noticed, or too small to matter", ["single"], "missed", "too small"),
         line("single: another name", ["single"], "wrong name"),

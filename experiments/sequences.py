@@ -32,7 +32,7 @@ from hmmseg.sequence.segment import segment_sequence
 
 OUT = Path(__file__).parent / "results" / "sequences.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "sequences.png"
-ROWS = {"none": "no labels", "asked": "the label asked for", "trial": "one labelled trial"}
+ROWS = {"none": "no labels", "asked": "the suggested label", "trial": "one labelled trial"}
 WRIST = ("width", "ee_y", "ee_z", "Fx", "Fy", "Fz")
 LEARNED_FROM = 80_000  # chosen: first seed of the worlds that weights are learned from
 MOST_TRIALS = 4  # numerics: of a hand's recordings
@@ -103,7 +103,7 @@ def hands(folders: list[Path]) -> list[Case]:
 
 
 def answers(case: Case) -> dict:
-    """Scores without labels, with the one requested label, with one labelled trial."""
+    """Scores without labels, with the one label that was suggested, with one labelled trial."""
     world = case.world
     model = fit_sequence(world.trials, world.task)
     blind = segment_sequence(world.trials, world.task, model)

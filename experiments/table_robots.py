@@ -52,11 +52,11 @@ def check() -> str | None:
     counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
     note = (
         f"{found['cases']} cases ({counts}; {found['below_the_floor']} of {found['faults']} faults show less "
-        f"than the floor of {found['floor']:g} nats and are not counted); in brackets 90 % intervals. "
+        f"than the floor of {found['floor']:g} nats and do not count); in brackets 90 % intervals. "
         f"Processor time a case: {seconds}. "
         f"Code of {found['made_by']}."
     )
-    return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+    return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
 def changed() -> str | None:
@@ -75,7 +75,7 @@ def changed() -> str | None:
         f"configurations, seed {found['seed']}; in brackets 90 % intervals. Processor time a case: "
         f"{seconds[len(seconds) // 2]:.0f} s. Code of {found['made_by']}."
     )
-    return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+    return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
 def bam() -> str | None:
@@ -91,7 +91,7 @@ def bam() -> str | None:
             ours, other = (1e3 * one["rms"][pair[n]] for n in ("one", "other"))
             less = f"{1e3 * pair['less']:.1f} ({low:.1f} to {high:.1f})"
             rows.append([words, pair["other"], f"{ours:.1f}", f"{other:.1f}", less])
-    head = ["left out in turn", "compared with", "ours [mrad]", "its [mrad]", "difference"]
+    head = ["left out in turn", "rival", "ours [mrad]", "rival [mrad]", "difference"]
     note = f"In brackets 95 % intervals by a paired bootstrap. Code of {found['made_by']}."
     return f"{markdown(head, rows)}\n\n{note}"
 

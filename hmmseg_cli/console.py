@@ -306,7 +306,7 @@ def needed(rig: Path | None, trials: Sequence[Path]) -> Path:
 
 
 def _keys(path: Path | None) -> set[str]:
-    """Keys at the top of a TOML file; none where it cannot be read, which its reader tells."""
+    """Keys at the top of a TOML file; none where it cannot be read, which its reader reports."""
     try:
         return set() if path is None else set(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError):

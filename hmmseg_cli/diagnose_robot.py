@@ -327,12 +327,12 @@ def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
-    """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
+    """What the logs leave open first, then the tables of every diagnosis, and held-out residuals."""
     out = []
     unseen = document["identifiability"]["unseen"]
     alike = document["identifiability"]["alike"]
     if unseen or alike:
-        table = Table(title="what these logs cannot tell", title_justify="left", show_header=False)
+        table = Table(title="what these logs leave open", title_justify="left", show_header=False)
         for one in alike[:6]:
             how = "act only together" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"
             table.add_row(", ".join(one["parameters"]), how)

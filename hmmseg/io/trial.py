@@ -28,7 +28,7 @@ MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 class Trial(Tabled):
     """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
 
-    `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
+    `origin` is where t = 0 lies, in ns since 1970, if the file says; `interpolated` marks, for
     channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
     `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
     reason. `touch_sd` [m]: how well the distance at which the fingers touch a block is known, but for noise;

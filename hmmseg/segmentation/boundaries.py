@@ -31,7 +31,6 @@ UNSEEN = 0.15  # prior: the same, as a share of the way that the velocities at b
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
 MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 24  # numerics: nodes over the time at which that motion started
-ALONE = 0.1  # prior: share of grips to which fingers do not come as one
 SEVERAL = 0.1  # prior: share of landings within whose sample interval one motion ends and another begins
 SHAPE = 0.05  # prior: how far its speed may be off the minimum-jerk profile, as a share of it
 STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
@@ -87,8 +86,8 @@ def log_smooth(c: Crossing, h: float, u: np.ndarray, bend: float | None = None) 
 def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
     """Probability (POINTS,) that every finger has hit by each node of an interval of h s.
 
-    Fingers move as one, so that duration and start of the motion are marginalised for all of them together;
-    or each by itself, as far as their readings say so. Distance, noise and stop are each finger's own.
+    Fingers move as one, so that duration and start of the motion are marginalised for all of them together.
+    Distance, noise and stop are each finger's own.
     """
     u = (np.arange(POINTS) + 0.5) / POINTS
     duration = np.geomspace(*MOTION, MOTIONS)[:, None, None]
@@ -96,22 +95,20 @@ def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
     age = starts[:, None] * (duration + h) - h  # since its start, at the first sample; uniform
     log_prior = np.log(duration + h)[..., 0] + np.zeros(STARTS)
     log_prior = log_prior - np.logaddexp.reduce(log_prior, axis=None)
-    together, every, apart, hits = log_prior, np.ones(1), 0.0, np.ones(1)
+    together, every = log_prior, np.ones(1)
     for c in impacts:
         log_motion, log_after = _log_impact(c, h, u, duration, age / duration)
         log_density = log_motion + log_after
         peak = log_density.max(axis=-1, keepdims=True)
         density = np.exp(log_density - peak)
         total = density.sum(axis=-1)
-        log_own, own = peak[..., 0] + np.log(total), np.cumsum(density, axis=-1) / total[..., None]
-        together, every = together + log_own, every * own
-        evidence, hit = _mixed(log_prior + log_own, own)
-        apart, hits = apart + evidence, hits * hit
-    evidence, hit = _mixed(together, every)
+        together = together + peak[..., 0] + np.log(total)
+        every = every * (np.cumsum(density, axis=-1) / total[..., None])
+    weight = np.exp(together - together.max())
+    hit = (weight[..., None] * every).sum(axis=(0, 1)) / weight.sum()
     if len(impacts) == 1:
         return _or_several(impacts[0], h, u, log_prior[..., None] + log_motion, log_after, hit)
-    share = 1 / (1 + ALONE / (1 - ALONE) * np.exp(np.clip(apart - evidence, -500, 500)))
-    return share * hit + (1 - share) * hits
+    return hit
 
 
 def _or_several(
@@ -136,21 +133,13 @@ def _or_several(
     return (1 - share) * hit + share * np.cumsum(density) / density.sum()
 
 
-def _mixed(log_weight: np.ndarray, hit: np.ndarray) -> tuple[float, np.ndarray]:
-    """Log sum of weights (...), and the weighted mean of hit (..., POINTS)."""
-    peak = log_weight.max()
-    weight = np.exp(log_weight - peak)
-    axes = tuple(range(weight.ndim))
-    return float(peak + np.log(weight.sum())), (weight[..., None] * hit).sum(axis=axes) / weight.sum()
-
-
 def _log_impact(
     c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log likelihoods (..., POINTS) of what precedes and of what follows an impact at u, given its motion.
 
     A minimum-jerk motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample.
-    Its distance is unknown (log-uniform); gap and velocity of the first sample tell it. The face
+    Its distance is unknown (log-uniform); gap and velocity of the first sample determine it. The face
     that it hits is as likely in one place on its way as in another. After the hit the velocity
     decays to v_right with an unknown time constant, which makes the compression `right`.
     """

@@ -38,11 +38,11 @@ from hmmseg.segmentation.boundaries import (
     first_of,
 )
 
-# prior: share of samples at which one sensor tells another story than the model (ringing, a block
+# prior: share of samples at which one sensor contradicts the model (ringing, a block
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
-LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
+LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed show how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 
@@ -55,7 +55,7 @@ class Penetration:
     before and just after each sample. `sd_pressed` is
     the noise of the force, `form` the share by which a pad's force may be off its compression;
     `sd_apart` [m]: what the force may be of itself where there is no contact. `hidden`: a rigid pad, whose
-    force tells that there is contact, but not how deep.
+    force shows that there is contact, but not how deep.
     """
 
     t: np.ndarray
@@ -103,7 +103,7 @@ def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.n
     depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
     # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
-    # is lost in it, that would count against contact, of which force alone tells.
+    # is lost in it, that would count against contact, which force alone shows.
     deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
     agree = agree + np.log(max(ROOT_2PI * c.sd_place / deep, 1.0))
     held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))
@@ -184,7 +184,7 @@ class Change:
     """Contacts made, or broken, at one boundary: of two, the last one made and the first one broken count.
 
     `timing` [s] is the uncertainty of the forces' own clock. `slips` [m]: at which penetration each contact
-    that is broken slides. `unmoved`: the contacts, had the block stood still where it rests later.
+    that is broken slides.
     """
 
     contacts: tuple[Penetration, ...]
@@ -193,7 +193,6 @@ class Change:
     kind: Kind
     timing: float
     slips: tuple[float, ...] = ()
-    unmoved: tuple[Penetration, ...] = ()
 
     @property
     def sort(self) -> tuple[Kind, int]:
@@ -223,12 +222,11 @@ def cut(change: Change) -> Change | None:
     if not near.size:
         return None
     index = index[near[0] : near[-1] + 2]
-    contacts, unmoved = (
-        tuple(replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
-              for c in each)
-        for each in (change.contacts, change.unmoved)
-    )  # fmt: skip
-    return replace(change, contacts=contacts, unmoved=unmoved)
+    contacts = tuple(
+        replace(c, t=t[index], pressed=c.pressed[index], place=c.place[index], rate=c.rate[:, index])
+        for c in change.contacts
+    )
+    return replace(change, contacts=contacts)
 
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
@@ -282,7 +280,6 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
 
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
 VIEWS = (0.6, 0.2, 0.2)
-STOOD = 0.5  # prior: that a block stood still until the later finger touched it
 FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 
 
@@ -293,16 +290,10 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
     silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
     meets the block again for some ms. Where these differ, each is as it may be (VIEWS).
 
-    Of two touches the later comes when both fingers are the block's width apart, as the first pushes the
-    block; or, of a heavy block in soft pads and touches some ms apart, before it has moved (STOOD).
+    Of two touches the later comes when both fingers are the block's width apart: the first pushes the block.
     """
-    contacts, unmoved = (
-        [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in each]
-        for each in (change.contacts, change.unmoved)
-    )
+    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
     views, weight = [contacts], (1.0,)
-    if unmoved:
-        views, weight = [contacts, unmoved], (1 - STOOD, STOOD)
     if change.slips:
         sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
         opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]

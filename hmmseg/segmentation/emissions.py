@@ -52,7 +52,7 @@ class Features(Brief):
     `pads`: their nominal compliances [m/N].
     `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force of a
     finger and press of both downwards [N]). `free`: 1 where a gripper's opening says that nothing is held,
-    None where nothing but forces tells.
+    None where forces alone are known.
     """
 
     t: np.ndarray

@@ -57,11 +57,10 @@ class Contacts:
         timing = self.sensing.delay_sd
         if FREE in (before.state, after.state):
             making = before.state == FREE
-            rests = (after if making else before).state == ON_GROUND
+            rests = not making and before.state == ON_GROUND
             fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
             if making:
-                pushed = tuple(self._finger(i, stretch, making, False) for i in (0, 1))
-                return cut(Change(pushed, prior, making, "impact", timing, unmoved=fingers if rests else ()))
+                return cut(Change(fingers, prior, making, "impact", timing))
             slips = tuple(self._slip(i, stretch) for i in (0, 1))
             return cut(Change(fingers, prior, making, "smooth", timing, slips))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
@@ -131,7 +130,7 @@ class Contacts:
 
         A touch begins where the compression does, and so do both changes for a sensor that is late.
         Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly. How fast a
-        stiff pad is pressed only its force tells: what its finger moves, it moves with the block.
+        stiff pad is pressed only its force shows it: what its finger moves, it moves with the block.
         """
         rate = central_differences(c.t, c.pressed)[0] if c.hidden else c.rate.mean(axis=0)
         moved = self.sensing.delay * np.nan_to_num(rate)

@@ -22,7 +22,7 @@ from hmmseg.segmentation.conformity import DEPARTURE, Conformity, assignments, c
 from hmmseg.segmentation.emissions import Features
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts
 
-GLANCE = 4096  # numerics: samples that tell which of the recording's blocks is which object
+GLANCE = 4096  # numerics: samples that identify the recording's blocks with objects
 
 
 def one_round(task: BlockTask) -> BlockTask:

@@ -43,6 +43,9 @@ ENOUGH = 40  # numerics: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
 SMOOTH = 12  # numerics: directions of a channel in a block, of which what is smooth consists
 ALONE = -4.0  # prior: log odds of a window to be off for reasons of its own
+# numerics: log variances that a search for them begins below what they could be at most: from above, one that
+# is too large may stay in the place of another
+BELOW = 4.0
 WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 # numerics: log variances are found to a hundredth of a nat
 CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
@@ -181,10 +184,10 @@ class Covariances:
         smooth, names = self._smooth, self.names
         left, rest = smooth.projected(residual, wide or {})
         kept = list(range(len(names)))
-        x = smooth.first_guess(left)
+        x = smooth.first_guess(left) - BELOW
         plain = smooth.cost(np.zeros(0), left, rest, [])[0]
         while kept:
-            bounds = [(v - 20.0, v + 12.0) for v in x]
+            bounds = [(v - 16.0, v + 16.0) for v in x]
             done = minimize(
                 smooth.cost, x, (left, rest, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE
             )

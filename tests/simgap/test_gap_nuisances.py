@@ -1,7 +1,5 @@
 """What is nobody's fault: linear unknowns integrated out, the noise's level and colour, blocks that turn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
