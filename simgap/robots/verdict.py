@@ -152,8 +152,10 @@ def _alternatives(search: Search, best: Settled) -> list[Settled]:
 def _explanations(
     others: Sequence[Settled], best: Settled, small: set[str], right: float
 ) -> list[Explanation]:
-    """The sets that are left, by weight, without what is small."""
-    score = np.array([best.score, *(max(s.score, best.score - np.log(RULED_OUT)) for s in others)])
+    """The sets that are left, by weight, without what is small: none weighs more than the best, for held-out
+    logs do not bear out what is likelier."""
+    others_score = [np.clip(s.score, best.score - np.log(RULED_OUT), best.score) for s in others]
+    score = np.array([best.score, *others_score])
     weight = np.exp(score - np.logaddexp.reduce(score))
     each = [tuple(sorted({*s.names} - small)) for s in (best, *others)]
     return [
