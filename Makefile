@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models bench-long gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -78,6 +78,10 @@ bench: $(INSTALLED)  ## time of the commands, stage by stage; fills docs/benchma
 
 bench-watch: $(INSTALLED)  ## following a task while it runs, on RECORDINGS; fills docs/watch.md
 	$(BIN)/python -m experiments.benchmarks.watch $(or $(RECORDINGS),recordings)
+	$(BIN)/python -m experiments.write_tables
+
+bench-long: $(INSTALLED)  ## up to 10,000,000 rows of a repeated task of the LAB, segmented from disk; fills docs/benchmarks.md
+	$(BIN)/python -m experiments.benchmarks.long_recordings $(or $(LAB),recordings/none_1)
 	$(BIN)/python -m experiments.write_tables
 
 bench-haptic: $(INSTALLED)  ## a minute of the virtual model at 4 kHz beside loops that do nothing (real-time priority: as root); fills docs/virtual_model.md

@@ -18,9 +18,20 @@ def identify(
 ) -> Identification:
     """Weight, width, height and friction of every block, with uncertainties, all trials pooled.
 
-    `trials`, `task`, `rig`: paths, tables or what the readers give; or what `hmmseg.align` gave, alone.
-    `progress(steps_done, steps_at_most)` is called while sampling. InputError for input at fault; trials
-    that do not fit the task are reported in the result, not raised.
+    Args:
+        trials: One source or several (paths, tables, results of `Trial.read`), or the result of
+            `hmmseg.align`, which needs no `task` or `rig`.
+        task: A path, a dict, or the result of `Task.read`.
+        rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
+        seed: Seed of all random draws.
+        progress: Called with (steps done, steps at most) while sampling.
+
+    Returns:
+        Posterior draws [N, m, 1], intervals, reasons for what is undetermined, and checks. Trials that do
+        not fit the task are reported there.
+
+    Raises:
+        InputError: A source is invalid.
 
     >>> from estimation import identify
     >>> from hmmseg import example_folder

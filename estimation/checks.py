@@ -27,7 +27,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS
 from hmmseg.segmentation.align import AlignedTrials
 
-NUM_REPLICATES = 400  # numerics: tell a p-value of SMALL to 0.0035
+NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.0035
 SMALL = 0.005  # chosen: p-value from which a check warns; a result has up to a dozen of them
 MEANING = {
     "force": "the net vertical force while carried differs between grips",
@@ -41,7 +41,7 @@ class PredictiveCheck:
     """Posterior-predictive p-value per channel, and warnings for those that are small.
 
     `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m);
-    `repeats`: observations that tell it, none where the prior alone decides.
+    `repeats`: observations that determine it, none where the prior alone decides.
     """
 
     p_values: dict[str, float]

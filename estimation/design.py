@@ -212,7 +212,7 @@ class PadDoubt:
     the share. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
     how much pads may give, by what the recordings show, whose stiffness the rig leaves unstated; 0 where it
     states one. `usual_normal`, `usual_shear`: forces of one finger as they usually are in a grip, and where a
-    block is put down [N]. `seen`: those shares and their sds whatever the odds, infinite where nothing tells.
+    block is put down [N]. `seen`: those shares and their sds whatever the odds, infinite where unknown.
     """
 
     normal: float = 0.0
@@ -553,7 +553,7 @@ class Design:
         return tuple(u.name for u in self.unknowns)
 
     def repeats(self) -> np.ndarray:
-        """By channel (3,): means beyond the unknowns they determine, all that tell scatter."""
+        """By channel (3,): means beyond the unknowns they determine, all that determine scatter."""
         counts = np.bincount(self.channel[~self.slope], minlength=len(CHANNELS))
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
@@ -587,7 +587,7 @@ def build(
     surprise = np.maximum(unexpected_bias(free_mean, free_variance, rig), moved)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
-    slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that tell no unknown
+    slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that determine no unknown
     slope_variance, alike = (
         np.stack(each) for each in zip(*(slope_variances(a, moves) for a in weighed), strict=True)
     )

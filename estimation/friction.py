@@ -3,7 +3,7 @@
 Coulomb's law: |shear| <= mu x normal force in every held sample (the paper's Table 3 takes the
 largest ratio of the recorded ones). The bound here is the posterior of the largest true ratio
 (`largest_ratio`); a finger that slips (`slip_evidence`) is at the limit, so the bound is then mu itself.
-Where a block is slid, the net force tells the friction against its support (`ground_friction`).
+Where a block is slid, the net force gives the friction against its support (`ground_friction`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hmmseg.segmentation.emissions import acceleration
 
 MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
 FEWEST = 4  # numerics: samples of sliding
-WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little to tell
+WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little
 COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
 
 
@@ -42,7 +42,7 @@ def ground_friction(
     weighed: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
     sd_force: float, rng: np.random.Generator, num_draws: int,
 ) -> GroundFriction | None:  # fmt: skip
-    """Friction of a block on what it is slid on; None where it is not, or where that tells too little.
+    """Friction of a block on what it is slid on; None where it is not, or where that says too little.
 
     The last support counts where a task slides the block on several.
     """
@@ -80,7 +80,7 @@ def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
 def _carried(
     weighed: Sequence[WeighedTrial], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
 ) -> tuple[float, float] | None:
-    """Weight and its sd [N] as carries of the same block tell it; None where it is not carried."""
+    """Weight and its sd [N] from carries of the same block; None where it is not carried."""
     moves = [s.move for s in steps if s.object == obj and s.state == ABOVE_GROUND and s.move is not None]
     means, counts = [], []
     for a in weighed:
@@ -177,7 +177,7 @@ def slip_evidence(
 ) -> SlipEvidence:
     """Slip of one block's grips, its coefficient being its bound: draws (num_draws,).
 
-    `others`: stretches with other blocks, which tell how much anchors drift without slip.
+    `others`: stretches with other blocks, which show how much anchors drift without slip.
     """
     stretches = [s for s in stretches if s.t.size > 2]
     every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])

@@ -79,9 +79,17 @@ class Identification(Tabled):
         return self.aligned.segmentations
 
     def of(self, obj: str, prop: str) -> np.ndarray:
-        """Posterior draws (num_draws,) of one property [N, m].
+        """Posterior draws of one property.
 
-        KeyError where it is undetermined, saying why, or where there is none of that name, with the nearest.
+        Args:
+            obj: Name of the object.
+            prop: `weight`, `width` or `height`.
+
+        Returns:
+            Draws (num_draws,) [N or m].
+
+        Raises:
+            KeyError: The property is undetermined (with the reason), or no object or property has that name.
         """
         for name, known in ((obj, self.task.objects), (prop, tuple(UNITS))):
             if name not in known:
@@ -247,7 +255,7 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(steps: tuple[Subtask, ...], task: BlockTask, obj: str, prop: str) -> list[str]:
-    """Names of the subtasks whose samples tell this property, as `carry block1`."""
+    """Names of the subtasks whose samples determine this property, as `carry block1`."""
     rises = dict(height_equations(task))
 
     def tells(s: Subtask) -> bool:

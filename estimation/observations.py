@@ -128,7 +128,7 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
     total, lags = -1.0, 1
     for lag in range(0, FARTHEST_LAG, 2):
         pair = rho(lag) + rho(lag + 1)
-        # A pair counts only where it stands out of its own sampling noise.
+        # A pair counts only where it exceeds its own sampling noise.
         if lag > 0 and pair <= 2 / np.sqrt(size):
             break
         total += 2 * pair
@@ -144,7 +144,7 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
 CHANNELS = ("force", "distance", "rise")
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
 APART = 0.1  # chosen: s by which one finger touches or lets go after the other, at most
-MIN_FREE = 8  # numerics: samples of free motion that tell the scale of the forces there
+MIN_FREE = 8  # numerics: samples of free motion that determine the scale of the forces there
 
 
 @dataclass(frozen=True, repr=False)
@@ -208,7 +208,7 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
-    """Of the subtasks that a recording shows (num_subtasks,), those of which its samples tell properties.
+    """Of the subtasks that a recording shows (num_subtasks,), those whose samples determine properties.
 
     A grip before a carry that never came held who knows what.
     """

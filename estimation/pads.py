@@ -78,10 +78,10 @@ def slope(
 ) -> Slope | None:  # fmt: skip
     """Robust slope of readings over the give, each group (num_timesteps,) with a level of its own.
 
-    `reading` is what `place`, which positions alone tell, becomes with the nominal give; `place` grows with
+    `reading` is what `place`, which positions alone give, becomes with the nominal give; `place` grows with
     the give. The rate of the give is fitted as well: it takes what a pad's viscosity, or a force that is
     late, adds while the give changes. `t` [s]; `noise`: sd of one reading at least; `sds`: those that sensors
-    are known to have, of a give and of a place [m]. None where too few samples tell.
+    are known to have, of a give and of a place [m]. None for too few samples.
     """
     rate = np.gradient(give, t)
     groups = [g & np.isfinite(reading) & np.isfinite(give) & np.isfinite(rate) for g in groups]
@@ -189,11 +189,7 @@ def possible_share(shares: np.ndarray, variances: np.ndarray) -> float:
 
 
 BEFORE = 4  # numerics: samples before the touch from which the fingers' height at it is extrapolated
-SURE, RELIEVED = (
-    4.0,
-    0.25,
-)  # chosen: noise sds, and share of the load, that a support bears once it is touched
-LEAST_GIVE = 1e-6  # numerics: m; a push that squeezes nothing tells nothing
+LEAST_GIVE = 1e-6  # numerics: m; a push that squeezes nothing shows nothing
 
 
 def landing(
@@ -204,7 +200,7 @@ def landing(
 
     `t`, `reading` (block_y by the rig's pads), `give` (their shear's), `place` (weights of the place's mean,
     summing to 1), `carry` (booleans): (num_timesteps,) in s and m; `touch`: mean and sd of the
-    moment [s]; `noise`: sd of one reading [m]. None where too few samples tell.
+    moment [s]; `noise`: sd of one reading [m]. None for too few samples.
 
     The height at the touch is a parabola through the last samples before it. Its error is how far a straight
     line lies from that, or how far the last samples themselves bend from one to the next, if that is more.

@@ -153,20 +153,8 @@ def calibrate(cases: Sequence[Case], pooled: int = POOLED, singles: int | None =
     }  # fmt: skip
 
 
-def report(name: str, found: dict) -> None:
-    """One line for each of pooled and single trials."""
-    for kind in ("pooled", "single"):
-        b, p = found[kind]["boundaries"]["all"], found[kind]["properties"]["all"]
-        print(
-            f"{name}, {kind}: boundaries median {1e3 * b['median']:.1f} ms, "
-            f"90 % cover {b['coverage_90']:.3f}; properties 68 % cover {p['coverage_68']:.3f}, "
-            f"95 % {p['coverage_95']:.3f}",
-            flush=True,
-        )
-
-
 def table() -> str | None:
-    """docs/tables/calibration.csv: coverages by kind of boundary and property, Laplace beside sampling."""
+    """docs/tables/calibration.csv: coverages by kind of boundary and property, by sampling and by Laplace."""
     found = load("calibration")
     if found is None:
         return None
@@ -251,15 +239,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=RESULTS / "calibration.json")
     options = parser.parse_args(arguments)
     document: dict = {"seed": SEED, "systematic_table": HAND.model_dump()}
+    cases = {
+        "bank": simulated_cases(options.cases),
+        "systematic": simulated_cases(options.cases // 3, seed=SEED + 1000, systematic=HAND),
+    }
     if options.recordings is not None:
         every = [read_case(folder) for folder in list_cases(options.recordings)]
-        document["recordings"] = calibrate([case for case in every if case.healthy])
-        report("recordings", document["recordings"])
-    document["bank"] = calibrate(simulated_cases(options.cases), singles=1)
-    report("bank", document["bank"])
-    deviating = simulated_cases(options.cases // 3, seed=SEED + 1000, systematic=HAND)
-    document["systematic"] = calibrate(deviating, singles=1)
-    report("systematic", document["systematic"])
+        cases["recordings"] = [case for case in every if case.healthy]
+    for name, mine in cases.items():
+        document[name] = calibrate(mine, singles=None if name == "recordings" else 1)
+        found = document[name]["pooled"]
+        print(name, found["boundaries"]["all"], found["properties"]["all"], flush=True)
     save(options.output, document)
 
 

@@ -5,7 +5,7 @@
 Every replicate has blocks, an operator's hand and noise of its own, from seeds that nothing was chosen on;
 worlds of one pace share performances, so that rows differ by their world alone. Resumable: a row that
 stands in the results with as many replicates is kept. Writes experiments/results/calibration_worlds.json,
-which docs/calibration.md shows, and docs/figures/calibration_worlds.png.
+of which `experiments.write_tables` makes docs/tables/worlds.csv and docs/figures/calibration_worlds.png.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from hmmseg.segmentation.spans import Segmentation
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "calibration_worlds.json"
+FIGURE = HERE.parent / "docs" / "figures" / "calibration_worlds.png"
+HEAD = ("world", "trials (misfits)", *(f"{p} rms" for p in PROPERTIES), "68 % cover", "95 % cover", "needed",
+        "boundaries, 90 % cover", "needed", "median")  # fmt: skip
 FIRST, REPLICATES = 116_000, 32
 LEVELS = (0.68, 0.95)
 PANELS = (
@@ -125,18 +128,6 @@ def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]
     return share, max(spread, float(np.sqrt(share_at_least * (1 - share_at_least) / (every.size + 4))))
 
 
-def line(name: str, s: dict[str, Any]) -> str:
-    """A row for people."""
-
-    def percent(key: str) -> str:
-        share, se = s[f"coverage_{key}"], s[f"se_{key}"]
-        return "   -   " if share is None else f"{100 * share:4.0f} +- {100 * se:2.0f}"
-
-    z = "" if s["z_rms"] is None else f"{s['z_rms']:.2f}"
-    return (f"{name:26} {s['trials']:3} trials {s['misfits']:2} misfits  68 %: {percent('68')}  95 %: "
-            f"{percent('95')}  z rms {z}  boundaries 90 %: {percent('90')}")  # fmt: skip
-
-
 def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
     """A panel for each level, a line for each world; grey is what is to be reached."""
     import matplotlib
@@ -172,22 +163,23 @@ def _covered(row: dict[str, Any], level: str) -> str:
     return "" if share is None else f"{100 * share:.0f} ± {100 * error:.0f} %"
 
 
+def cells(name: str, s: dict[str, Any]) -> list[str]:
+    """A row of the table, under HEAD."""
+    rms = [percent(s[p]["rms"], 2) if p in s else "" for p in PROPERTIES]
+    needed = ["" if s[k] is None else f"x{s[k]:.2f}" for k in ("needed_95", "needed_90")]
+    cover = [_covered(s, level) for level in ("68", "95", "90")]
+    median = "" if s["boundary_median"] is None else milliseconds(s["boundary_median"])
+    trials = f"{s['trials']} ({s['misfits']})"
+    return [name, trials, *rms, *cover[:2], needed[0], cover[2], needed[1], median]
+
+
 def table() -> str | None:
-    """docs/tables/worlds.csv: a row a world; `needed`: the factor at which intervals hold as stated."""
+    """docs/tables/worlds.csv and its figure; `needed`: the factor at which intervals hold as stated."""
     found = load("calibration_worlds")
     if found is None:
         return None
-    rows = []
-    for name, s in found["rows"].items():
-        rms = [percent(s[p]["rms"], 2) if p in s else "" for p in PROPERTIES]
-        needed = ["" if s[k] is None else f"x{s[k]:.2f}" for k in ("needed_95", "needed_90")]
-        cover = [_covered(s, level) for level in ("68", "95", "90")]
-        median = "" if s["boundary_median"] is None else milliseconds(s["boundary_median"])
-        cells = [*rms, *cover[:2], needed[0], cover[2], needed[1], median]
-        rows.append([name, f"{s['trials']} ({s['misfits']})", *cells])
-    head = ["world", "trials (misfits)", *(f"{p} rms" for p in PROPERTIES), "68 % cover", "95 % cover",
-            "needed", "boundaries, 90 % cover", "needed", "median"]  # fmt: skip
-    return markdown(head, rows)
+    draw(found["rows"], FIGURE)
+    return markdown(HEAD, [cells(name, s) for name, s in found["rows"].items()])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -195,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", nargs="*", default=list(WORLDS), metavar="NAME")
     parser.add_argument("--replicates", type=int, default=REPLICATES)
-    parser.add_argument("--fresh", action="store_true", help="score every row anew")
+    parser.add_argument("--fresh", action="store_true", help="score every row again")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     document: dict[str, Any] = {"first": FIRST, "rows": {}}
@@ -208,8 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             document["rows"][name] = summary(scored) | {"seconds": sum(s["seconds"] for s in scored)}
             document["rows"] = {n: document["rows"][n] for n in WORLDS if n in document["rows"]}
             save(options.output, document)
-        print(line(name, document["rows"][name]), flush=True)
-    draw(document["rows"], HERE.parent / "docs" / "figures" / "calibration_worlds.png")
+        print(" | ".join(cells(name, document["rows"][name])), flush=True)
 
 
 if __name__ == "__main__":

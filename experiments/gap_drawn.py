@@ -2,10 +2,10 @@
 
     python -m experiments.gap_drawn FOLDER --results DIR --run NAME [--cases CASE ...]
 
-FOLDER holds cases with labels.json beside them: those of another simulator, or those that
-`python -m experiments.blind_check open` draws anew. Diagnoses go to DIR/CASE.json, so that a run may be
+FOLDER holds cases with labels.json next to them: those of another simulator, or those that
+`python -m experiments.blind_check open` draws. Diagnoses go to DIR/CASE.json, so that a run may be
 stopped and started again, and the rows of this run stand under NAME in experiments/results/gap_labs.json,
-beside those of other code. Nothing is sealed: what is changed by what comes out is judged on other cases.
+next to those of other code. Nothing is sealed: what is changed by what comes out is judged on other cases.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def table() -> str | None:
         line("healthy: none", ["healthy"], "quiet"),
         line("single: named alone", ["single"], "named"),
         line("single: named alone, or in a set", ["single"], "named", "set"),
-        line("single: others beside it", ["single"], "beside others"),
+        line("single: named with others", ["single"], "beside others"),
         line("single: unknown", ["single"], "unknown"),
         line("single: not noticed, or too small to matter", ["single"], "missed", "too small"),
         line("single: another name", ["single"], "wrong name"),

@@ -51,14 +51,14 @@ def list_cases(folder: Path) -> list[Path]:
 
 
 def read_case(folder: Path) -> Case:
-    """One case; true properties from labels.json beside it if that is there, else actual.toml."""
+    """One case; true properties from labels.json next to it if that is there, else actual.toml."""
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     if not isinstance(task, BlockTask):
         raise InputError(str(folder / "task.toml"), "is a plain ordered task", "objects and moves")
     files = sorted(folder.glob("trial_*.csv"))
     trials = tuple(read_trial(file, rig) for file in files)
     signals = tuple(task_space(trial, rig) for trial in trials)
-    truth = tuple(_read_boundaries(folder / "truth" / f"{file.stem}.json") for file in files)
+    truth = tuple(read_boundaries(folder / "truth" / f"{file.stem}.json") for file in files)
     blocks = {}
     if (folder / "actual.toml").exists():
         blocks = read_actual(folder / "actual.toml", task.objects)
@@ -74,7 +74,8 @@ def read_case(folder: Path) -> Case:
     return Case(folder.name, rig, task, trials, signals, truth, blocks, effects)
 
 
-def _read_boundaries(path: Path) -> tuple[float, ...] | None:
+def read_boundaries(path: Path) -> tuple[float, ...] | None:
+    """True boundaries [s] of a file in truth/, NaN of one that never came; None without the file."""
     if not path.exists():
         return None
     times = json.loads(path.read_text(encoding="utf-8"))["boundaries"]

@@ -22,11 +22,8 @@ def minute() -> str | None:
     found = load("benchmark_robot")
     if found is None:
         return None
-    runs = {"whole": found["whole"]}
-    if "interrupted" in found:
-        runs |= {k: found["interrupted"][k] for k in ("first", "again")}
-    label = {"whole": "in one go", "first": "interrupted half way", "again": "the same command again"}
-    rows = [[label[k], f"{v['processor']:.0f} s", f"{v['wall']:.0f} s"] for k, v in runs.items()]
+    whole = found["whole"]
+    rows = [["in one go", f"{whole['processor']:.0f} s", f"{whole['wall']:.0f} s"]]
     note = (
         f"A log of {found['seconds']:.0f} s at {found['rate']:.0f} Hz of six joints; {found['cores']} cores, "
         f"on which on average {found['load'][1]:.0f} processes ran, these among them. Planted: "
@@ -41,10 +38,10 @@ def check() -> str | None:
     found = load("robots_check")
     if found is None:
         return None
-    told: dict[str, Any] = {**found, **found["named_right_by_kind"]}
+    shares: dict[str, Any] = {**found, **found["named_right_by_kind"]}
     rows = []
     for key, (label, goal) in GOALS.items():
-        one = told[key]
+        one = shares[key]
         if not one["of"]:
             continue
         low, high = (100 * v for v in one["interval_90"])
@@ -55,11 +52,11 @@ def check() -> str | None:
     counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
     note = (
         f"{found['cases']} cases ({counts}; {found['below_the_floor']} of {found['faults']} faults show less "
-        f"than the floor of {found['floor']:g} nats and are not asked); in brackets 90 % intervals. "
+        f"than the floor of {found['floor']:g} nats and do not count); in brackets 90 % intervals. "
         f"Processor time a case: {seconds}. "
         f"Code of {found['made_by']}."
     )
-    return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+    return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
 def changed() -> str | None:
@@ -78,7 +75,7 @@ def changed() -> str | None:
         f"configurations, seed {found['seed']}; in brackets 90 % intervals. Processor time a case: "
         f"{seconds[len(seconds) // 2]:.0f} s. Code of {found['made_by']}."
     )
-    return f"{markdown(['', 'of', 'share', 'to reach'], rows)}\n\n{note}"
+    return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
 def bam() -> str | None:
@@ -94,7 +91,7 @@ def bam() -> str | None:
             ours, other = (1e3 * one["rms"][pair[n]] for n in ("one", "other"))
             less = f"{1e3 * pair['less']:.1f} ({low:.1f} to {high:.1f})"
             rows.append([words, pair["other"], f"{ours:.1f}", f"{other:.1f}", less])
-    head = ["left out in turn", "beside", "ours [mrad]", "it [mrad]", "difference"]
+    head = ["left out in turn", "rival", "ours [mrad]", "rival [mrad]", "difference"]
     note = f"In brackets 95 % intervals by a paired bootstrap. Code of {found['made_by']}."
     return f"{markdown(head, rows)}\n\n{note}"
 
@@ -112,12 +109,6 @@ def given() -> str | None:
         others = f"; or {', '.join(one['indistinguishable'])}" if one["indistinguishable"] else ""
         rows.append([name, one["verdict"], causes + others, "yes" if one["right"] else "no",
                      f"{one['over_noise']:.2f}", f"{one['seconds']:.0f} s"])  # fmt: skip
-    head = [
-        "case",
-        "verdict",
-        "causes, with their parameters",
-        "as the answer",
-        "left, over noise",
-        "processor",
-    ]
+    head = ["case", "verdict", "causes, with their parameters", "as the answer", "left, over noise",
+            "processor"]  # fmt: skip
     return markdown(head, rows)

@@ -23,7 +23,7 @@ from experiments import (
     table_robots,
     wrist,
 )
-from experiments.benchmarks import commands, haptic_loop, watch
+from experiments.benchmarks import commands, haptic_loop, long_recordings, watch
 from experiments.blind_check import tables as blind_check
 from experiments.real import hiro_snap
 from experiments.table_text import as_csv
@@ -46,6 +46,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/gap_results.md", "blind", blind_check.blind, "blind-check"),
     ("docs/tables/blind.csv", "", blind_check.by_circumstance, "blind-check"),
     ("docs/benchmarks.md", "commands", commands.table, "bench"),
+    ("docs/benchmarks.md", "lengths", long_recordings.table, "bench-long"),
     ("docs/virtual_model.md", "haptic", haptic_loop.table, "bench-haptic"),
     ("docs/watch.md", "watch", watch.table, "bench-watch"),
     ("docs/robots_results.md", "minute", table_robots.minute, "bench-robot"),

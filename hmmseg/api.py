@@ -36,9 +36,17 @@ def block_task(task: Source) -> BlockTask:
 
 
 def decompose(task: Source) -> Decomposition:
-    """Subtasks of a task, and for each object's properties what reveals them.
+    """Subtasks of a task, and the subtasks that reveal each object's properties.
 
-    `task`: a path, a dict or what `Task.read` gives. InputError for a description at fault.
+    Args:
+        task: A path, a dict, or the result of `Task.read`.
+
+    Returns:
+        The subtasks in order, the signals they need, and by object and property the evidence, or the reason
+        why there is none.
+
+    Raises:
+        InputError: The description contradicts itself.
 
     >>> from hmmseg import decompose, example_folder
     >>> found = decompose(example_folder() / "task.toml")
@@ -51,10 +59,18 @@ def decompose(task: Source) -> Decomposition:
 
 
 def align(trials: Source | Sequence[Source], task: Source, rig: Source) -> AlignedTrials:
-    """Fit the switching model to trials of one task of blocks, pooled, and align each of them.
+    """Fit the hidden Markov model to pooled trials of one task of blocks, and align each trial.
 
-    Every argument may be a path, a table or what `Trial.read`, `Task.read` and `Rig.read` give. Trials
-    that do not fit their task say so in `segmentations[i].failed`; InputError for input at fault.
+    Args:
+        trials: One source or several: paths, tables, or results of `Trial.read`.
+        task: A path, a dict, or the result of `Task.read`.
+        rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
+
+    Returns:
+        All trials with their alignments. Those that do not fit the task say so in `segmentations[i].failed`.
+
+    Raises:
+        InputError: A source is invalid, or the task is not one of blocks.
 
     >>> from hmmseg import align, example_folder
     >>> folder = example_folder()
@@ -75,13 +91,22 @@ def segment(
 ) -> list[Segmentation]:
     """Subtasks of every trial with the uncertainty of each boundary.
 
-    A task of blocks needs its `rig`; a plain ordered task takes a `model` from `fit`, or learns one from
-    these trials. InputError for input at fault.
+    Args:
+        trials: One source or several: paths, tables, or results of `Trial.read`.
+        task: A path, a dict, or the result of `Task.read`.
+        rig: The nominal hand, which a task of blocks needs.
+        model: Of a plain ordered task, from `fit`; learned from these trials by default.
+
+    Returns:
+        One segmentation a trial, with times in s.
+
+    Raises:
+        InputError: A source is invalid or missing.
 
     >>> import pandas as pd
     >>> from hmmseg import example_folder, segment
     >>> folder = example_folder()
-    >>> trial = pd.read_csv(folder / "trial_01.csv")  # a table will do as well as a path
+    >>> trial = pd.read_csv(folder / "trial_01.csv")  # a table instead of a path
     >>> found = segment(trial, folder / "task.toml", folder / "rig.toml")[0]
     >>> carry = found.spans[2]
     >>> carry.subtask, carry.object, round(carry.end - carry.start, 1)
@@ -100,10 +125,18 @@ def fit(
     task: Source,
     labels: Mapping[str, Sequence[float | None] | Mapping[str, float]] | None = None,
 ) -> SequenceModel:
-    """Emissions and durations of a plain ordered task, from labels of some trials or none.
+    """Learn emissions and durations of a plain ordered task, from labels of some trials or none.
 
-    `labels`: by the trial's name boundaries [s], None where unknown, or {subtask: its start}.
-    InputError for input at fault.
+    Args:
+        trials: One source or several: paths, tables, or results of `Trial.read`.
+        task: A path, a dict, or the result of `Task.read`.
+        labels: By name of the trial its boundaries [s], None where unknown, or {subtask: start [s]}.
+
+    Returns:
+        A model for `segment`.
+
+    Raises:
+        InputError: A source is invalid, or the task is one of blocks.
 
     >>> import numpy as np
     >>> from hmmseg import fit, segment

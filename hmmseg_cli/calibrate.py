@@ -36,7 +36,7 @@ def calibrate(
     seed: UnusedSeed = 0,
     quiet: QuietOption = False,
 ) -> None:
-    """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these cannot tell."""
+    """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these leave open."""
     with Output("calibrate", json=json, seed=seed, quiet=quiet) as out:
         own = OwnSimulator(simulator, model, map_file, (), patch)
         if not own.given:

@@ -49,12 +49,12 @@ MapOption = Annotated[
 ]  # fmt: skip
 CandidateOption = Annotated[
     list[str] | None,
-    _option("--candidate", "NAME", "Offer one more thing the MJCF model can set as a cause, such as "
+    _option("--candidate", "NAME", "Add a parameter of the MJCF model to the candidates, such as "
             "joint:elbow.frictionloss."),
 ]  # fmt: skip
 HistoryOption = Annotated[
     Path | None,
-    _option("--history", "FILE.jsonl", "Keep this run's intervals in that file, and say what moved since."),
+    _option("--history", "FILE.jsonl", "Add this run's intervals to that file, and say what has moved."),
 ]
 RerunOption = Annotated[
     Path | None, _option("--rerun", "FILE.rrd", "Recorded, simulated and corrected, for Rerun's viewer.")
@@ -327,12 +327,12 @@ def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
-    """What the logs cannot tell first, then the tables of every diagnosis, and held-out residuals."""
+    """What the logs leave open first, then the tables of every diagnosis, and held-out residuals."""
     out = []
     unseen = document["identifiability"]["unseen"]
     alike = document["identifiability"]["alike"]
     if unseen or alike:
-        table = Table(title="what these logs cannot tell", title_justify="left", show_header=False)
+        table = Table(title="what these logs leave open", title_justify="left", show_header=False)
         for one in alike[:6]:
             how = "act only together" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"
             table.add_row(", ".join(one["parameters"]), how)

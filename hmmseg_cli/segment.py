@@ -31,6 +31,8 @@ from hmmseg_cli.console import (
 from hmmseg_cli.labels import WriteOption, check_destination, write_labels
 
 if TYPE_CHECKING:
+    from hmmseg.io.rig import Rig
+    from hmmseg.io.task import BlockTask
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.spans import Question, Segmentation
 
@@ -60,7 +62,7 @@ def segment(
     """Segment recordings into the task's subtasks, with the uncertainty of every boundary.
 
     With --workers or --scheduler each recording is fitted by itself, not pooled with the others, and a folder
-    stands for the recordings in it.
+    means all recordings in it.
     """
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
         apart = workers is not None or scheduler is not None
@@ -82,7 +84,9 @@ def segment(
                 recordings, found = [], _segment_apart(out, paths, task, rig, workers, scheduler)
             else:
                 thresholds = (force_threshold, velocity_threshold)
-                recordings, found = _segment_blocks(out, paths, description, rig, method, thresholds)
+                recordings, found = _segment_blocks(
+                    out, paths, description, rig, method, thresholds, figures is None and write is None
+                )
         if apart:
             out.print(trials_table(found))
         for segmentation in found:
@@ -98,13 +102,15 @@ def segment(
 
 
 def _segment_blocks(
-    out: Output, paths, task, rig_file: Path, method: Method, thresholds
+    out: Output, paths, task, rig_file: Path, method: Method, thresholds, lean: bool
 ) -> tuple[list[Trial], list[Segmentation]]:
     from hmmseg.hand.signals import task_space
     from hmmseg.io.rig import read_rig
     from hmmseg.segmentation.thresholds import segment_qualitative
 
     rig = read_rig(rig_file)
+    if lean and method is Method.HMM and _on_disk(paths, task, rig):
+        return [], _segment_long(out, paths, task, rig)
     recordings = read_trials(out, paths, rig)
     signals = [task_space(trial, rig) for trial in recordings]
     if method is Method.QUALITATIVE:
@@ -137,6 +143,27 @@ def _segment_apart(
     if not found:
         raise InputError(str(paths[0]), "the process that segmented it was killed, as of all others",
                          "enough memory, or fewer --workers")  # fmt: skip
+    return found
+
+
+def _on_disk(paths: Sequence[Path], task: BlockTask, rig: Rig) -> bool:
+    """Whether recordings are of a repeated task and too long to be read at once."""
+    from hmmseg.hand.read import is_long
+
+    return task.repeat != 1 and rig.gripper is None and all(is_long(path) for path in paths)
+
+
+def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig) -> list[Segmentation]:
+    """Each recording by itself, from disk; what cannot be is judged by its beginning."""
+    from hmmseg.hand.read import LongRecording, check
+    from hmmseg.segmentation.align import segment_long
+
+    found = []
+    for path in paths:
+        recording = LongRecording(path, rig)
+        for warning in check(recording.beginning(), rig):
+            out.warn(warning)
+        found.append(segment_long(recording, task, rig))
     return found
 
 

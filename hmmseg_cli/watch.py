@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hmmseg_cli.rows import Rows
 
 LagOption = Annotated[float, typer.Option(
-    "--lag", metavar="S", min=0.0, help="How long a boundary is waited for [s].")]  # fmt: skip
+    "--lag", metavar="S", min=0.0, help="How long to wait before a boundary is settled [s].")]  # fmt: skip
 PlotOption = Annotated[bool, typer.Option(
     "--plot", help="Show it live in the terminal (standard error).")]  # fmt: skip
 SkipOption = Annotated[bool, typer.Option(

@@ -26,10 +26,22 @@ def simulate(
     seed: int = 0,
     operator: OperatorSettings | None = None,
 ) -> list[SimulatedTrial]:
-    """Trials of the virtual model, performed by its own operator, each with its truth.
+    """Trials of the virtual model, performed by a simulated operator, each with its truth.
 
-    `properties`: an identification, blocks by name, or a file (identify's JSON, an `actual.toml`); the
-    paper's blocks by default. InputError for input at fault or where the hand cannot reach.
+    Args:
+        task: A task of blocks: a path, a dict, or the result of `Task.read`.
+        rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
+        properties: An identification, blocks by name, or a file (identify's JSON, an `actual.toml`); the
+            paper's blocks by default.
+        trials: How many.
+        seed: Of the first trial; each further one has the next.
+        operator: Ranges from which motions are drawn.
+
+    Returns:
+        The trials, each with true boundaries [s] and blocks.
+
+    Raises:
+        InputError: A source is invalid, or the hand cannot reach.
 
     >>> from hmmseg import example_folder
     >>> from simgap import simulate
@@ -53,13 +65,24 @@ def diagnose(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Where recordings part from the virtual model, which effect causes it, how far it shrinks the gap.
+    """Where recordings differ from the virtual model, which effect causes it, and how far the gap shrinks.
 
-    `trials`, `task`, `rig`: paths, tables or what the readers give; or what `hmmseg.align` or `identify`
-    gave, alone: the alignment is then theirs. `actual`: properties measured apart (a path or a table);
-    `effects` are taken instead of choosing; `healthy` recordings of the same task and hand are the null, not
-    simulated twins; `progress` is given what is being done, in words.
-    InputError for input at fault, an effect that is unknown or cannot act, or where no trial fits its task.
+    Args:
+        trials: One source or several (paths, tables, results of `Trial.read`), or the result of
+            `hmmseg.align` or `identify`, whose alignment is then used and which needs no `task` or `rig`.
+        task: A path, a dict, or the result of `Task.read`.
+        rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
+        actual: Properties measured independently of the trials: a path or a dict.
+        effects: Causes that are given instead of chosen.
+        healthy: Recordings of the same task and hand that replace simulated healthy twins as the null.
+        seed: Seed of all random draws.
+        progress: Called with a description of each stage.
+
+    Returns:
+        Verdict, causes with their parameters, where the gap is, and its shrinkage on held-out trials.
+
+    Raises:
+        InputError: A source is invalid, an effect is unknown or cannot act, or no trial fits its task.
     """
     identified = None
     if isinstance(trials, Identification):

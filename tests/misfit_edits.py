@@ -5,8 +5,6 @@ and gives the edited trial with the index of the first subtask that it does not 
 joined with continuous time; positions jump where pieces meet, as they would under a cut.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Following a task while it runs: time a row, accuracy against lag beside off line, agreement, false alarms.
+"""Following a task while it runs: time a row, accuracy against lag and off line, agreement, false alarms.
 
     python -m experiments.benchmarks.watch FOLDER...
 
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.recordings import list_cases
+from experiments.recordings import list_cases, read_boundaries
 from experiments.saving import save
 from experiments.table_text import load, markdown, percent
 from hmmseg.io.rig import Rig
@@ -102,12 +102,6 @@ def off_line(case: Path, file: Path) -> tuple[list, bool]:
     return [(s.start, s.start_sd) for s in found.spans[1:]], found.complete
 
 
-def truth_of(case: Path, file: Path) -> list[float | None] | None:
-    """True boundaries [s], None where the recording's truth is not known."""
-    path = case / "truth" / f"{file.stem}.json"
-    return json.loads(path.read_text())["boundaries"] if path.exists() else None
-
-
 def properties_of(case: Path, file: Path) -> list[float]:
     """Errors of the last answer's properties in standard deviations of both, against actual.toml."""
     watcher = Watcher(case / "task.toml", case / "rig.toml")
@@ -172,14 +166,14 @@ def main() -> None:
     by_lag: dict[str, list] = {str(lag): [] for lag in (*LAGS, "off line")}
     verdicts, apart, weights = [], [], []
     for case, file in chosen:
-        true = truth_of(case, file)
+        true = read_boundaries(case / "truth" / f"{file.stem}.json")
         whole, complete = off_line(case, file)
         record = {"case": case.name, "off_line": complete}
         for lag in LAGS:
             found, alarm, fits = boundaries(case, file, lag)
             if lag == 1.0:
                 record |= {"alarm": bool(alarm), "fits": bool(fits)}
-            if true is None or not complete or len(found) != len(true) or None in true:
+            if true is None or not complete or len(found) != len(true) or np.isnan(true).any():
                 continue
             by_lag[str(lag)] += [(t - b, sd) for (t, sd), b in zip(found, true, strict=True)]
             if lag == 1.0:
@@ -203,7 +197,7 @@ def main() -> None:
 
 
 def draw(by_lag: dict) -> None:
-    """Error of settled boundaries against the lag, beside the segmentation of the whole recording."""
+    """Error of settled boundaries against the lag, and that of the whole recording."""
     from hmmseg.plot.style import canvas
 
     lags = [lag for lag in LAGS if str(lag) in by_lag]

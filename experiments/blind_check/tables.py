@@ -41,8 +41,8 @@ def number(entry: dict[str, Any]) -> str:
 
 
 def goals(found: dict[str, Any]) -> str:
-    """Figures beside what they are to reach."""
-    lines = ["| figure | to reach | found (95 % interval) | cases |", "|---|---|---|---|"]
+    """Figures and their goals."""
+    lines = ["| figure | goal | found (95 % interval) | cases |", "|---|---|---|---|"]
     for key, (words, goal) in FIGURES.items():
         entry = found["table"].get(key)
         if entry is not None:

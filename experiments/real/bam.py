@@ -1,4 +1,4 @@
-"""Whole logs of a servo run freely, of a gain or mass that took no part: the servo's model beside BAM's M6.
+"""Whole logs of a servo run freely, of a gain or mass that took no part: the servo's model against BAM's M6.
 
     python -m experiments.real.bam FOLDER [--output FILE.json]
 
@@ -183,7 +183,6 @@ def main() -> None:
         print(by, out[by], flush=True)
         if given.output is not None:
             save(given.output, {**out, "logs": rows})
-            pd.DataFrame(rows).to_csv(given.output.with_suffix(".csv"), index=False)
 
 
 if __name__ == "__main__":

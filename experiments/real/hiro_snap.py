@@ -208,7 +208,7 @@ def table() -> str | None:
     note = (
         f"Snap assembly by a HIRO robot (200 Hz; {trials} trials, {found['seeds']} random crops of up to "
         f"{found['max_crop']:g} s each): median error against the controller's labels, 95th percentile, "
-        "share within 0.3 s. To reach: a median of 60 ms with labels, all within 0.3 s without."
+        "share within 0.3 s. Goals: a median of 60 ms with labels, all within 0.3 s without."
     )
     return f"{note}\n\n{markdown(head, rows)}"
 

@@ -39,7 +39,7 @@ BUCKETS = 24  # numerics: of a small plot
 
 @dataclass(frozen=True)
 class Channel:
-    """One column: its unit where the file or its name tells, its rate [Hz] where times are known,
+    """One column: its unit where the file or its name gives it, its rate [Hz] where times are known,
     how many samples lack it or were interpolated, its range, and its course in few means.
     """
 
@@ -337,7 +337,7 @@ CURRENT = {"current", "amp", "amps"}
 
 
 def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> str:
-    """A `[gripper]` table as TOML with the units of its columns; empty where the names do not tell.
+    """A `[gripper]` table as TOML with the units of its columns; empty where the names do not say.
 
     `entries` are those of `[columns]` or `[topics]` that are proposed already.
     """

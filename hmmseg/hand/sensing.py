@@ -1,6 +1,6 @@
 """Which readings of a hand are none: what a working sensor cannot have read is named and left out.
 
-One model of a sensor stands behind it. Its readings scatter, so that neighbours repeat each other to the
+This follows from a model of a sensor. Its readings scatter, so that neighbours repeat each other to the
 last digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow;
 they stay within a few times the range of all others; a position moves no farther between two samples than its
 velocity carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of
@@ -8,9 +8,9 @@ missing readings is a fault where its length has next to no chance under that mo
 forces that are held for some samples and recordings without noise pass. What is left out is missing from
 there on, to the segmentation and to the properties alike.
 
-Forces in other units than N, which nothing in mechanics tells: load and inertia scale alike.
+Forces in other units than N do not show in mechanics, as load and inertia scale alike.
 
-What tells is what is known apart: the noise of the sensor where `rig.toml` states it, what grippers weigh.
+Independent knowledge shows them: the sensor's noise where `rig.toml` states it, the weight of grippers.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ FEW = 0.01  # limit: share of readings that are so far off: of more the others a
 LEAP = 20.0  # limit: noise sds that a step exceeds
 FASTEST = 1.2  # limit: times what the fastest velocity around it covers; a sudden stop is off by half
 SWEPT = 0.1  # limit: share of a position's range that its velocity covers while it stands still
-MIN_ALIVE = 30  # numerics: readings that tell a channel's own noise
+MIN_ALIVE = 30  # numerics: readings that determine a channel's own noise
 ROUNDING = 1e-6  # numerics: of a channel's range: less noise is that of arithmetic
 MOST = 200  # numerics: longest runs of a channel that are looked at
 LISTED = 3  # look: stretches in a line
@@ -314,7 +314,7 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
         near = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
         covered = near * np.diff(times)
         far = np.abs(more) > np.maximum(LEAP * robust_sd(more), FASTEST * covered)
-        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # what happened in a gap no velocity tells
+        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # no velocity covers a gap
         if far.any():
             stepping[name] = there, np.where(far, more, 0.0)
     if len(stepping) != 1:

@@ -153,20 +153,20 @@ def _parabolas(values: np.ndarray, length: int, deriv: int) -> np.ndarray:
 
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
-TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less tells nothing of its weight and centre
+TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less shows nothing of its weight and centre
 SAMPLES = 20  # numerics: of free motion, at least
 
 
 @dataclass(frozen=True)
 class Tool:
-    """What free motion tells of the tool: `axes` Q (3, 3), `offset` and `drift` (3,) [N, N/s].
+    """The tool as free motion shows it: `axes` Q (3, 3), `offset` and `drift` (3,) [N, N/s].
 
     `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
     [N s/m]; `jerked` [kg s]: of how the acceleration changes, which is by how much later than the wrench the
     pose was taken, times the inertia; `noise` [N]: scale of one component of F in free motion about the
     model; `since` [s]: when the drift has added nothing to the offset, `drift_sd` [N/s]: its standard error;
     `against`: the reading goes against a stated sign; `centre_of_mass` (3,) [m] in the tool's axes, None
-    where no torques or turns tell it.
+    where no torques or turns determine it.
     """
 
     axes: np.ndarray
@@ -227,7 +227,7 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
 
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
-    """The tool from free motion, samples `free` (num_timesteps,); InputError where that cannot tell."""
+    """The tool from free motion, samples `free` (num_timesteps,); InputError where it is undetermined."""
     motion = free_motion(trial, rig, pose, free)
     tool = tool_of(trial.file, rig, motion, float(trial.t.mean()))
     return replace(tool, centre_of_mass=_centre_of_mass(trial, rig.wrist, tool, free, motion.terms))
@@ -338,10 +338,10 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
 
 
 def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
-    """InputError where free motion cannot tell what the rig leaves open."""
+    """InputError where free motion does not determine what the rig leaves open."""
     left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
     if (left_open or gripper.reaction is None) and abs(inertia) < SURE * error:
-        problem = "do not show the hand's own mass in free motion, so nothing tells how the sensor stands"
+        problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
         raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
                          "under [gripper], as they are mounted")  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 The wrist feels the sum of what both fingers do; each finger's channels hold half of it. What
 they press against each other with does not reach the wrist. Where no grip force is recorded, the
-pads' own spring tells it: their squeeze is the opening at which they touched less the one they are
+pads' own spring gives it: their squeeze is the opening at which they touched less the one they are
 held at (`hmmseg.hand.opening`). That says when something is held, and where the touch lies within what
 the slowing of the closing leaves open, but is no measured force: friction is not bounded by it.
 
@@ -180,7 +180,7 @@ def _together(estimates: list[tuple[float, float]], held: float, top: float) -> 
     """Mean and sd [m] of the opening at the touch, between the one held and the widest, `top`.
 
     What pads and drive give is the prior (Student-t); each estimate is right within its sd, or is of
-    something else (a finger that drags the block on, an opening in two steps) and tells nothing.
+    something else (a finger that drags the block on, an opening in two steps) and shows nothing.
     """
     width = np.linspace(held, max(top, held + GRID), NODES)
     log_density = -(TAIL + 1) / 2 * np.log1p(((width - held - GIVE[0]) / GIVE[1]) ** 2 / TAIL)
@@ -268,7 +268,7 @@ def counts_closing(trial: Trial, rig: Rig) -> InputError:
 def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
     """The line for a sign that is the other way round: lifts take weight `load` [N] off the hand.
 
-    None: nothing is lifted that would tell, and free motion contradicts the stated sign.
+    None: nothing is lifted that would decide, and free motion contradicts the stated sign.
     """
     problem = "go against the hand's own acceleration in free motion"
     if load is not None:
@@ -281,7 +281,7 @@ def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
 
 
 def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
-    """The warning where a lift tells one sign and free motion the other: readings that go with the pose."""
+    """The warning where a lift shows one sign and free motion the other: readings that go with the pose."""
     where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
     return (
         f"{where} bear {load:.3g} N of what is lifted, but go against the hand's own acceleration in free "
@@ -386,7 +386,7 @@ def _surely_free(opening: np.ndarray, held: list[tuple[int, int, int]]) -> np.nd
 
 
 def grip_force_of(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
-    """What each pad presses with [N]: samples, or a number while it grips; None where nothing tells."""
+    """What each pad presses with [N]: samples, or a number while it grips; None where it is unknown."""
     if isinstance(gripper.grip_force, str):
         return np.abs(trial.channels[gripper.grip_force])
     if gripper.grip_force is not None:
@@ -513,7 +513,7 @@ def _with_other_sign(
 ) -> tuple[Held, Rig, tuple[str, ...]]:
     """What is held with the other sign, where lifts pull up and none is stated; else InputError.
 
-    What is lifted hangs on the hand: that tells the sign before the hand's own inertia does.
+    What is lifted hangs on the hand: that shows the sign before the hand's own inertia does.
     """
     for reaction in (True, False) if rig.wrist.reaction is None else ():
         other = rig.model_copy(update={"gripper": rig.wrist.model_copy(update={"reaction": reaction})})

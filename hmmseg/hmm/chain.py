@@ -94,11 +94,6 @@ class Chain:
         """How long recordings must be where weights vary in time, else None."""
         return next((len(band) + 1 for band in self.bands if band.ndim == 2), None)
 
-    @property
-    def varying(self) -> bool:
-        """Whether any weight changes in time."""
-        return self.num_samples is not None
-
     def _check(self, d: int, band: Any) -> None:
         width = max(self.num_states - d, 0)
         steps = None if self.num_samples is None else self.num_samples - 1
@@ -221,7 +216,7 @@ def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
 
 
 def not_numbers(log_likelihoods: np.ndarray, row: int) -> ValueError:
-    """What to raise for a row with NaN among numbers."""
+    """What to raise for a row with NaN beside numbers."""
     column = int(np.flatnonzero(np.isnan(np.asarray(log_likelihoods[row], dtype=float)))[0])
     where = f"log_likelihoods: NaN or +inf at {[row, column]}"
     return ValueError(f"{where}, expected numbers or -inf (a missing sample is NaN throughout)")

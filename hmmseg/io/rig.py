@@ -127,11 +127,6 @@ class Gripper(StrictTable):
         """Whether the tool's orientation is recorded."""
         return self.quaternion is not None or self.rotation_vector is not None
 
-    @property
-    def grip_known(self) -> bool:
-        """Whether the pads' normal force is known."""
-        return self.grip_force is not None or self.force_per_ampere is not None
-
 
 def direction(axis: str) -> Any:
     """Unit vector (3,), an array, of an axis such as `-z`."""

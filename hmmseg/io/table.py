@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,12 @@ def check_unique(names: Sequence[str], where: str) -> None:
     for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
+
+
+def appended(table: Table, more: Table) -> Table:
+    """A table with the rows of another, of the same columns, after its own."""
+    columns = {name: np.concatenate([values, more.columns[name]]) for name, values in table.columns.items()}
+    return replace(table, columns=columns, rows=np.concatenate([table.rows, more.rows]))
 
 
 def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -28,7 +28,7 @@ MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 class Trial(Tabled):
     """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
 
-    `origin` is where t = 0 lies, in ns since 1970, if the file tells; `interpolated` marks, for
+    `origin` is where t = 0 lies, in ns since 1970, if the file says; `interpolated` marks, for
     channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
     `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
     reason. `touch_sd` [m]: how well the distance at which the fingers touch a block is known, but for noise;
@@ -111,8 +111,11 @@ class Trial(Tabled):
         return Path(name).stem + f"_{part}" * bool(part)
 
 
-def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
-    """Trial from a table as it was read, whether or not it can be; InputError where it cannot."""
+def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:
+    """Trial from a table as it was read, whether or not it can be; InputError where it cannot.
+
+    `whole`: all of a recording, whose channels must have some values.
+    """
     names, optional = channels_of(rig, task)
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
     _check_lengths(table)
@@ -126,7 +129,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None) -> Trial:
         values = _mapped(numbers(table, theirs_name), name, columns, table)
         if task is None:
             _check_size(values, theirs_name, table)
-        if np.isfinite(values).any():
+        if not whole or np.isfinite(values).any():
             channels[name] = unwrapped(values) if measures(name) == "angle" and task is None else values
         elif name not in optional:  # an optional one without values is as good as absent
             raise InputError(f"{table.file}: column {theirs_name}", "has no values", "at least one number")

@@ -68,7 +68,7 @@ from hmmseg.segmentation.pads import sense
 from hmmseg.segmentation.posteriors import contacts, nearest_touch
 from hmmseg.segmentation.rounds import one_round, round_tasks
 
-WARM_UP = 8  # numerics: rows that tell a force noise which the rig does not state
+WARM_UP = 8  # numerics: rows that determine a force noise which the rig does not state
 NUM_CHANNELS = len(CARTESIAN_CHANNELS)
 KINDS = {FREE: FREE_KIND, ON_GROUND: GROUND_KIND, SLIDING: SLIDING_KIND, ABOVE_GROUND: ABOVE_KIND}
 # chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a

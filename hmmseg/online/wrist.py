@@ -1,6 +1,6 @@
 """Rows of a gripper with a sensor in its wrist as the two fingers that a filter follows.
 
-As `hmmseg.hand.wrist`, with what the rows so far tell. What the tool itself puts on the sensor is found from
+As `hmmseg.hand.wrist`, from the rows so far. What the tool itself puts on the sensor is found from
 the free motion before the first grip, so nothing can be said before that (all of it is the task's first
 subtask anyhow), and anew at every further one. Motion is smoothed over a window, so rows come out a window
 late; while the gripper closes or lets go, until it is known when it touched.
@@ -72,7 +72,7 @@ class Wrist:
         self.back = False  # the last grip was none: what has come out since it began comes again
         self._went = Went()
 
-        self.force_sd = 0.0  # by how much a drift that free motion could not tell may be wrong in a grip [N]
+        self.force_sd = 0.0  # by how much a drift that free motion did not show may be wrong in a grip [N]
 
     @property
     def touch_sd(self) -> float:
@@ -291,7 +291,7 @@ STAND = 0.1  # chosen: s of next to no motion: the gripper stands
 STILL = 0.1  # chosen: share of a closing's top speed that is next to none
 SAMPLES = 4  # numerics: of a stand at least, and steps: what the touch is read from
 PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
-NOISE = 200  # numerics: samples that tell the opening's noise
+NOISE = 200  # numerics: samples that determine the opening's noise
 CLEAR = 10.0  # chosen: noise scales of a motion, as off line
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
 OPENING = 0.1  # chosen: share of the way back at which a gripper has surely let go, as off line

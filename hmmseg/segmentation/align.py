@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
+from hmmseg.hand.read import LongRecording
 from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -34,7 +35,16 @@ from hmmseg.segmentation.emissions import WINDOW, Features, features, thin, with
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
-from hmmseg.segmentation.rounds import cut, merge_point, one_round, part, round_tasks, slices
+from hmmseg.segmentation.rounds import (
+    InMemory,
+    OnDisk,
+    Recorded,
+    cut,
+    merge_point,
+    one_round,
+    round_tasks,
+    slices,
+)
 from hmmseg.segmentation.spans import Failure, Segmentation, Span, trials_table
 from hmmseg.tables import Brief, Tabled
 
@@ -73,7 +83,7 @@ class Pool:
 
 
 def pooled(
-    parts: Sequence[tuple[Signals, slice]], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig,
+    parts: Sequence[tuple[Recorded, slice]], fitting: Sequence[int], steps: tuple[Subtask, ...], rig: Rig,
     taps: Sequence[Spans],
 ) -> Pool:  # fmt: skip
     """One fit of all `parts` of recordings that are `fitting`; a second one where their forces come late.
@@ -82,7 +92,7 @@ def pooled(
     """
 
     def once(late: Sensing | None = None) -> tuple[list[Reading], Fit, Sensing]:
-        signals = (part(recorded, samples) for recorded, samples in parts)
+        signals = (recorded.part(samples) for recorded, samples in parts)
         signals = signals if late is None else (read_again(s, late) for s in signals)
         readings = [_read(s, rig, t) for s, t in zip(signals, taps, strict=True)]
         fitted = fit([readings[i].features for i in fitting], steps)
@@ -130,7 +140,7 @@ class Piece:
 
 
 def aligned_rounds(
-    recordings: Sequence[Signals],
+    recordings: Sequence[Recorded],
     coarse: Sequence[Features],
     task: BlockTask,
     rig: Rig,
@@ -154,7 +164,7 @@ def aligned_rounds(
         pool = pooled(flat, fitting, steps, rig, taps)
     else:  # what is known of the sensors, and no alignment
         parameters = of[0].free.parameters
-        readings = [_read(part(r, p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
+        readings = [_read(r.part(p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
         pool = Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
     position = {i: j for j, i in enumerate(fitting)}
     pieces = iter([
@@ -171,13 +181,13 @@ def performed(task: BlockTask, pieces: Sequence[Sequence[Piece]]) -> BlockTask:
 
 
 def _rounds(
-    recordings: Sequence[Signals], coarse: Sequence[Features], task: BlockTask, rig: Rig
+    recordings: Sequence[Recorded], coarse: Sequence[Features], task: BlockTask, rig: Rig
 ) -> tuple[list[list[slice]], list[list[Conformity]]]:
     """Samples and verdict of every round of every recording."""
     cuts = [cut(f, task) for f in coarse]
     while True:
         every = [slices(r.t, at) for r, at in zip(recordings, cuts, strict=True)]
-        parts = [[features(thin(part(r, p), MAX_RATE), rig) for p in own]
+        parts = [[features(thin(r.part(p), MAX_RATE), rig) for p in own]
                  for r, own in zip(recordings, every, strict=True)]  # fmt: skip
         tasks = [own for p in parts for own in round_tasks(task, len(p))]
         found = iter(examine([f for own in parts for f in own], tasks))
@@ -356,7 +366,7 @@ def align(
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
     whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
     coarse = [features(thin(s, MAX_RATE), rig) for s in whole]
-    pool, pieces = aligned_rounds(signals, coarse, task, rig, all_fit)
+    pool, pieces = aligned_rounds([InMemory(s) for s in signals], coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)
     number = 1 if all_fit or done.repeat == "unknown" else done.repeat
@@ -376,3 +386,19 @@ def align(
 def segment(trials: Sequence[Trial], task: BlockTask, rig: Rig) -> list[Segmentation]:
     """Segmentation of each trial of one task; all are fitted together."""
     return align(trials, task, rig).segmentations
+
+
+def segment_long(recording: LongRecording, task: BlockTask, rig: Rig) -> Segmentation:
+    """Segmentation of one recording that stays on disk, as `segment` has it.
+
+    It is passed over twice: thinned as a whole, which tells the rounds, and then round by round. Memory holds
+    the times and what is read of each round at 100 Hz at most.
+    """
+    source = OnDisk(recording, rig)
+    coarse = [features(source.thinned(MAX_RATE), rig)]
+    pool, pieces = aligned_rounds([source], coarse, task, rig)
+    done = performed(task, pieces)
+    number = 1 if done.repeat == "unknown" else done.repeat
+    last = float(recording.t[-1])
+    return joined(recording.file, last, recording.rate, pieces[0], subtasks(done), number,
+                  task.repeat == "unknown", pool.remarks)[0]  # fmt: skip

@@ -139,7 +139,7 @@ def _log_impact(
     """Log likelihoods (..., POINTS) of what precedes and of what follows an impact at u, given its motion.
 
     A minimum-jerk motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample.
-    Its distance is unknown (log-uniform); gap and velocity of the first sample tell it. The face
+    Its distance is unknown (log-uniform); gap and velocity of the first sample determine it. The face
     that it hits is as likely in one place on its way as in another. After the hit the velocity
     decays to v_right with an unknown time constant, which makes the compression `right`.
     """

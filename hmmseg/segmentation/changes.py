@@ -38,11 +38,11 @@ from hmmseg.segmentation.boundaries import (
     first_of,
 )
 
-# prior: share of samples at which one sensor tells another story than the model (ringing, a block
+# prior: share of samples at which one sensor contradicts the model (ringing, a block
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
-LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed tell how restless a hand is
+LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed show how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 
@@ -55,7 +55,7 @@ class Penetration:
     before and just after each sample. `sd_pressed` is
     the noise of the force, `form` the share by which a pad's force may be off its compression;
     `sd_apart` [m]: what the force may be of itself where there is no contact. `hidden`: a rigid pad, whose
-    force tells that there is contact, but not how deep.
+    force shows that there is contact, but not how deep.
     """
 
     t: np.ndarray
@@ -103,7 +103,7 @@ def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.n
     depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
     # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
-    # is lost in it, that would count against contact, of which force alone tells.
+    # is lost in it, that would count against contact, which force alone shows.
     deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
     agree = agree + np.log(max(ROOT_2PI * c.sd_place / deep, 1.0))
     held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))

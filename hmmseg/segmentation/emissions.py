@@ -52,7 +52,7 @@ class Features(Brief):
     `pads`: their nominal compliances [m/N].
     `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force of a
     finger and press of both downwards [N]). `free`: 1 where a gripper's opening says that nothing is held,
-    None where nothing but forces tells.
+    None where forces alone are known.
     """
 
     t: np.ndarray
@@ -278,13 +278,16 @@ def noise_sd(values: np.ndarray) -> float:
     return float(white_sd(there)) if there.size > 2 else np.nan
 
 
-def thin(signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf) -> Signals:
+def thin(
+    signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf, rate: float | None = None
+) -> Signals:
     """Signals read at a rate of at most `max_rate` [Hz], each reading a mean over up to `window` s.
 
     White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing.
-    A short window keeps what changes within a reading apart.
+    A short window keeps what changes within a reading apart. `rate` [Hz]: of the recording that the signals
+    are a piece of; their own median otherwise.
     """
-    rate = float(1.0 / np.median(np.diff(signals.t)))
+    rate = float(1.0 / np.median(np.diff(signals.t))) if rate is None else rate
     group = group_size(rate, max_rate)
     if group <= 1:
         return signals

@@ -186,7 +186,7 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
         for k in columns:
             spread = np.hypot(f.usual["y"], old.scale["level"])
             if not (np.isfinite(resting) & (gamma[:, k] > 0)).any():
-                continue  # nothing tells where the block rests
+                continue  # where the block rests is unknown
             start = old.levels[i].get(k) if old.levels else None
             start = weighted_median(resting, gamma[:, k]) if start is None else start
             found[k] = _location(resting, gamma[:, k], spread, start)

@@ -63,7 +63,7 @@ LAW_SHARE, LAW_LEAD = (
 )  # prior: share by which a pad's force is off its law, and s by which it leads
 HOLD = 0.75  # chosen: share of a squeeze's firmest load from which it holds its block
 FIRMEST = 0.95  # numerics: quantile
-SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recording tells
+SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recording gives
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Lateness:
 
 
 def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], least: float) -> Lateness | None:
-    """The delay, or filter, that explains the forces best; None where there is nothing to tell it by.
+    """The delay, or filter, that explains the forces best; None where nothing determines it.
 
     `prior`: mean and sd of the compliance of a pad [m/N]. `least` [s]: what is less is no delay.
     """
@@ -214,7 +214,7 @@ IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 SLIDING = 0.9  # chosen: quantile of the steepest ratios of forces of all contacts that is friction's
 LOUD = 0.9  # chosen: quantile of what forces show after releases that is how loud they ring
-ENOUGH = 24  # chosen: stretches that tell a delay
+ENOUGH = 24  # chosen: stretches that determine a delay
 
 
 @dataclass(frozen=True)

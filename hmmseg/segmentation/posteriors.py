@@ -130,7 +130,7 @@ class Contacts:
 
         A touch begins where the compression does, and so do both changes for a sensor that is late.
         Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly. How fast a
-        stiff pad is pressed only its force tells: what its finger moves, it moves with the block.
+        stiff pad is pressed only its force shows it: what its finger moves, it moves with the block.
         """
         rate = central_differences(c.t, c.pressed)[0] if c.hidden else c.rate.mean(axis=0)
         moved = self.sensing.delay * np.nan_to_num(rate)

@@ -3,26 +3,90 @@
 The task's chain closes on itself: from the free motion after its last move the next round may begin, and from
 wherever a path has left the chain as well, so that a round that fails does not carry the others away. One
 Viterbi path over the chain's few states finds the rounds, at a cost linear in the length of the recording
-whatever their number.
+whatever their number. Long recordings are read from disk round by round.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
-from hmmseg.hand.signals import Signals
+from hmmseg.hand.read import LongRecording
+from hmmseg.hand.signals import Signals, come_late, differenced, group_size, task_space
 from hmmseg.hmm import dense
+from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.conformity import DEPARTURE, Conformity, assignments, column, departing, settled
-from hmmseg.segmentation.emissions import Features
+from hmmseg.segmentation.emissions import Features, thin
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts
 
-GLANCE = 4096  # numerics: samples that tell which of the recording's blocks is which object
+MARGIN = 64  # numerics: rows read on either side of a part, for differences of its neighbours
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """Signals that are at hand."""
+
+    signals: Signals
+
+    @property
+    def t(self) -> np.ndarray:
+        """Times (num_timesteps,) [s]."""
+        return self.signals.t
+
+    def part(self, samples: slice) -> Signals:
+        """Signals of some samples."""
+        return part(self.signals, samples)
+
+
+class OnDisk:
+    """Signals read anew at each access.
+
+    Whether velocities come late is judged by its beginning: a drive does not change its habits.
+    """
+
+    def __init__(self, recording: LongRecording, rig: Rig) -> None:
+        self.recording, self.rig = recording, rig
+        self._late = come_late(recording.beginning(), rig)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Times (num_timesteps,) [s]."""
+        return self.recording.t
+
+    def part(self, samples: slice) -> Signals:
+        """Signals of some samples."""
+        start, stop = samples.start, samples.stop
+        low, high = max(start - MARGIN, 0), min(stop + MARGIN, self.t.size)
+        signals = task_space(self.recording.rows(low, high), self.rig)
+        if self._late:
+            signals = differenced(signals)
+        return part(signals, slice(start - low, stop - low))
+
+    def thinned(self, max_rate: float) -> Signals:
+        """All of it, at a rate of at most `max_rate` [Hz], as `thin` has it."""
+        rate = self.recording.rate
+        step = group_size(rate, max_rate)
+        size = max(self.recording.piece // step, 1) * step
+        pieces = [
+            thin(self.part(slice(start, min(start + size, self.t.size))), max_rate, rate=rate)
+            for start in range(0, self.t.size, size)
+        ]
+        joined = {
+            name: np.concatenate([getattr(p, name) for p in pieces])
+            if isinstance(value, np.ndarray)
+            else value
+            for name, value in vars(pieces[0]).items()
+        }
+        return Signals(**joined)  # type: ignore[arg-type]
+
+
+Recorded = InMemory | OnDisk
+GLANCE = 4096  # numerics: samples that identify the recording's blocks with objects
 
 
 def one_round(task: BlockTask) -> BlockTask:

@@ -23,7 +23,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Question:
-    """The one boundary of a trial whose label would tell most.
+    """The one boundary of a trial whose label would decide most.
 
     `subtask`: the one that begins there. `gain`: expected reduction of entropy [nats].
     """

@@ -101,7 +101,7 @@ class Gap:
     """Residuals (n,) at the nominal, derivatives by nuisances whose prior is N(0, 1), and candidates.
 
     `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
-    trials tell nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
+    trials say nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
     from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
     of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same. `told` (n,):
     the mean square of a row if nothing acts, 1 where it is not given: repeats of one motion share an error.

@@ -31,10 +31,11 @@ class World(NamedTuple):
     `delay`, `smoothing` (4,) [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
     the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
     yields with that delay (spring and damper in parallel). `inertia`: factor of the mass times acceleration.
-    `couple` [m]: how far the mass lies right of the middle.
+    `couple` [m]: how far the mass lies right of the middle. `hang` [rad]: by how much a block in the air has
+    turned clockwise against how it stood.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
-    `doubt_joints` [rad^2] (T, N, 4): variance of what a correction cannot tell of angles.
+    `doubt_joints` [rad^2] (T, N, 4): variance that a correction leaves in angles.
     `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (6,): 1 where a candidate delays or
     smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE, SMOOTH, CREEPING,
     SLIDING, RINGING, YIELDING), so that equations without it are not evaluated.
@@ -72,6 +73,7 @@ class World(NamedTuple):
     ground: Array
     carry: Array
     events: Array
+    hang: Array | float = 0.0
 
 
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
@@ -118,7 +120,7 @@ class HandEffect(Effect):
     `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]: least and most that
     blocks are held with, so that it shows. `restored(channels, values)`: recorded channels as they would be
     without it. `patched(document, found)`: puts what was found into numbers that rig.toml has of its own, and
-    says where each parameter stands; None where it has none. `wrong(problem, push)`: candidates of the gap
+    says where each parameter is found; None where it has none. `wrong(problem, push)`: candidates of the gap
     that stand for measurements rather than for what acts.
     """
 

@@ -98,6 +98,8 @@ ACTUAL = HandEffect(
 # A support inclined from the horizontal.
 #
 # A block of which one foot touches first turns in the grip until the other one does, and pads slide on it.
+# One that stood on a slope turns back as it is lifted, by some share of the slope: the fingers' height
+# difference changes by its width times that.
 
 TABLE_TILT = HandEffect(
     name="table_tilt",
@@ -107,9 +109,12 @@ TABLE_TILT = HandEffect(
     mistaken_for=("joint_offset", "height"),
     called="a table that is not level",
     check="Lay a spirit level on the table, along the line between the fingers.",
-    parameters={"angle": Parameter(0.0, 0.025, "rad")},
+    parameters={
+        "angle": Parameter(0.0, 0.025, "rad"),
+        "turned": Parameter(0.5, 0.5, low=0.0, high=1.5, hidden=True),
+    },
     stage=CONTACT,
-    correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"]),
+    correct=lambda w, v, on: w._replace(tilt=w.tilt + v["angle"], hang=w.hang + v["turned"] * v["angle"]),
     scene=lambda v: {"tilt": v["angle"]},
     wrist=True,
     turns="angle",

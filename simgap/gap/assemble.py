@@ -105,7 +105,7 @@ NOISE_BANDS = 6  # numerics: of which medians are taken
 SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
 OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it
 FEWEST = 12  # numerics: coefficients of a band
-CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they tell nothing of it
+CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they say nothing of it
 
 
 def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
@@ -183,7 +183,7 @@ Other = TypeVar("Other")
 
 # numerics: signs of draws by places; products of what has different places cancel over the draws
 SIGNS = np.array([[1, 1], [1, -1]], float)
-SIZES = (1.0, -0.25)  # numerics: sds of noise of a draw; both tell whether it acts in proportion
+SIZES = (1.0, -0.25)  # numerics: sds of noise of a draw; both show whether it acts in proportion
 ALIKE = 0.5  # numerics: by which share of the larger both may differ
 
 
@@ -274,7 +274,7 @@ def gap_of(
         k = problem.num_properties
         start = healthy.residual - healthy.push @ healthy.u[:k]
         nuisance = np.concatenate([-healthy.push, problem.nuisances.columns], 1)
-        shifting = [_shifting(problem, f, start, healthy.push) for f in fits]
+        shifting = [_shifting(problem, f, start, healthy.push, healthy.doubts) for f in fits]
         measured = [c for c in _measured(problem, healthy) if c.parameters in seen]
         every = (*shifting, *scattering, *measured)
         return Gap(rows, start, nuisance, every, tolerance=tolerance, usual=usual)
@@ -339,12 +339,12 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
         u[own] = neutral(given)[own]
         rest = tuple(e for e in joint.effects if e != key)
         alone.append(residual_at(given, rest, u)[there] - joint.residual)
-    both = (all_of_them - sum(alone)) / len(alone)
+    both, doubts = (all_of_them - sum(alone)) / len(alone), (joint.doubts - healthy.doubts) / len(alone)
     out, at = [], k
     for key, shift in zip(joint.effects, alone, strict=True):
         free = free_of(key)
         out.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
-                              joint.push[:, at : at + len(free)], joint.doubts / len(alone)))  # fmt: skip
+                              joint.push[:, at : at + len(free)], doubts))  # fmt: skip
         at += len(free)
     return out
 
@@ -366,11 +366,12 @@ def _turning(given: Problem, angle: float) -> np.ndarray:
     return np.square(size[there]) * (stands & (distance | offset | (y & ~mean)))
 
 
-def _shifting(given: Problem, f: Fitted, start: np.ndarray, push: np.ndarray) -> Candidate:
-    """A fit as a candidate: what it takes off the residual, at properties' own nominal."""
+def _shifting(given: Problem, f: Fitted, start: np.ndarray, push: np.ndarray, usual: float) -> Candidate:
+    """A fit as a candidate: what it takes off the residual, at properties' own nominal; `usual` [nats]: the
+    doubts without it."""
     k = given.num_properties
     shift = start - (f.residual - push @ f.u[:k])
-    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.push[:, k:], f.doubts)
+    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.push[:, k:], f.doubts - usual)
 
 
 def _candidate(

@@ -355,7 +355,7 @@ def diagnose(
     document = body(found, verdict, causes, following, seed)
     warnings = (*found.warnings, *_inseparable(verdict, following))
     if found.problem.frame.num_trials == 1:
-        warnings = (*warnings, "one trial: nothing tells an accident of it from an effect")
+        warnings = (*warnings, "one trial: an accident of it looks like an effect")
     before = residual_at(found.problem, (), found.healthy.u)
     after = residual_at(found.problem, causes.effects, causes.u)
     cells = tallies(found.problem, before)
@@ -368,7 +368,7 @@ def _inseparable(verdict: Attribution, following: dict[str, Any] | None) -> list
     if not left:
         return []
     return [
-        f"no experiment of the list is expected to tell {', '.join(left)} from {' + '.join(verdict.causes)}"
+        f"no experiment listed is expected to separate {', '.join(left)} from {' + '.join(verdict.causes)}"
     ]
 
 
@@ -380,7 +380,7 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    leading = [j for j in sought(forms(gap), 1)[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    leading = [j for j in sought(forms(gap))[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(

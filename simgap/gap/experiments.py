@@ -1,9 +1,9 @@
-"""The next experiment: which of a short list would tell the leading cause from its partners.
+"""The next experiment: which of a short list would separate the leading cause from its partners.
 
 Every experiment is simulated with the leading cause in it, and cause and partners are fitted to what it would
 record. The gain expected of a partner is by how much it would then fit worse: the divergence after properties
 have done their best (Chaloner & Verdinelli, Statist. Sci. 10, 1995), for as many trials as there are. Of the
-experiments that tell most partners the first of the list is taken, which asks least of the model.
+experiments that separate most partners the first of the list is taken, which needs least of the model.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Experiment:
     measured: bool = False
 
 
-# Those whose outcome needs least of the model first: fast work asks most of it.
+# Those whose outcome needs least of the model first: fast work needs most of it.
 EXPERIMENTS = (
     Experiment(
         "weigh the blocks and measure them with calipers, and give the values with --actual", {}, True
@@ -60,10 +60,10 @@ Values = Mapping[str, Mapping[str, float]]
 def next_experiment(
     found: Search, cause: Values, partners: Sequence[str], seed: int, actual: Actual | None = None
 ) -> dict[str, Any] | None:
-    """The experiment that tells most partners from the cause by ENOUGH nats; None where none tells any.
+    """The experiment that separates most partners from the cause by ENOUGH nats; None where none does.
 
     `cause` holds the parameters of each effect that acts, as the interface names them. `separates` lists the
-    cause and the partners told from it, `expected_gain_nats` the least gain of these.
+    cause and the partners separated from it, `expected_gain_nats` the least gain of these.
     """
     try:
         blocks = blocks_of(found)

@@ -27,6 +27,7 @@ from simgap.gap.sensor_noise import (
     mean_of,
     motion_doubt,
     of_a_kink,
+    pushed,
     residual_noise,
     sample_noise,
     sensor_sd,
@@ -197,7 +198,8 @@ def trial_arrays(
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
-    sd = np.hypot(plain, motion_doubt(signals, sample, step, group, rig.fingertip))
+    push = pushed(mean_of(signals, "x"), sample["x"] / np.sqrt(2))
+    sd = np.hypot(plain, motion_doubt(signals, sample, push, step, group, rig.fingertip))
     sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
     shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity
     sd[:, NET] = np.hypot(sd[:, NET], shaken[:, None])
@@ -223,6 +225,7 @@ def trial_arrays(
         "there": there,
         "sd": sd,
         "plain": plain,
+        "pushed": push,
         "sensor": sensor_sd(joints, rates, sample, rig, group),
         "sample": channel_noise(sample) * np.sqrt(group),  # of one as it was recorded
         "kind": (2 * phase + edge).astype(float),
@@ -331,16 +334,18 @@ class Arrays(NamedTuple):
     """Constants of the contact equations: T trials, N samples, C channels, M moves, O objects.
 
     `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): how far it
-    is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `kind` (T, N):
+    is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `pushed` (T, N) [m]:
+    how far the fingers are seen to go from sample to sample; `kind` (T, N):
     2 * phase, + 1 next to a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
     `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
-    forces as they stand in `World`.
+    forces as they are in `World`.
     """
 
     there: np.ndarray
     sd: np.ndarray
     plain: np.ndarray
+    pushed: np.ndarray
     kind: np.ndarray
     subtask: np.ndarray
     onehot: np.ndarray
@@ -402,6 +407,7 @@ def build(aligned: AlignedTrials) -> Frame:
         stack["there"],
         stack["sd"],
         stack["plain"],
+        stack["pushed"],
         stack["kind"].astype(int),
         stack["subtask"].astype(int),
         onehot,

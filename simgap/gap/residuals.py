@@ -233,19 +233,11 @@ def recorded(arrays: Arrays, channel: str) -> np.ndarray:
     return arrays.there[..., CHANNELS.index(channel)]
 
 
-def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray, place: np.ndarray | None) -> np.ndarray:
-    """Values (T, N) less their weighted mean in every grip (pickup and place apart if `place` is given)."""
-    parts = (
-        [arrays.onehot]
-        if place is None
-        else [arrays.onehot * (1 - place)[..., None], arrays.onehot * place[..., None]]
-    )
-    out = values
-    for part in parts:
-        total = (weight[:, None] @ part)[:, 0]
-        mean = ((weight * values)[:, None] @ part)[:, 0] / np.maximum(total, 1e-9)
-        out = out - (part @ mean[..., None])[..., 0]
-    return out * weight
+def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray) -> np.ndarray:
+    """Values (T, N) less their weighted mean in every grip."""
+    total = (weight[:, None] @ arrays.onehot)[:, 0]
+    mean = ((weight * values)[:, None] @ arrays.onehot)[:, 0] / np.maximum(total, 1e-9)
+    return (values - (arrays.onehot @ mean[..., None])[..., 0]) * weight
 
 
 def in_grip(
@@ -257,25 +249,25 @@ def in_grip(
     """
     weight = firm * recorded(arrays, channel)
     if world.modes[SLIDING]:
-        return _followed(values, weight, noise[..., CHANNELS.index(channel)], world.slip, arrays.onehot)
-    return less_mean(values, arrays, weight, None), np.ones_like(values)
+        sd = noise[..., CHANNELS.index(channel)]
+        return _followed(values, weight, sd, SLIDE * world.slip, arrays.onehot)
+    return less_mean(values, arrays, weight), np.ones_like(values)
 
 
 def _followed(
-    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, slip: np.ndarray, grips: np.ndarray
+    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, walk: np.ndarray, grips: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
 
-    The state is where a grip holds its block; it walks by SLIDE from one sample to the next where pads slide
-    at either. A grip's first value sets it and tells nothing.
+    The state is where a grip holds its block, or where that stands: it goes by about `walk` (T, N) from one
+    sample to the next, the larger of both. A grip's first value sets it and says nothing.
     """
     from simgap.recursions import innovations
 
-    other = np.ones(slip.shape, bool)
+    other = np.ones(walk.shape, bool)
     other[:, 1:] = (grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5
-    before = np.concatenate([slip[:, :1], slip[:, :-1]], 1)
-    walk = np.square(np.maximum(slip, before) * SLIDE)
-    return innovations(values, weight, sd, walk, other, ANYWHERE**2)
+    before = np.concatenate([walk[:, :1], walk[:, :-1]], 1)
+    return innovations(values, weight, sd, np.square(np.maximum(walk, before)), other, ANYWHERE**2)
 
 
 TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
@@ -315,7 +307,7 @@ def residuals(
     # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = arrays.phase[..., Phase.PLACE]
-    offset = block_offset(y2 - y1, fy1, fy2, pads_give)
+    offset = block_offset(y2 - y1, fy1, fy2, pads_give) + world.hang * width * world.carry
     x = block_x((x1 + x2) / 2, fx1, fx2, pads_give)
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
@@ -326,7 +318,12 @@ def residuals(
     closed = firm * both
     still = closed * (arrays.phase[..., Phase.PICKUP] + place)
     offset, loose_offset = in_grip(offset, closed * held, "offset", arrays, noise, world)
-    x = less_mean(x, arrays, still * recorded(arrays, "x"), place)
+    # A hand that moves takes what it holds on the ground along: the block stays where it was pushed to.
+    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
+    x, loose_x = _followed(
+        x, still * recorded(arrays, "x"), noise[..., CHANNELS.index("x")], arrays.pushed,
+        parts.reshape(*x.shape, -1),
+    )  # fmt: skip
     y, loose_y = in_grip(y, closed * world.ground, "y", arrays, noise, world)
 
     acceleration, _ = fivepoint(world, velocity)
@@ -349,7 +346,7 @@ def residuals(
     geometry = np.stack([x, y, distance * held, offset], -1)
     # In the units of what was recorded: an effect must not gain by scaling the noise down.
     size = np.mean(world.link)
-    loose = np.stack([np.ones_like(x), loose_y, np.ones_like(x), loose_offset], -1)
+    loose = np.stack([loose_x, loose_y, np.ones_like(x), loose_offset], -1)
     factor = loose + _doubt(world, firm) / np.square(noise[..., :4])
     return (
         np.concatenate([geometry / size, speeds / size, forces], -1),

@@ -189,7 +189,7 @@ class Search:
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
         """Weight, width, height (O, 3) of the blocks, and which are known: measured apart or identified.
 
-        What is measured is as the recordings leave it, what nothing tells as the prior does.
+        What is measured is as the recordings leave it, what nothing determines as the prior does.
         """
         values, known = self.problem.properties(self.healthy.u), self.problem.measured.copy()
         for (name, kind), value in self.identified.items():

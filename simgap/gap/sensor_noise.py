@@ -106,7 +106,7 @@ def of_a_kink(group: int) -> tuple[float, float]:
     return tuple(float(np.sqrt(np.square(rule).sum() / bend)) for rule in (mean, slope))  # type: ignore
 
 
-UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples can tell,
+UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples determines,
 # chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
 STARTING = 0.1
 FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
@@ -179,17 +179,16 @@ def residual_noise(one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndar
 
 
 def motion_doubt(
-    s: Signals, one: dict[str, np.ndarray], step: float, group: int, pad: Fingertip
+    s: Signals, one: dict[str, np.ndarray], push: np.ndarray, step: float, group: int, pad: Fingertip
 ) -> np.ndarray:
     """How far (N, C) residuals are off beyond noise where motion is not what equations take it for, sd.
 
-    Fingers that push a block move it, and speeds that change within a sample, as that of a pressed fingertip
-    that is released, no rule gives; while pads give way quickly, their damping bears a part of the force.
-    Samples are means over `group` finer ones.
+    Blocks that fingers `push` (N,) [m] rock, and speeds that change within a sample, as that of a pressed
+    fingertip that is released, no rule gives; while pads give way quickly, their damping bears a part of the
+    force. Samples are means over `group` finer ones.
     """
     root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))
-    push = pushed(mean_of(s, "x"), one["x"] / root2)
-    out[:, 0], out[:, 1], out[:, 3] = np.hypot(NUDGE, push), ROCKING * push, 2 * ROCKING * push
+    out[:, 0], out[:, 1], out[:, 3] = NUDGE, ROCKING * push, 2 * ROCKING * push
     damped = FOAM / step * changes(np.stack([s.fx1, s.fy1, s.fx2, s.fy2], 1), one["force"])
     normal, shear = damped[:, ::2] / pad.normal_stiffness, damped[:, 1::2] / pad.shear_stiffness
     for channel, each in ((0, normal / 2), (1, shear / 2), (2, normal), (3, shear)):
@@ -209,7 +208,7 @@ def mean_of(s: Signals, name: str) -> np.ndarray:
 def between_samples(
     t: np.ndarray, force: np.ndarray, free: np.ndarray, starting: np.ndarray, boundaries: np.ndarray
 ) -> np.ndarray:
-    """What no model of coarse samples can tell (N, 4) of net fx, net fy, grip and shear [N].
+    """What no model of coarse samples determines (N, 4) of net fx, net fy, grip and shear [N].
 
     A share of the largest change from sample to sample, two samples around, more of it where a carry is
     `starting` or ending; and just after a grip a share of what is still recorded, for it tells of forces

@@ -1,7 +1,7 @@
 """Healthy twins: this task, rig and pace, these blocks, grips and sensors, simulated and diagnosed alike.
 
 The statistic of a recording is a log Bayes factor; that of a healthy one exceeds s with a probability of
-exp(-s) at most, if the model is right. It is never quite right: twins tell by how much the factor is off for
+exp(-s) at most, if the model is right. It is never quite right: twins show by how much the factor is off for
 recordings like these (`simgap.attribution.search.detected`).
 """
 
@@ -129,7 +129,7 @@ def carried(
     return weight, width
 
 
-BATCHES = (1, 3, 4)  # numerics: twins that are simulated at once: the first alone mostly tells enough
+BATCHES = (1, 3, 4)  # numerics: twins that are simulated at once: the first alone is mostly enough
 LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
 QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
 

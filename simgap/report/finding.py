@@ -199,7 +199,7 @@ def sentences(body: Body) -> list[str]:
 
 
 def changed(body: Body) -> list[str]:
-    """What two sets of logs tell of a robot that may have changed between them."""
+    """What two sets of logs show of a robot that may have changed between them."""
     if body["verdict"] == "none":
         return ["No change that these logs can show: the model fits the new ones as well as the old ones."]
     if body["verdict"] == "unknown":
@@ -238,7 +238,7 @@ def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 
 
 def explained(body: Body) -> str:
-    """Share of the gap that the causes explain, where the body tells it."""
+    """Share of the gap that the causes explain, where the body has it."""
     parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]
     known = [(n, a) for n, a in parts if a and a.get("share") is not None]
     if not known:
@@ -291,7 +291,7 @@ def _noise(rest: Mapping[str, Any]) -> bool:
 
 
 def settles(body: Body, weighed: bool) -> str:
-    """What would tell more of blocks whose properties were fitted; "" where nothing is open, or they were
+    """What would show more of blocks whose properties were fitted; "" where nothing is open, or they were
     measured (`weighed`)."""
     rest = body.get("remainder") or {}
     unsure = body["verdict"] in ("set", "unknown") or (

@@ -61,7 +61,7 @@ class Calibration:
 
     @property
     def told(self) -> np.ndarray:
-        """Whether logs tell each parameter by itself (p,)."""
+        """Whether logs determine each parameter by itself (p,)."""
         return np.sqrt(np.diag(self._posterior)) <= UNTOLD
 
     @property
@@ -108,7 +108,7 @@ class Calibration:
     def _reason(self, k: int) -> str:
         others = [self.label(i) for i in self._group(k) if i != k]
         if self.information[k, k] < 1 or not others:
-            return "these logs tell little more of it than was known beforehand"
+            return "these logs add little to what was known beforehand"
         return f"told only together with {', '.join(others)}"
 
     def _group(self, k: int) -> list[int]:
@@ -182,7 +182,7 @@ def calibrate(
         effects: by name; those that are not fitted along are left out.
         length: s of windows that lead near.
         begin: where to begin, if that is near already; effects in it that are not fitted along stay there.
-        tell: hears what is being done.
+        tell: called with a description of each stage.
         judged: whether it is fitted anew without each log in turn, to say how far that is from it.
 
     Raises:
@@ -211,7 +211,7 @@ def calibrate(
     if _over_noise(linear) > LEAVES and len(stated) < len(fitted):
         found, linear, whiten = _least_squares(whole.moved(found), found, STEPS, fitted)
         stated = fitted
-    tell("what the logs tell")
+    tell("what the logs determine")
     names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten, stated)
     tell("held-out logs")
     before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})

@@ -474,7 +474,7 @@ def changes(
         old: logs of the robot as it was, two at least; the more motions the better.
         new: logs of it as it is.
         effects: what may have changed, by name; those that are `fitted` are calibrated on OLD.
-        tell: hears what is being done.
+        tell: called with a description of each stage.
         calibration: of the same old logs, where that is known.
         known: what was learned of the same old logs before, where NEW makes the same motions as then.
 

@@ -77,8 +77,8 @@ def diagnose(
         forced: effects that are taken instead of choosing.
         seed: of what is drawn.
         phases: stretches of the logs by name; by motion and contact where they are not given.
-        tell: hears what is being done.
-        warn: is told at once what cannot be told apart.
+        tell: called with a description of each stage.
+        warn: called at once with what cannot be separated.
         more: further candidates.
         length: s of windows.
         groups: one number a log; logs of one number are held out together.

@@ -196,11 +196,6 @@ class Composed:
             out.append(_read(acting, log.window(window.begin, window.end), float(log.t[0]), channels))
         return out
 
-    def read_whole(self, log: Recording, true: Channels, point: Point) -> Channels:
-        """Channels along a whole log as they are read."""
-        acting = [(e, v) for e, v in self._acting(point) if e.reads]
-        return _read(acting, log, float(log.t[0]), true)
-
     def starts(self, point: Point) -> list[Mapping[str, float] | None]:
         """Every window's start, smoothed from the recordings with read-outs' effects undone."""
         undone = self.unread(point)

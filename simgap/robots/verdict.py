@@ -2,7 +2,9 @@
 
 There is a gap if some set, or a discrepancy alone, is likelier than the sensors' noise. Causes are known if
 they explain most of the whole gap, of all channels together, in logs that took no part, at values that a
-robot can have.
+robot can have. How many times the noise is left does not matter for that: a real robot always leaves some, by
+which its sensors are as much finer than its model. It is in the discrepancy, by which causes are weighed, and
+is told.
 """
 
 from __future__ import annotations
@@ -36,8 +38,7 @@ from simgap.robots.whiten import ALONE, Whitener
 
 OPEN = 0.1  # chosen: share of what is left without a small cause that may be left with it
 MATTERS = 1.1  # chosen: mean squares over the noise's; a smaller gap that nothing explains is told as none
-SEVERAL = 3.0  # chosen: times the noise; causes that leave more, and a part of the gap, are not known
-PART = 0.1  # chosen: that part
+PART = 0.1  # chosen: share of the gap by which a set may leave more than the best and be compared with it
 
 
 @dataclass(frozen=True)
@@ -81,11 +82,9 @@ def verdict_on(
     causes = best.names if forced else tuple(n for n, big in zip(best.names, large, strict=True) if big)
     left = shares.remainder if far is None else max(1.0 - far.fraction, 0.0)
     doubts = _absurd(search.composed.effects, best, causes)
-    if over_noise > SEVERAL and left > PART:
-        doubts = (*doubts, f"{over_noise:.3g} times the noise is left")
     right = 0.0 if doubts else known(left, 1.0 - left)
     others = _alternatives(search, best)
-    # What is too small to be told, and what takes its place, is no cause and stands in for none.
+    # What is too small to report, and its replacements, is no cause and replaces none.
     small = {*best.names} - {*causes}
     small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
     sets = _explanations(others, best, small - {*causes}, right)
@@ -99,7 +98,7 @@ def verdict_on(
             {*s.causes} for s in sets if s.causes and cause not in s.causes and len(s.causes) <= len(causes)
         ]
         stands_in[cause] = tuple(sorted(set().union(*rivals) - {*causes}))
-    rest = Remainder(shares.remainder if named else float(verdict.verdict != "none"), _alone(best), ())
+    rest = Remainder(left if named else float(verdict.verdict != "none"), _alone(best), ())
     told = verdict.verdict != "none"
     where = _where(search, nothing, phases) if told else ()
     rest = Remainder(rest.share, rest.p_value, _where(search, best, phases) if told and best.names else where)
@@ -153,8 +152,10 @@ def _alternatives(search: Search, best: Settled) -> list[Settled]:
 def _explanations(
     others: Sequence[Settled], best: Settled, small: set[str], right: float
 ) -> list[Explanation]:
-    """The sets that are left, by weight, without what is small."""
-    score = np.array([best.score, *(max(s.score, best.score - np.log(RULED_OUT)) for s in others)])
+    """The sets that are left, by weight, without what is small: none weighs more than the best, for held-out
+    logs do not bear out what is likelier."""
+    others_score = [np.clip(s.score, best.score - np.log(RULED_OUT), best.score) for s in others]
+    score = np.array([best.score, *others_score])
     weight = np.exp(score - np.logaddexp.reduce(score))
     each = [tuple(sorted({*s.names} - small)) for s in (best, *others)]
     return [
@@ -181,7 +182,7 @@ def _absurd(effects: Mapping[str, RobotEffect], best: Settled, causes: Sequence[
 
 
 def _where(search: Search, one: Settled, phases: Phases) -> tuple[Cell, ...]:
-    """Cells in which what a set leaves stands out of the noise."""
+    """Cells in which what a set leaves exceeds the noise."""
     composed, rows = search.composed, one.linear.rows
     whiten: Whitener = one.covariances.whitener()
     white = whiten(np.nan_to_num(one.linear.residual))

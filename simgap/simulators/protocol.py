@@ -72,7 +72,16 @@ class Simulator(Protocol):
     def channels(self) -> Mapping[str, Channel]: ...  # noqa: D102
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
-        """Channels along the recording."""
+        """Simulate one recording.
+
+        Args:
+            parameters: By name, in their units.
+            recording: Its commands and times `t` (num_samples,) [s].
+            start: By position channel its first value, and under its name with `_rate` its first rate.
+
+        Returns:
+            By name every channel that is no command (num_samples,), at the recording's times.
+        """
         ...
 
 

@@ -1,4 +1,4 @@
-"""Complete synthetic trials: an operator performs a task, sensors record it, contacts tell the truth."""
+"""Complete synthetic trials: an operator performs a task, sensors record it, contacts give the truth."""
 
 from __future__ import annotations
 

@@ -166,15 +166,23 @@ class VirtualModel:
 
     @double_precision
     def prepare(self, dt: float) -> None:
-        """Compile for a period dt [s], so that no step of a loop has to."""
+        """Compile the step for a period dt [s] before a loop begins."""
         jax.block_until_ready(self._advance(np.zeros(8), np.zeros(8), dt))
 
     @double_precision
     def step(self, finger_positions: ArrayLike, finger_velocities: ArrayLike, dt: float) -> np.ndarray:
-        """Forces (2, 2) [N] that fingers 1, 2 exert (x, y) after moving for dt [s] to these positions.
+        """Move the fingers and advance the blocks; `energy` [J] is then that of blocks and contacts.
 
-        Positions and velocities (2, 2) [m, m/s]. A device renders the opposite. `energy` [J] is
-        afterwards what blocks and contacts hold. ValueError for a shape or number that is not.
+        Args:
+            finger_positions: (2, 2) [m], fingers 1 and 2, x and y, reached at the end of the step.
+            finger_velocities: (2, 2) [m/s], there.
+            dt: Period [s].
+
+        Returns:
+            Forces (2, 2) [N] that the fingers exert; a haptic device renders the opposite.
+
+        Raises:
+            ValueError: A shape is wrong or a number is not finite.
         """
         tips = np.empty(8)
         tips[:4] = np.reshape(finger_positions, 4)

@@ -124,6 +124,11 @@ def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
     np.testing.assert_allclose(starts(first)[1:4], (np.array([5, 6, 7]) - 0.5) * 0.05)
 
 
+def test_equal_agreement_goes_to_holding_on_the_ground():
+    out = segment("111" + "323" + "2222" + "333" + "111", PICK)
+    assert out.spans[2].start == pytest.approx(5.5 * 0.05)
+
+
 def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
     carried = segment("1113s3222233s11", PICK)
     assert carried.complete

@@ -375,6 +375,14 @@ def test_a_grip_that_slides_before_it_ends_may_have_ended_then():
     assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
 
 
+def test_a_grip_that_does_not_slide_ends_when_it_did():
+    (known,) = disagreements([release(k) for k in range(40)]).values()
+    for seed in range(90, 95):
+        found, plain = moment(release(seed, slip=0.0), known), moment(release(seed), known)
+        assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3
+        assert found.sd < 1.5 * plain.sd
+
+
 def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets():
     folder = example_folder()
     rig = Rig.read(folder / "rig.toml")

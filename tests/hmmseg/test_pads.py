@@ -12,6 +12,7 @@ from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import (
     LATE,
+    Compliance,
     Sensing,
     Squeeze,
     _compliance,
@@ -132,9 +133,6 @@ def test_healthy_forces_are_neither_late_nor_filtered():
 
 
 def test_reading_again_undoes_what_was_found():
-    from hmmseg.hand.signals import Signals
-    from hmmseg.segmentation.pads import Compliance
-
     t = np.arange(0, 1, 0.01)
     ramp = np.clip(t - 0.3, 0, 0.4)
     zero = np.zeros(t.size)

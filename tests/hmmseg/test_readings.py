@@ -202,7 +202,7 @@ def test_what_cannot_be_known_is_told_with_the_label_that_would_decide():
 
 @pytest.mark.parametrize("named", [(0, 1), (1, 2), (0, 2)])
 def test_labels_of_one_trial_decide(named):
-    trials, truth = ambiguous()
+    trials, truth = ambiguous(3)
     labels = {"trial_2": truth[2, list(named)].tolist()}
     model = fit_sequence(trials, TASK, labels)
     for segmentation, cuts in zip(segment_sequence(trials, TASK, model), truth, strict=True):
@@ -211,16 +211,15 @@ def test_labels_of_one_trial_decide(named):
         assert not any(span.alternatives for span in segmentation.spans)
 
 
-@pytest.mark.parametrize("form", ["list", "name"])
-def test_one_boundary_decides_where_it_lies(form):
-    trials, truth = ambiguous()
-    for at in (1, 2):
-        time = float(truth[1, at])
-        given = [None, time] if form == "list" else {"pull": time}
-        model = fit_sequence(trials, TASK, {"trial_1.csv": given})
-        for segmentation, cuts in zip(segment_sequence(trials, TASK, model), truth, strict=True):
-            assert segmentation.spans[2].start == pytest.approx(cuts[at], abs=0.1)
-            assert not segmentation.spans[2].alternatives
+@pytest.mark.parametrize(("form", "at"), [("list", 1), ("name", 2)])
+def test_one_boundary_decides_where_it_lies(form, at):
+    trials, truth = ambiguous(3)
+    time = float(truth[1, at])
+    given = [None, time] if form == "list" else {"pull": time}
+    model = fit_sequence(trials, TASK, {"trial_1.csv": given})
+    for segmentation, cuts in zip(segment_sequence(trials, TASK, model), truth, strict=True):
+        assert segmentation.spans[2].start == pytest.approx(cuts[at], abs=0.1)
+        assert not segmentation.spans[2].alternatives
 
 
 def test_courses_are_saved(tmp_path):

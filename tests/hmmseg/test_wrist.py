@@ -12,6 +12,7 @@ from hmmseg.hand.read import read_trial
 from hmmseg.hand.tool import applied_force, free_tool, pose_of
 from hmmseg.hand.wrist import closings, grip_of
 from hmmseg.io.rig import parse_rig
+from hmmseg.io.table import frame_table
 from hmmseg.io.task import read_task
 from hmmseg.io.trial import trial_of
 from hmmseg.segmentation.align import align
@@ -30,8 +31,6 @@ def read_all(performed, setup, **said):
 
 
 def raw(simulated, setup, **said):
-    from hmmseg.io.table import frame_table
-
     rig = wrist_rig(setup, **said)
     return trial_of(frame_table(wrist_recording(simulated, setup), None), rig, None), rig
 

@@ -41,7 +41,7 @@ def test_the_next_experiment_says_what_it_promises():
         console.print(table)
     said = sink.getvalue()
     assert "work twice as fast" in said
-    assert "expected to tell force_lag, force_lowpass apart, by 41 nats at least" in said
+    assert "expected to separate force_lag, force_lowpass, by 41 nats at least" in said
     assert len(tables(body | {"next_experiment": None})) == len(tables(body)) - 1
 
 

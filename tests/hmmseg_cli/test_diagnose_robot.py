@@ -1,6 +1,7 @@
 """`hmmseg diagnose --simulator`: from logs to a document, and lines about options that do not go together."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -68,8 +69,6 @@ def test_a_cause_is_named_and_patched(logs, tmp_path):
     ],
 )
 def test_what_does_not_go_together_is_said(logs, capsys, options, line):
-    import re
-
     assert main(["diagnose", *logs, *options]) == 2
     told = capsys.readouterr().err
     assert re.search(line, told) and "Traceback" not in told

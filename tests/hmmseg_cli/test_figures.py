@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from matplotlib.text import Text
 
 from estimation import plots
@@ -70,8 +71,6 @@ def make_signals() -> Signals:
 
 def check_picture(path) -> None:
     """A PNG file that is neither empty nor one colour."""
-    from matplotlib.image import imread
-
     picture = imread(path)
     assert min(picture.shape[:2]) > 200 and np.std(picture[..., :3]) > 0.02
 

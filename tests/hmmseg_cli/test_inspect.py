@@ -30,6 +30,7 @@ from file_writers import (
 from experiments.wrist_scene import Setup, performances, wrist_recording
 from hmmseg.hand.inspect import inspect, propose
 from hmmseg.hand.read import read_trial
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.table import plain_table
 from hmmseg.io.task import read_task
@@ -40,8 +41,6 @@ NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
 
 
 def cartesian() -> dict[str, np.ndarray]:
-    from hmmseg.hand.signals import task_space
-
     rig = read_rig(NONE / "rig.toml")
     signals = task_space(read_trial(NONE / "trial_01.csv", rig), rig)
     names = ("t", "x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")

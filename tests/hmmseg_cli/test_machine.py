@@ -5,9 +5,11 @@ Always one line and exit 2 (or 130), or the whole result; never a traceback or h
 
 import builtins
 import contextlib
+import ctypes
 import io
 import json
 import os
+import pty
 import shutil
 import signal
 import subprocess
@@ -15,6 +17,7 @@ import sys
 import tempfile
 import threading
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +25,7 @@ import pytest
 
 from hmmseg.example import example_folder
 from hmmseg_cli import console
-from hmmseg_cli.main import main
+from hmmseg_cli.main import heard, main
 
 STACK = Path(__file__).parents[1] / "data/stack"
 HAND = ["--task", "task.toml", "--rig", "rig.toml"]
@@ -257,8 +260,6 @@ def test_nothing_is_written_into_the_package_and_no_home_is_needed(lab, monkeypa
 def test_a_page_watched_in_the_terminal_leaves_standard_output_alone(lab):
     rows = Path("trial.csv").read_bytes().splitlines(keepends=True)[:40]
     script = f"exec {' '.join(PROCESS)} watch --plot {' '.join(HAND)} > answers.jsonl"
-    import pty
-
     main_end, terminal = pty.openpty()  # standard error is a terminal, as a user has it
     run = subprocess.Popen(["bash", "-c", script], stdin=subprocess.PIPE, stderr=terminal)
     os.close(terminal)
@@ -314,8 +315,6 @@ def test_properties_that_nothing_has_are_refused(value, key, lab, capsys):
 
 
 def test_an_archive_that_unpacks_to_a_gigabyte_of_nothing_is_refused(lab, capsys):
-    import zipfile
-
     with zipfile.ZipFile("trial.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open("t.npy", "w", force_zip64=True) as member:
             header = io.BytesIO()
@@ -369,9 +368,6 @@ def test_ctrl_c_at_any_moment(name, lab, capsys):
 
 def test_ctrl_c_in_a_callback_is_heard(capsys):
     """What C calls can raise nothing; the interrupt comes when it has returned."""
-    import ctypes
-
-    from hmmseg_cli.main import heard
 
     @ctypes.CFUNCTYPE(None)
     def called():

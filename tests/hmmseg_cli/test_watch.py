@@ -8,7 +8,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from hmmseg import Watcher
+from hmmseg_cli.live import Live, picture, spark
 from hmmseg_cli.main import main
 
 CASE = Path(__file__).parents[2] / "recordings" / "paper_blocks"
@@ -85,11 +88,6 @@ def test_bad_rows_can_be_left_out(run):
 
 
 def test_the_live_picture_shows_where_the_task_is():
-    from rich.console import Console
-
-    from hmmseg import Watcher
-    from hmmseg_cli.live import Live, spark
-
     watcher = Watcher(COMMAND[2], COMMAND[4])
     live = Live(watcher, lines=False)
     live._console.file = io.StringIO()
@@ -98,8 +96,6 @@ def test_the_live_picture_shows_where_the_task_is():
         answer = watcher.update(t, values)
         live.update(answer)
     live.close()
-    from hmmseg_cli.live import picture
-
     console = Console(file=io.StringIO(), width=140)
     console.print(picture(watcher, answer, list(live._kept), ["a note"]))
     text = console.file.getvalue()

@@ -165,6 +165,19 @@ def test_gradients_through_contact_agree_with_differences():
         assert float(value) == pytest.approx(float(loss(*up) - loss(*down)) / (2 * h), rel=1e-4)
 
 
+def test_gradients_are_finite_exactly_at_touch():
+    constants = scene()
+    state = at(constants, (0.0, 0.008))  # resting at depth 0, tips at depth 0
+
+    def total(weight, x):
+        fingers = tips(-0.01, 0.008, 0.01, 0.008)._replace(x=(-x, x))
+        _, loads = interact(constants._replace(weight=(weight,)), state, fingers)
+        return loads.fx[0] + loads.block_y[0]
+
+    for value in jax.grad(total, argnums=(0, 1))(jnp.asarray(0.4), jnp.asarray(0.01)):
+        assert np.isfinite(value)
+
+
 K, C = jnp.asarray(4000.0), jnp.asarray(8.0)
 
 

@@ -1,7 +1,5 @@
 """Late, slow and yielding things at contact changes: forces before their sensor, supports that settle."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter, lsim

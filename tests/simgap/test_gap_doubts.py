@@ -1,7 +1,5 @@
 """What corrections leave in doubt: slides, dead bands, forces between samples, rings; against oracles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lsim
@@ -9,12 +7,12 @@ from scipy.stats import multivariate_normal
 
 from simgap.channels import play
 from simgap.effects.geometry import within
-from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, driven
+from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, driven, sensed
 from tests.simgap.test_gap_effects import performance, world_of
 
 
 def _cost(values, weight, sd, slip, grips) -> float:
-    out, factor = _followed(*(np.asarray(z)[None] for z in (values, weight, sd, slip, grips)))
+    out, factor = _followed(*(np.asarray(z)[None] for z in (values, weight, sd, SLIDE * slip, grips)))
     out, factor = np.asarray(out)[0], np.asarray(factor)[0]
     return float(0.5 * ((out / sd) ** 2 / factor + np.log(factor)).sum())
 
@@ -94,3 +92,14 @@ def test_the_ring_of_a_straight_load_is_exact_and_is_taken_out_again():
     system = ([damped], [1, 2 * zeta * w, w**2])
     ring = lsim(system, rate, fine, interp=False)[1]
     np.testing.assert_allclose(read[0, :, 0] - load[0, :, 0], drive * ring[::40], atol=0.01)
+
+
+def test_late_forces_are_in_doubt_between_samples_only():
+    world = world_of(performance())
+    step = float(world.t[0, 1] - world.t[0, 0])
+    force = np.repeat(np.where(world.t > 1.0, 2.0, 0.0)[..., None], 4, axis=2)
+    for delay, doubtful in ((2.0, False), (2.5, True)):
+        late = world._replace(delay=np.asarray(delay * step), modes=np.eye(6)[0])
+        out, variance = sensed(late, force)
+        assert (float(variance.max()) > 0.1) == doubtful
+        assert float(np.abs(out[:, 3:] - force[:, :-3]).max()) <= 2.0

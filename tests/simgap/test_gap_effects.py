@@ -1,7 +1,5 @@
 """Effects: gradients, neutrality, composition, and that a planted effect is taken out again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

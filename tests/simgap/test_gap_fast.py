@@ -1,7 +1,5 @@
 """What changes within a sample: fast work is no irregular clock, and brief delays are told with care."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from demo_recordings import RIG, TASK

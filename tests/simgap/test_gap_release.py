@@ -1,7 +1,5 @@
 """What is seen while pads close or let go, or a block comes off its support, is no evidence of an effect."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from experiments.generic_ensembles import PLANTED, TASK, ensemble
+from experiments.generic_ensembles import PLANTED, TASK, Scatter, ensemble
 from experiments.generic_ensembles import made as case_of
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
@@ -222,8 +222,6 @@ def test_missing_samples_are_bridged(alike):
 
 def test_rates_may_differ():
     """Simulated at ten times the rate: compared at the real one's."""
-    from experiments.generic_ensembles import Scatter
-
     rng = np.random.default_rng(6)
     real, first = ensemble(rng, 5)
     sim, second = ensemble(rng, 5, None, Scatter(rate=1000.0, noise=0.02 * np.sqrt(10)), "sim")

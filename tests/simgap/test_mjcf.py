@@ -9,6 +9,15 @@ from simgap.simulators.recording import Recording
 
 mujoco = pytest.importorskip("mujoco")
 
+from simgap.robot_effects import UNMEASURED, candidates, effects_of  # noqa: E402
+from simgap.robot_effects.base import Setting  # noqa: E402
+from simgap.simulators.mjcf.engine import rollout, warned  # noqa: E402
+from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
+from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
+from simgap.simulators.mjcf.patch import attribute_set, option_set  # noqa: E402
+from simgap.simulators.mjcf.runs import _carried_out, _commanded  # noqa: E402
+from simgap.simulators.mjcf.signals import Held  # noqa: E402
+
 XML = """<mujoco model="swing">
   <compiler angle="radian"/>
   <option timestep="0.001" integrator="RK4"/>
@@ -41,8 +50,6 @@ def files(tmp_path):
 
 
 def loaded(files, *candidates: str):
-    from simgap.simulators.mjcf.load import load_mjcf
-
     found = load_mjcf(*files(), candidates)
     t = np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.zeros(t.size)})
@@ -80,8 +87,6 @@ def test_what_is_set_is_taken_back(files):
 
 
 def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
-    from simgap.simulators.mjcf.signals import Held
-
     held = Held(np.array([0.0, 0.005, 0.01]), np.arange(0, 0.012, 0.002))
     np.testing.assert_allclose(held(np.array([1.0, 3.0, 0.0])), [1, 1, 2, 3, 3, 0])
     held = Held(np.array([0.0, 0.01, 0.02]), np.arange(0, 0.02, 0.005))  # a line is half a sample sooner
@@ -108,8 +113,6 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
     ],
 )
 def test_a_map_at_fault_is_said_in_a_line(files, described, line):
-    from simgap.simulators.mjcf.load import load_mjcf
-
     with pytest.raises(InputError, match=line):
         load_mjcf(*files(described=described))
 
@@ -133,8 +136,6 @@ def test_degrees_where_radians_are_declared_are_named(files, tmp_path):
 
 
 def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, tmp_path):
-    from simgap.simulators.mjcf.load import load_mjcf
-
     servo = '<position name="m" joint="pivot" kp="9" ctrlrange="-0.5 0.5" ctrllimited="true"/>'
     goals = MAP.replace('unit = "Nm"', 'unit = "rad"')
     found = load_mjcf(*files(XML.replace('<motor name="m" joint="pivot"/>', servo), goals))
@@ -157,10 +158,6 @@ def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, 
 
 def test_delayed_commands_step_when_they_are_carried_out(files):
     """The mean over each solver's step of what was commanded 12.3 ms before, by brute force."""
-    from simgap.robot_effects import effects_of
-    from simgap.simulators.mjcf.runs import _carried_out, _commanded
-    from simgap.simulators.mjcf.signals import Held
-
     found, log, effects = loaded(files)
     rng = np.random.default_rng(3)
     t = log.t + 1e-3 * rng.uniform(-1, 1, log.t.size)
@@ -182,15 +179,11 @@ def test_delayed_commands_step_when_they_are_carried_out(files):
 
 def test_a_mass_stays_within_what_a_robot_can_have(files):
     found, log, effects = loaded(files)
-    from simgap.robot_effects import effects_of
-
     mass = effects_of(found.simulator, [log], effects)["body:bob.mass"].parameters["mass"]
     assert (mass.low, mass.high) == pytest.approx((0.5 / 3, 1.5))
 
 
 def test_a_patch_touches_only_what_changes(files):
-    from simgap.simulators.mjcf.patch import attribute_set, option_set
-
     text = attribute_set(XML, "joint", "pivot", {"damping": "0.02"})
     assert text is not None
     changed = [(a, b) for a, b in zip(XML.splitlines(), text.splitlines(), strict=True) if a != b]
@@ -204,9 +197,6 @@ def test_a_patch_touches_only_what_changes(files):
 
 
 def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files):
-    from simgap.robot_effects import candidates
-    from simgap.robot_effects.base import Setting
-
     found, log, _ = loaded(files)
     made = candidates(Setting(found.simulator, [log]))
     assert {n for n, e in made.items() if e.fitted} == found.simulator.numerics
@@ -229,8 +219,6 @@ TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "serv
 
 def turning(files, described: str = TURN, more: str = ""):
     """The servo's simulator and a log in which its command swings."""
-    from simgap.simulators.mjcf.load import load_mjcf
-
     found = load_mjcf(*files(SERVO % more, described))
     t = np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t)})
@@ -255,8 +243,6 @@ def test_a_payload_is_a_point_mass_where_it_is_said_to_be(files, place, at):
 
 
 def test_a_payload_where_nothing_is_is_said(files):
-    from simgap.simulators.mjcf.load import load_mjcf
-
     with pytest.raises(InputError, match=r"payload_at.arm: the model has no site tol.*tool"):
         load_mjcf(*files(SERVO % "", 'payload_at = {arm = "tol"}\n' + TURN))
     with pytest.raises(InputError, match=r"payload_at.arm: .*name of a site"):
@@ -274,13 +260,9 @@ def test_no_play_is_the_plain_model_and_play_lags_at_turns(files):
 
 
 def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(files):
-    from simgap.robot_effects import UNMEASURED, effects_of
-
     found, log, more = loaded(files)
 
     def made(described: str):
-        from simgap.simulators.mjcf.load import load_mjcf
-
         again = load_mjcf(*files(described=described + MAP))
         more = again.effects([log])
         return effects_of(again.simulator, [log], more)
@@ -300,8 +282,6 @@ def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(
 
 
 def test_mujoco_s_warnings_are_counted_and_no_file_is_left(files, tmp_path, monkeypatch):
-    from simgap.simulators.mjcf.engine import warned
-
     monkeypatch.chdir(tmp_path)
     warned()
     found, log, _ = loaded(files)
@@ -311,3 +291,95 @@ def test_mujoco_s_warnings_are_counted_and_no_file_is_left(files, tmp_path, monk
     (line,) = warned()
     assert line.startswith("MuJoCo: ") and line.endswith(" times)") and warned() == []
     assert not list(tmp_path.glob("*.TXT"))
+
+
+STEPPED = """<mujoco><option timestep="{step}"/><worldbody><body name="arm"><joint name="j" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02"/></body></worldbody>
+<actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+COLUMNS = '[columns]\nq = {joint = "j"}\nu = {actuator = "m"}\n'
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        ("window = 0", "window.*seconds above 0"), ("window = -1", "window.*seconds above 0"),
+        ("window = 1e9", "window.*at most"), ('window = "long"', "window"), ("window = nan", "window"),
+        ("time = 3", "time"), ("time = []", "time"), ('time = {column = "t", unit = "parsec"}', "unit"),
+        ("keyframe = 3", "keyframe.*the name of a keyframe"), ('keyframe = "home"', "keyframe.*no home"),
+        ("windw = 1", "windw"),
+    ],
+)  # fmt: skip
+def test_a_map_that_says_what_cannot_be(line, wanted, tmp_path):
+    (tmp_path / "robot.xml").write_text(STEPPED.format(step="0.002"))
+    (tmp_path / "map.toml").write_text(f"{line}\n{COLUMNS}")
+    with pytest.raises(InputError, match=wanted):
+        load_mjcf(tmp_path / "robot.xml", tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize("step", ["0", "-0.001", "1e-12", "nan", "5"])
+def test_a_model_whose_time_step_is_none(step, tmp_path):
+    (tmp_path / "robot.xml").write_text(STEPPED.format(step=step))
+    (tmp_path / "map.toml").write_text(COLUMNS)
+    with pytest.raises(InputError, match=r"robot\.xml"):
+        load_mjcf(tmp_path / "robot.xml", tmp_path / "map.toml")
+
+
+INERTIA, REACH, MASS = 0.02, 0.1, 0.5
+ROTOR = INERTIA - MASS * REACH**2 - 1e-4
+LAWFUL = f"""<mujoco><option timestep="0.0005" integrator="implicitfast" gravity="0 0 -9.81"/>
+<worldbody><body><joint name="hinge" type="hinge" axis="0 -1 0" armature="{ROTOR}"/>
+<inertial pos="0 0 -{REACH}" mass="{MASS}" diaginertia="1e-4 1e-4 1e-4"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge" ctrllimited="true" ctrlrange="-2 2"/></actuator>
+<sensor><jointpos joint="hinge"/><jointvel joint="hinge"/></sensor></mujoco>"""
+
+
+def swung(gravity=True, angle=0.0, rate=0.0, torque=0.0, seconds=0.2, **laws):
+    """Angles and rates (steps,) of a pendulum with these laws, and its steps' times."""
+    model = mujoco.MjModel.from_xml_string(LAWFUL)
+    if not gravity:
+        model.opt.gravity[:] = 0.0
+    data, steps = mujoco.MjData(model), round(seconds / model.opt.timestep)
+    spec = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    first = np.zeros((1, mujoco.mj_stateSize(model, spec)))
+    first[0, 1:3] = angle, rate
+    control = np.full((1, steps, 1), torque)
+    names = {n: f"actuator:motor.{n}" if n == "fade" else f"joint:hinge.{n}" for n in laws}
+    mine = Laws.of(model, [(names[n], v) for n, v in laws.items()])
+    if mine:
+        found = run(model, data, mine, first, control)
+    else:
+        found = rollout.rollout(model, data, first, control, nstep=steps)[1]
+    return *found[0].T, np.arange(steps) * model.opt.timestep
+
+
+def test_friction_by_load_holds_at_rest_up_to_its_limit():
+    weight = MASS * 9.81 * REACH * np.sin(0.5)
+    held, _, _ = swung(
+        angle=0.5, load_friction=2.1
+    )  # half of that of the weight: 1.05 times as much as holds
+    assert np.abs(held - 0.5).max() < 3e-3  # MuJoCo's friction creeps, by 12 mrad/s here
+    _, rate, t = swung(angle=0.5, load_friction=1.5, seconds=0.02)
+    assert rate[-1] / t[-1] == pytest.approx(-(weight - 0.75 * weight) / INERTIA, rel=0.03)
+    # A motor that lifts loads the gears by its own torque and by the weight.
+    _, rate, t = swung(angle=0.5, torque=2 * weight, load_friction=0.5, seconds=0.02)
+    assert rate[-1] / t[-1] == pytest.approx((1.0 - 0.5 * 0.5 * 3) * weight / INERTIA, rel=0.03)
+
+
+def test_friction_by_direction_and_near_standstill_brakes_as_stated():
+    for way, torque in ((1.0, 0.05), (-1.0, 0.0)):  # 0.05 N m one way, and as nothing holds it back, none
+        _, rate, t = swung(gravity=False, rate=way, direction_friction=0.05)
+        assert rate[-1] == pytest.approx(way * (1 - torque / INERTIA * t[-1]), rel=0.01)
+    _, rate, t = swung(gravity=False, rate=0.5, stribeck_extra=0.02, stribeck_speed=0.4, seconds=0.05)
+    assert rate[-1] == pytest.approx(0.5 - 0.02 * np.exp(-((0.5 / 0.4) ** 2)) / INERTIA * t[-1], rel=0.01)
+
+
+def test_drag_and_a_drive_that_fades():
+    _, rate, t = swung(gravity=False, rate=5.0, quadratic_drag=0.01)
+    np.testing.assert_allclose(rate, 5 / (1 + 0.01 * 5 / INERTIA * t), rtol=1e-3)
+    _, rate, t = swung(gravity=False, torque=1.0, fade=0.3, seconds=0.05)  # half of the most: 15 % less
+    assert rate[-1] / t[-1] == pytest.approx(0.85 / INERTIA, rel=1e-3)
+
+
+def test_laws_that_do_nothing_run_as_the_plain_model():
+    plain, acting = (swung(angle=1.0, torque=0.1, **laws)[0] for laws in ({}, {"load_friction": 1e-12}))
+    np.testing.assert_allclose(acting, plain, atol=1e-12)

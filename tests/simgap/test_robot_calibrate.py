@@ -7,8 +7,14 @@ import pytest
 from simgap_swing import Swing, log
 
 from hmmseg.errors import InputError
+from hmmseg_cli.main import main
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import calibrate
+from simgap.robots.linear import linearise
+from simgap.robots.model import Composed
+from simgap.robots.rows import noises
+from simgap.robots.whiten import covariances
+from simgap.robots.windows import JUMPS
 from simgap.simulators.user import checked
 
 
@@ -81,8 +87,6 @@ MAP = '[columns.q]\njoint = "hinge"\n[columns.u]\nactuator = "servo"\nunit = "ra
 def test_the_command_patches_the_model_and_tells_how_commands_were_held(tmp_path):
     """A servo that followed lines between the targets that were logged, its gain other than stated."""
     mujoco = pytest.importorskip("mujoco")
-    from hmmseg_cli.main import main
-
     (tmp_path / "robot.xml").write_text(ROBOT)
     (tmp_path / "map.toml").write_text(MAP)
     model = mujoco.MjModel.from_xml_string(ROBOT.replace('kp="20"', 'kp="15"'))
@@ -117,11 +121,6 @@ def test_the_command_patches_the_model_and_tells_how_commands_were_held(tmp_path
 def test_a_command_that_jumps_between_two_samples_is_no_gap(tmp_path):
     """A drive that took its commands at 500 Hz, logged at 50 Hz: when a jump came is not in the log."""
     mujoco = pytest.importorskip("mujoco")
-    from simgap.robots.linear import linearise
-    from simgap.robots.model import Composed
-    from simgap.robots.rows import noises
-    from simgap.robots.whiten import covariances
-    from simgap.robots.windows import JUMPS
     from simgap.simulators.mjcf.load import load_mjcf
 
     (tmp_path / "robot.xml").write_text(ROBOT)

@@ -5,7 +5,12 @@ import pytest
 
 from simgap.robot_effects import readouts
 from simgap.robot_effects.base import Setting
-from simgap.robots.windows import FLIES, REGIMES, RESTS, STRIKES
+from simgap.robots.linear import base_at, linearise, wobbling
+from simgap.robots.model import Composed
+from simgap.robots.phases import phases_of
+from simgap.robots.rows import rows_of
+from simgap.robots.whiten import CONTACTS, LIES, Discrepancy, covariances
+from simgap.robots.windows import AT_REST, FLIES, REGIMES, RESTS, STRIKES, cut, resting
 from simgap.simulators.protocol import Channel, Parameter
 from simgap.simulators.recording import Recording
 
@@ -111,10 +116,6 @@ def dropped(tmp_path_factory):
 
 
 def test_flight_and_contact_are_told_apart(dropped):
-    from simgap.robots.phases import phases_of
-    from simgap.robots.rows import rows_of
-    from simgap.robots.windows import cut
-
     simulator, log = dropped
     times, what = simulator.contact_states(log)
     fall = np.sqrt(2 * 0.45 / 9.81)
@@ -134,10 +135,6 @@ def test_flight_and_contact_are_told_apart(dropped):
 
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     """Windows that admit that each impact differs by a usual size: their weight on the scale is small."""
-    from simgap.robots.linear import linearise, wobbling
-    from simgap.robots.model import Composed
-    from simgap.robots.whiten import CONTACTS, Discrepancy, covariances
-
     simulator, log = dropped
     every = readouts.candidates(Setting(simulator, [log]))
     (scale,) = [e for e in every if e.name == "readout.scale"]
@@ -157,8 +154,6 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
 
 
 def test_what_lies_still_rests_and_what_slows_down_does_not():
-    from simgap.robots.windows import AT_REST, resting
-
     t = np.arange(0, 1.0, 0.01)
     log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
     rests = resting(log, {"q": 1.0})
@@ -170,9 +165,6 @@ def test_what_lies_still_rests_and_what_slows_down_does_not():
 def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):
     """It begins 1.5 mm within the board, for it is read on a scale of 0.97, and has left it by the first
     sample."""
-    from simgap.robots.linear import base_at
-    from simgap.robots.model import Composed
-
     simulator, log = dropped
     composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     rows, base = composed.rows, base_at(composed, {})
@@ -186,10 +178,6 @@ def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):
 
 def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
     """By channel, alike at all samples of a window of rest, and in no other window."""
-    from simgap.robots.linear import linearise
-    from simgap.robots.model import Composed
-    from simgap.robots.whiten import LIES, covariances
-
     simulator, log = dropped
     composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     linear = linearise(composed, {}, [])

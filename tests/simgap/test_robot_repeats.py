@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from simgap.robot_effects import candidates
+from simgap.robot_effects.base import Setting
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed, motions
 from simgap.robots.sets import Sets
@@ -37,9 +39,6 @@ def composed(errors: np.ndarray, rng: np.random.Generator, paces=None) -> Compos
         bare = Recording(f"log{k}", T, {"pace": np.full(T.size, 1.0 if paces is None else paces[k])})
         y = simulator.simulate({"size": 1.0}, bare)["y"] + error + NOISE * rng.standard_normal(T.size)
         logs.append(bare.with_columns({"y": y}))
-    from simgap.robot_effects import candidates
-    from simgap.robot_effects.base import Setting
-
     effects = {n: e for n, e in candidates(Setting(simulator, logs)).items() if n == "size" or e.fitted}
     made = Composed.of(simulator, logs, effects, {"y": NOISE})
     return replace(made, motion=motions(made))

@@ -1,5 +1,7 @@
 """Evidence of sets in closed form against integrals, and what whitens rows against what it says it is."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -8,6 +10,7 @@ from scipy.integrate import quad
 from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.sets import Sets, cancelling, neighbours, pairs
+from simgap.robots.verdict import _absurd
 from simgap.robots.whiten import Block, Covariances, Discrepancy, Source
 
 NAMES = ("a", "b", "c")
@@ -114,12 +117,6 @@ def test_noise_leaves_the_floor():
 
 
 def test_a_value_at_a_bound_is_doubted_but_for_nothing_at_all():
-    from types import SimpleNamespace
-
-    from simgap.robot_effects.base import RobotEffect
-    from simgap.robots.verdict import _absurd
-    from simgap.simulators.protocol import Parameter
-
     known = {
         "rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
         "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)}),

@@ -1,5 +1,7 @@
 """A simulator read from a user's file, and every line that says what is wrong with one."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -164,8 +166,6 @@ def test_a_file_called_as_a_package_does_not_stand_in_for_it(tmp_path):
 
     (tmp_path / "scipy.py").write_text(GOOD)
     load_simulator(f"{tmp_path / 'scipy.py'}:Robot")
-    import sys
-
     assert sys.modules["scipy"] is scipy
 
 

@@ -1,7 +1,5 @@
 """An effect is one file: that of docs/your_effect.md is a candidate of hands, robots, ensembles and play."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -91,6 +91,30 @@ def checked_width(table: Table) -> Table:
     return table
 
 
+def rows_of(path: Path, kind: str) -> int | None:
+    """Rows of a file that can be read in pieces; None of any other."""
+    module = _module(kind, path)
+    return module.num_rows(path) if hasattr(module, "read_pieces") else None
+
+
+def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) -> Iterator[Table]:
+    """Tables of about `rows` rows each, in order, none of fewer than `least`; InputError as `read_table`."""
+    from hmmseg.io.table import appended
+
+    file, _ = split_part(path)
+    waiting: Table | None = None
+    with _parsing(path):
+        for piece in _module(kind_of(file), path).read_pieces(file, wanted, rows):
+            if waiting is not None and len(piece.rows) < least:
+                waiting = appended(waiting, piece)
+                continue
+            if waiting is not None:
+                yield waiting
+            waiting = piece
+    if waiting is not None:
+        yield waiting
+
+
 def parts_of(path: str | Path) -> list[str]:
     """Names of the recordings that a file holds; none where the file is one recording itself."""
     file, part = split_part(path)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,46 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         arrays = np.load(file, allow_pickle=False)
         columns = {name: arrays[name] for name in chosen}
     return plain_table(str(path), columns, [name for name in names if name not in chosen], wanted)
+
+
+def num_rows(path: Path) -> int | None:
+    """Rows of an archive's first array; None where it is none, or not to be read in pieces."""
+    if not zipfile.is_zipfile(path):
+        return None
+    with zipfile.ZipFile(path) as archive:
+        names = [i.filename for i in archive.infolist() if i.filename.endswith(".npy")]
+        if not names:
+            return None
+        with archive.open(names[0]) as member:
+            shape, fortran, dtype = _header(member)
+        return shape[0] if len(shape) == 1 and dtype.kind in "fiu" and not fortran else None
+
+
+def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
+    """Tables of at most `rows` rows each, in order: a long file in bounded memory, packed or not."""
+    with zipfile.ZipFile(path) as archive, ExitStack() as open_:
+        every = [i.filename.removesuffix(".npy") for i in archive.infolist() if i.filename.endswith(".npy")]
+        members, kinds, lengths = {}, {}, {}
+        for name in every:
+            if wanted is not None and name not in wanted:
+                continue
+            _claimed(path, archive, name)
+            members[name] = open_.enter_context(archive.open(f"{name}.npy"))
+            shape, _, kinds[name] = _header(members[name])
+            if len(shape) != 1:
+                raise InputError(f"{path}: column {name}", f"has {len(shape)} axes", "one number a row")
+            lengths[name] = shape[0]
+        if len(set(lengths.values())) > 1:
+            raise InputError(
+                str(path), f"has columns of {sorted(set(lengths.values()))} rows", "of one length"
+            )
+        for first in range(0, next(iter(lengths.values()), 0), rows):
+            count = min(rows, next(iter(lengths.values())) - first)
+            columns = {
+                name: np.frombuffer(member.read(count * kinds[name].itemsize), kinds[name])
+                for name, member in members.items()
+            }
+            yield Table(str(path), tuple(every), columns, np.arange(first + 1, first + count + 1))
 
 
 def _header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,24 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         columns = to_columns(file.read(columns=[name for name in names if is_wanted(name, wanted)]))
     rest = [name for name in names if not any(c == name or c.startswith(f"{name}[") for c in columns)]
     return plain_table(str(path), columns, rest, wanted)
+
+
+def num_rows(path: Path) -> int:
+    """Rows of a file."""
+    with pq.ParquetFile(path) as file:
+        return file.metadata.num_rows
+
+
+def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
+    """Tables of at most `rows` rows each, in order: a long file in bounded memory."""
+    with pq.ParquetFile(path, pre_buffer=False) as file:  # which would hold all of the file
+        names, first = file.schema_arrow.names, 1
+        chosen = [name for name in names if is_wanted(name, wanted)]  # by one thread: each has a memory
+        for batch in file.iter_batches(batch_size=rows, columns=chosen, use_threads=False):
+            columns = to_columns(pa.Table.from_batches([batch]))
+            numbers = np.arange(first, first + batch.num_rows)
+            first += batch.num_rows
+            yield Table(str(path), tuple(names), columns, numbers)
 
 
 def to_columns(table: pa.Table) -> dict[str, np.ndarray]:

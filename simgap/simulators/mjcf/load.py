@@ -329,7 +329,7 @@ SAME = math.log(2.0)  # limit: a servo that follows its goals at less or more th
 
 
 def _clipped(simulator: Any, log: Recording, file: str) -> list[str]:
-    """What to tell of commands that the model clips."""
+    """The warning about commands that the model clips."""
     model, out = simulator.model, []
     for column, a in simulator.driven.items():
         if model.actuator_ctrllimited[a]:

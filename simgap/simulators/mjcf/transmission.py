@@ -1,4 +1,4 @@
-"""What MuJoCo's models lack and the recorded motion tells: a drive that carries the arm's weight, gears that
+"""What MuJoCo's models lack and the recorded motion shows: a drive that carries the arm's weight, gears that
 give under load."""
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Motion:
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
-    """The motion along a log; joints that no column tells rest where the model has them."""
+    """The motion along a log; joints without a column rest where the model has them."""
     model = simulator.model
     position, rate, acceleration = {}, {}, {}
     for column, joint in simulator.joints.items():
