@@ -128,7 +128,7 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
     total, lags = -1.0, 1
     for lag in range(0, FARTHEST_LAG, 2):
         pair = rho(lag) + rho(lag + 1)
-        # A pair counts only where it stands out of its own sampling noise.
+        # A pair counts only where it exceeds its own sampling noise.
         if lag > 0 and pair <= 2 / np.sqrt(size):
             break
         total += 2 * pair

@@ -154,7 +154,7 @@ def calibrate(cases: Sequence[Case], pooled: int = POOLED, singles: int | None =
 
 
 def table() -> str | None:
-    """docs/tables/calibration.csv: coverages by kind of boundary and property, Laplace beside sampling."""
+    """docs/tables/calibration.csv: coverages by kind of boundary and property, by sampling and by Laplace."""
     found = load("calibration")
     if found is None:
         return None

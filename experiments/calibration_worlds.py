@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", nargs="*", default=list(WORLDS), metavar="NAME")
     parser.add_argument("--replicates", type=int, default=REPLICATES)
-    parser.add_argument("--fresh", action="store_true", help="score every row anew")
+    parser.add_argument("--fresh", action="store_true", help="score every row again")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     document: dict[str, Any] = {"first": FIRST, "rows": {}}

@@ -2,10 +2,10 @@
 
     python -m experiments.gap_drawn FOLDER --results DIR --run NAME [--cases CASE ...]
 
-FOLDER holds cases with labels.json beside them: those of another simulator, or those that
-`python -m experiments.blind_check open` draws anew. Diagnoses go to DIR/CASE.json, so that a run may be
+FOLDER holds cases with labels.json next to them: those of another simulator, or those that
+`python -m experiments.blind_check open` draws. Diagnoses go to DIR/CASE.json, so that a run may be
 stopped and started again, and the rows of this run stand under NAME in experiments/results/gap_labs.json,
-beside those of other code. Nothing is sealed: what is changed by what comes out is judged on other cases.
+next to those of other code. Nothing is sealed: what is changed by what comes out is judged on other cases.
 """
 
 from __future__ import annotations

@@ -49,9 +49,9 @@ class Page:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            told = json.loads(self._socket.recv(timeout=PATIENCE))
-            if told.get("id") == self._number:
-                return told.get("result", {})
+            reply = json.loads(self._socket.recv(timeout=PATIENCE))
+            if reply.get("id") == self._number:
+                return reply.get("result", {})
 
     def value(self, expression: str) -> Any:
         """What a JavaScript expression is."""
@@ -224,7 +224,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--gif", type=Path)
-    parser.add_argument("--effect", help="beside the nominal world")
+    parser.add_argument("--effect", help="that acts in a second world")
     given = parser.parse_args()
     arguments = ["--effect", given.effect] if given.effect else []
     with served(given.folder, *arguments) as address, browser(address) as page:

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 def commit_of(root: Path = ROOT) -> str | None:
     """The commit of a checkout, with a plus sign where its code was changed since; None outside of one.
 
-    Results and figures that were made anew since are no change of the code.
+    Results and figures that were made again since are no change of the code.
     """
 
     def git(*words: str) -> str:

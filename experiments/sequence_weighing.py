@@ -2,7 +2,7 @@
 
 By maximum likelihood of the true boundaries, whose density is the mixture over courses and choices that
 `hmmseg segment` answers with (hmmseg.sequence.courses.Weighing): first without labels, then, for how far
-boundaries lie off a change once labels have told by how much, of the other trials with one of them labelled.
+boundaries lie off a change once labels have shown by how much, of the other trials with one of them labelled.
 """
 
 from __future__ import annotations

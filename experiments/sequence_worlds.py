@@ -1,4 +1,4 @@
-"""Plain sequences drawn anew, of many kinds, with their true boundaries.
+"""Plain sequences of many kinds, drawn at random, with their true boundaries.
 
 What makes real ones hard is in them: coloured and heavy-tailed noise, drifts, transients after an event,
 states nearly alike, states with phases of their own that nobody named, something that settles after the

@@ -50,7 +50,7 @@ class Case:
 
 
 def drawn(first: int, count: int) -> list[Case]:
-    """Worlds drawn anew, of many kinds and of abrupt changes alone."""
+    """Fresh worlds, of many kinds and of abrupt changes alone."""
     cases = []
     for group, make in (("drawn", draw), ("abrupt", abrupt)):
         for seed in range(first, first + count):
@@ -114,8 +114,8 @@ def answers(case: Case) -> dict:
         b = world.task.sequence.index(question.subtask) - 1
         labels = {world.trials[i].name: {question.subtask: float(world.boundaries[i][b])}}
         model = fit_sequence(world.trials, world.task, labels)
-        told = segment_sequence(world.trials, world.task, model)
-        out["asked"] = score(case, told, without=i)
+        again = segment_sequence(world.trials, world.task, model)
+        out["asked"] = score(case, again, without=i)
         out["gain"] = question.gain
     labels = {world.trials[0].name: world.boundaries[0].tolist()}
     taught = segment_sequence(world.trials, world.task, fit_sequence(world.trials, world.task, labels))
@@ -127,7 +127,7 @@ def score(case: Case, found: list[Segmentation], without: int | None = None) -> 
     """Errors as shares of the trial, coverage, and what was said of the places; one entry a boundary.
 
     `place`: probability of the place given, and whether the truth is nearer to it than to any other (within
-    its 90 % interval's width of 2 % of the trial at least); `listed`: the truth is at some place told.
+    its 90 % interval's width of 2 % of the trial at least); `listed`: the truth is at one of these places.
     """
     rows = []
     for i, (segmentation, trial, truth) in enumerate(
@@ -141,13 +141,13 @@ def score(case: Case, found: list[Segmentation], without: int | None = None) -> 
             span = starts.get(case.world.task.sequence[b + 1])
             if span is None:
                 continue
-            told = [(p.time, p.probability) for p in span.alternatives] or [(span.start, 1.0)]
-            near = [abs(time - truth[b]) <= 0.03 * length for time, _ in told]
+            places = [(p.time, p.probability) for p in span.alternatives] or [(span.start, 1.0)]
+            near = [abs(time - truth[b]) <= 0.03 * length for time, _ in places]
             rows.append({
                 "error": (span.start - truth[b]) / length, "samples": (span.start - truth[b]) * trial.rate,
                 "in_90": bool(span.start_90[0] <= truth[b] <= span.start_90[1]),
                 "width": (span.start_90[1] - span.start_90[0]) / length,
-                "told": [[p, bool(n)] for (_, p), n in zip(told, near, strict=True)],
+                "places": [[p, bool(n)] for (_, p), n in zip(places, near, strict=True)],
             })  # fmt: skip
     return {"boundaries": rows}
 
@@ -158,20 +158,20 @@ def summary(scores: list[dict]) -> dict:
     if not rows:
         return {}
     error = np.abs([row["error"] for row in rows])
-    silent = [row for row in rows if len(row["told"]) == 1]
-    told = np.array([pair for row in rows for pair in row["told"]], dtype=float)
+    silent = [row for row in rows if len(row["places"]) == 1]
+    places = np.array([pair for row in rows for pair in row["places"]], dtype=float)
     reliability = []
     for low, high in pairwise(BINS):
-        inside = (told[:, 0] >= low) & (told[:, 0] < high)
+        inside = (places[:, 0] >= low) & (places[:, 0] < high)
         if inside.any():
-            said, true = told[inside].mean(0).tolist()
+            said, true = places[inside].mean(0).tolist()
             reliability.append({"said": said, "true": true, "count": int(inside.sum())})
     return {
         "boundaries": len(rows), "median": float(np.median(error)), "right": float((error <= 0.03).mean()),
         "within_a_sample": float(np.mean([abs(row["samples"]) <= 1 for row in rows])),
         "coverage_90": float(np.mean([row["in_90"] for row in rows])),
         "width": float(np.median([row["width"] for row in rows])),
-        "listed": float(np.mean([any(n for _, n in row["told"]) for row in rows])),
+        "listed": float(np.mean([any(n for _, n in row["places"]) for row in rows])),
         "sure": len(silent) / len(rows),
         "sure_right": float(np.mean([abs(row["error"]) <= 0.03 for row in silent])) if silent else None,
         "reliability": reliability,

@@ -38,10 +38,10 @@ def check() -> str | None:
     found = load("robots_check")
     if found is None:
         return None
-    told: dict[str, Any] = {**found, **found["named_right_by_kind"]}
+    shares: dict[str, Any] = {**found, **found["named_right_by_kind"]}
     rows = []
     for key, (label, goal) in GOALS.items():
-        one = told[key]
+        one = shares[key]
         if not one["of"]:
             continue
         low, high = (100 * v for v in one["interval_90"])

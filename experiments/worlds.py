@@ -151,7 +151,7 @@ def replicates(world: World, numbers: Sequence[int]) -> Iterator[Replicate]:
     for number in numbers:
         mine = [next(done) for _ in range(world.trials)]
         trials = [_recorded(world, s, task, sensors, number) for s in mine]
-        yield Replicate(task, _told(world, sensors), trials, [s.boundaries for s in mine],
+        yield Replicate(task, _stated(world, sensors), trials, [s.boundaries for s in mine],
                         dict(mine[0].blocks))  # fmt: skip
 
 
@@ -159,7 +159,7 @@ def trials_of(world: World, numbers: Sequence[int]) -> list[Judged]:
     """Single trials of a world by their numbers, which seed their operators too."""
     task, sensors = task_of(world.blocks), sensors_of(world)
     return [
-        Judged(_recorded(world, s, task, sensors, number), _told(world, sensors), s.boundaries)
+        Judged(_recorded(world, s, task, sensors, number), _stated(world, sensors), s.boundaries)
         for number, s in zip(numbers, _happens(world, numbers, numbers), strict=True)
     ]
 
@@ -223,15 +223,15 @@ def _coloured(noisy: Trial, clean: Trial, rho: float) -> Trial:
     return replace(noisy, channels=channels)
 
 
-def _told(world: World, sensors: Rig) -> Rig:
-    """What the estimator is told of the hand."""
+def _stated(world: World, sensors: Rig) -> Rig:
+    """The rig as the estimator gets it."""
     noise = {name: sd * world.stated for name, sd in sensors.noise.model_dump(exclude_none=True).items()}
-    told = sensors.model_copy(update={"noise": Noise(**noise)})
+    stated = sensors.model_copy(update={"noise": Noise(**noise)})
     if world.bias:
-        told = told.model_copy(update={"systematic": Systematic(force_bias=(BIAS,) * 4)})
+        stated = stated.model_copy(update={"systematic": Systematic(force_bias=(BIAS,) * 4)})
     if world.doubted:
-        told = told.model_copy(update={"systematic": Systematic(pad_stiffness=(PADS, PADS))})
-    return told.model_copy(update={"systematic": HAND}) if world.deviating else told
+        stated = stated.model_copy(update={"systematic": Systematic(pad_stiffness=(PADS, PADS))})
+    return stated.model_copy(update={"systematic": HAND}) if world.deviating else stated
 
 
 def disturbed(trial: Trial, boundaries: np.ndarray, cell: Cell, number: int) -> Trial:

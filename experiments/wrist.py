@@ -3,7 +3,7 @@
     python -m experiments.wrist [FOLDER with wrist_restack_1 and wrist_untared]
 
 Each case: four trials of the arm, or two of a setup of `experiments.wrist_scene`, segmented and identified
-together. Boundary errors beside their 90 % intervals, properties beside their 95 % ones.
+together. Boundary errors with their 90 % intervals, properties with their 95 % ones.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ SETUPS: dict[str, tuple[Setup, dict]] = {
 
 
 def score(recordings: Sequence, rig: Rig, task: BlockTask, truths: Sequence, blocks: dict) -> dict:
-    """One case: what is found of recordings beside boundaries [s] and blocks that are known."""
+    """One case: what is found in recordings against known boundaries [s] and blocks."""
     try:
         aligned = align([read_trial(each, rig) for each in recordings], task, rig)
         found = identify_aligned(aligned)
@@ -177,7 +177,7 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path, nargs="?", default=ARM)
     parser.add_argument("--seeds", type=int, default=2, help="performances of each setup")
-    parser.add_argument("--only", help="setups whose name holds this, told and not saved")
+    parser.add_argument("--only", help="setups whose name holds this, printed and not saved")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     document: dict = {"arm": {}, "synthetic": {}, "seeds": given.seeds}

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hmmseg.segmentation.spans import Segmentation
 
 WorkersOption = Annotated[int | None, typer.Option(
-    "--workers", metavar="N", min=1, help="Fit each recording by itself, in so many processes.")]  # fmt: skip
+    "--workers", metavar="N", min=1, help="Fit each recording by itself, in N processes.")]  # fmt: skip
 SchedulerOption = Annotated[str | None, typer.Option(
     "--scheduler", metavar="ADDRESS",
     help="The same on a Dask cluster, as tcp://host:8786; local: one of this machine.")]  # fmt: skip

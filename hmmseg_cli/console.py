@@ -44,14 +44,14 @@ TaskBeside = Annotated[Path | None, typer.Option(
 RigBeside = Annotated[Path | None, typer.Option(
     "--rig", metavar="R", help="Nominal hand (TOML); rig.toml next to the trials by default.")]  # fmt: skip
 ActualOption = Annotated[Path | None, typer.Option(
-    "--actual", metavar="A", help="Properties measured apart from the trials (TOML).")]  # fmt: skip
+    "--actual", metavar="A", help="Properties measured independently of the trials (TOML).")]  # fmt: skip
 JsonOption = Annotated[str | None, typer.Option(
     "--json", metavar="FILE", help="Write the result as JSON; - is standard output.")]  # fmt: skip
 FiguresOption = Annotated[Path | None, typer.Option(
     "--figures", metavar="DIR", help="Draw the figures into this folder.")]  # fmt: skip
 ReportOption = Annotated[Path | None, typer.Option(
     "--report", metavar="FILE.html", help="Write one self-contained page.")]  # fmt: skip
-SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")]
+SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all random draws.")]
 UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, min=0)]  # taken, where nothing is random
 QuietOption = Annotated[bool, typer.Option(
     "--quiet", help="Print nothing but errors; warnings are in the JSON.")]  # fmt: skip

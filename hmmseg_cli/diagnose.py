@@ -55,11 +55,11 @@ hmmseg diagnose trial_*.csv --against simulated/trial_*.csv"""
 
 ActualOption = Annotated[Path | None, typer.Option(
     "--actual", metavar="A", rich_help_panel=BLOCKS,
-    help="Properties measured apart from the trials (TOML).")]  # fmt: skip
+    help="Properties measured independently of the trials (TOML).")]  # fmt: skip
 HealthyOption = Annotated[list[Path] | None, typer.Option(
     "--healthy", metavar="TRIAL...",
-    help="Recordings known to be healthy, the best null there is; healthy twins are simulated otherwise. "
-    "With a model of a robot: its logs of before; what changed since is sought.",
+    help="Recordings known to be healthy, the best null; by default healthy twins are simulated. "
+    "With a model of a robot: its earlier logs, to find what changed.",
 )]  # fmt: skip
 AgainstOption = Annotated[list[Path] | None, typer.Option(
     "--against", metavar="SIM...", rich_help_panel=GIVEN,
@@ -68,7 +68,7 @@ ModelFile = Annotated[Path | None, typer.Option(
     "--model", metavar="M", rich_help_panel=GIVEN,
     help="Emissions (.npz) of a plain ordered task, by hmmseg fit; or as --mjcf.")]  # fmt: skip
 EffectOption = Annotated[list[str] | None, typer.Option(
-    "--effect", metavar="NAME", help="Take this effect instead of choosing; several act together."
+    "--effect", metavar="NAME", help="The cause, instead of choosing one; repeated, they act together."
 )]  # fmt: skip
 LISTS = ("--against", "--healthy")  # options that take several files
 

@@ -49,12 +49,12 @@ MapOption = Annotated[
 ]  # fmt: skip
 CandidateOption = Annotated[
     list[str] | None,
-    _option("--candidate", "NAME", "Offer one more thing the MJCF model can set as a cause, such as "
+    _option("--candidate", "NAME", "Add a parameter of the MJCF model to the candidates, such as "
             "joint:elbow.frictionloss."),
 ]  # fmt: skip
 HistoryOption = Annotated[
     Path | None,
-    _option("--history", "FILE.jsonl", "Keep this run's intervals in that file, and say what moved since."),
+    _option("--history", "FILE.jsonl", "Add this run's intervals to that file, and say what has moved."),
 ]
 RerunOption = Annotated[
     Path | None, _option("--rerun", "FILE.rrd", "Recorded, simulated and corrected, for Rerun's viewer.")

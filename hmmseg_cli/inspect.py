@@ -28,7 +28,7 @@ def inspect(
     files: FilesArgument, rig: RigFile = None, write: WriteOption = None, json: JsonOption = None,
     seed: UnusedSeed = 0, quiet: QuietOption = False,
 ) -> None:  # fmt: skip
-    """What is in a recording, and the [columns] or [topics] that would read it."""
+    """What a recording contains, and the [columns] or [topics] that would read it."""
     from hmmseg.hand.inspect import inspect as look
 
     with Output("inspect", json=json, seed=seed, quiet=quiet) as out:

@@ -44,7 +44,7 @@ COLLECTED = 10_000
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
-# Plain help: markup would swallow what stands in square brackets.
+# Plain help: markup would swallow text in square brackets.
 app = typer.Typer(cls=Hmmseg, rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
 
 # In the order of `hmmseg --help`, each with an example. Modules import what is heavy (jax, matplotlib,

@@ -24,7 +24,7 @@ BlocksFile = Annotated[Path | None, typer.Option(
 EffectOption = Annotated[list[str] | None, typer.Option(
     "--effect", metavar="NAME", help="Switched on in addition to the nominal world.")]  # fmt: skip
 FolderOption = Annotated[Path, typer.Option("--output", metavar="DIR", help="Where trials are saved.")]
-PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of this machine; 0: any free.")]
+PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any free.")]
 OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
 
 

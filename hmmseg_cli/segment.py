@@ -62,7 +62,7 @@ def segment(
     """Segment recordings into the task's subtasks, with the uncertainty of every boundary.
 
     With --workers or --scheduler each recording is fitted by itself, not pooled with the others, and a folder
-    stands for the recordings in it.
+    means all recordings in it.
     """
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
         apart = workers is not None or scheduler is not None

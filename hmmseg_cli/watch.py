@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json as jsonlib
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from hmmseg_cli.rows import Rows
 
 LagOption = Annotated[float, typer.Option(
-    "--lag", metavar="S", min=0.0, help="How long a boundary is waited for [s].")]  # fmt: skip
+    "--lag", metavar="S", min=0.0, help="How long to wait before a boundary is settled [s].")]  # fmt: skip
 PlotOption = Annotated[bool, typer.Option(
     "--plot", help="Show it live in the terminal (standard error).")]  # fmt: skip
 SkipOption = Annotated[bool, typer.Option(
@@ -62,13 +63,11 @@ def watch(
                 out.warn(f"{watcher.counts[key]} {text}")
         envelope = {"format": "hmmseg.watch/1", "version": hmmseg.__version__, "seed": seed,
                     "warnings": out.warnings, "figures": [], "counts": dict(watcher.counts)}  # fmt: skip
-        line = final.line(envelope)
+        document = final.to_json() | envelope
         if write is not None:
-            write(line + "\n")
+            write(jsonlib.dumps(document, separators=(",", ":")) + "\n")
         if destination is not None or out.lost:
-            import json as jsonlib
-
-            out.finish(jsonlib.loads(line))
+            out.finish(document)
 
 
 def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out: Output) -> None:

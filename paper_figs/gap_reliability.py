@@ -1,4 +1,4 @@
-"""How often what the blind check was told comes true, by the probability it was given."""
+"""How often a statement of the blind check comes true, by the probability it was given."""
 
 from __future__ import annotations
 

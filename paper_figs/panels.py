@@ -66,15 +66,15 @@ def only(values: Sequence[float], chosen: Sequence[int]) -> np.ndarray:
 
 
 def forces(
-    figure: Figure, one: Mapping[str, Sequence[float]], beside: Mapping[str, Sequence[float]] | None = None
+    figure: Figure, one: Mapping[str, Sequence[float]], behind: Mapping[str, Sequence[float]] | None = None
 ) -> list[Axes]:
-    """The four panels of the paper's Figures 6 and 12; `beside` is drawn in grey behind."""
+    """The four panels of the paper's Figures 6 and 12; `behind` is drawn in grey."""
     labels = {"fx": "Net $f_x$ [N]", "fy": "Net $f_y$ [N]", "grip": "Grip [N]", "shear": "Shear [N]"}
     axes = stacked(figure, len(labels))
     for ax, (name, label) in zip(axes, labels.items(), strict=True):
         thresholds(ax)
-        if beside is not None:
-            ax.plot(beside["t"], beside[name], color=GREY, lw=0.7)
+        if behind is not None:
+            ax.plot(behind["t"], behind[name], color=GREY, lw=0.7)
         ax.plot(one["t"], one[name], color=INK, lw=0.9)
         ax.set_ylabel(label)
         low, high = ax.get_ylim()

@@ -266,7 +266,7 @@ def corner() -> None:
                 contour_kwargs={"linewidths": 0.9},
             )
         axes = np.array(figure.axes).reshape(len(names), len(names))
-        for ax in axes[1:, 0]:  # labels near a corner would meet those of the panel beside
+        for ax in axes[1:, 0]:  # labels near a corner would meet those of the next panel
             low, high = ax.get_ylim()
             ticks = [tick for tick in ax.get_yticks() if low < tick < high]
             inner = [0.1 < (tick - low) / (high - low) < 0.9 for tick in ticks]

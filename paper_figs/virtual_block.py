@@ -65,7 +65,7 @@ def fig12() -> None:
 
 
 def fig13() -> None:
-    """Figure 13: the virtual block's weight, beside the recording's block 2."""
+    """Figure 13: the virtual block's weight, and that of the recording's block 2."""
     found = load("virtual_block")
     virtual = found["virtual"]
     held = np.any([carry["inside"] for carry in virtual["carries"]], axis=0)
@@ -162,16 +162,16 @@ def replay() -> None:
         axes[3].set_xlabel("Time [s]")
         axes[3].set_xlim(t[0], t[-1])
         figure.align_ylabels(axes)
-        beside = figure.add_subplot(grid[:, 1])
+        right = figure.add_subplot(grid[:, 1])
         for k, (state, (label, colour)) in enumerate(JUDGED.items()):
             rms = [trial[state] for trial in found["trials"]]
             place = k + np.linspace(-0.22, 0.22, len(rms))
-            beside.plot(place, rms, "o", color=colour, mec=INK, mew=0.4, ms=4.5, label=label)
-        beside.axhline(found["limit"], color=RED, lw=0.9, ls="--")
-        beside.text(-0.45, found["limit"] + 0.015, "limit", color=RED, fontsize=7)
-        beside.axhline(1, color=GREY, lw=0.6)
-        beside.set_xticks(range(2), ["free\nmotion", "carry"])
-        beside.set_xlim(-0.5, 1.5)
-        beside.set_ylim(0, 1.75)
-        beside.set_ylabel("Net force residual, rms / noise sd")
+            right.plot(place, rms, "o", color=colour, mec=INK, mew=0.4, ms=4.5, label=label)
+        right.axhline(found["limit"], color=RED, lw=0.9, ls="--")
+        right.text(-0.45, found["limit"] + 0.015, "limit", color=RED, fontsize=7)
+        right.axhline(1, color=GREY, lw=0.6)
+        right.set_xticks(range(2), ["free\nmotion", "carry"])
+        right.set_xlim(-0.5, 1.5)
+        right.set_ylim(0, 1.75)
+        right.set_ylabel("Net force residual, rms / noise sd")
         figure.legend(handles=[*lines, *state_handles()], loc="outside lower center", ncols=5)

@@ -81,11 +81,11 @@ def table() -> str | None:
         )
         for command, stages in found["stages"].items()
     ]
-    told = "; ".join(
+    note = "; ".join(
         f"`hmmseg {name}` {v['warm']:.1f} s warm, {v['first']:.0f} s the first time ever"
         for name, v in found["commands"].items()
     )
-    return "\n\n".join([*tables, f"Whole commands, processor: {told}."])
+    return "\n\n".join([*tables, f"Whole commands, processor: {note}."])
 
 
 def main() -> None:

@@ -3,12 +3,12 @@
     python -m experiments.benchmarks.haptic_loop [--seconds 60] [--realtime] [--output FILE.json]
 
 Rate: two blocks picked and stacked over and over at 4 kHz, every step timed on one core, memory
-watched, beside loops at the same pace that do nothing, or arithmetic for as long as a step takes: how
+watched, compared with loops at the same pace that do nothing, or arithmetic for as long as a step takes: how
 late those are, the machine is. With
 `--realtime` it runs as a haptic loop would: paced by the clock, before all other
 processes; without, as fast as it can. Passivity: a light device, squeezed onto a block by a
 spring, feels forces that are held for a period and one sample old; port energy and remaining
-motion over a range of pad stiffness, at 1 and 4 kHz, without and with passivity control, beside
+motion over a range of pad stiffness, at 1 and 4 kHz, without and with passivity control, against
 the sampled-data limit.
 """
 
@@ -175,7 +175,7 @@ def measure_passivity() -> list[dict[str, float | bool]]:
 
 
 def table() -> str | None:
-    """docs/virtual_model.md: the haptic loop beside one that does nothing."""
+    """docs/virtual_model.md: the haptic loop and one that does nothing."""
     found = load("haptic_loop")
     if found is None:
         return None
@@ -187,11 +187,11 @@ def table() -> str | None:
          f"{rate['spinning_loop_worst_us'] / 1e3:.2f} ms", f"{rate['spinning_loop_late']}"],
         ["empty", "", "", f"{rate['empty_loop_worst_us'] / 1e3:.2f} ms", f"{rate['empty_loop_late']}"],
     ]  # fmt: skip
-    told = (
+    note = (
         f"Programs compiled in the loop: {rate['programs_compiled_in_the_loop']}; bytes grown in 10,000 "
         f"steps: {rate['grown_bytes_in_10000_steps']} (the interpreter's own)."
     )
-    return markdown(["loop", "median", "99.9 %", "worst", "late"], rows) + f"\n\n{told}"
+    return markdown(["loop", "median", "99.9 %", "worst", "late"], rows) + f"\n\n{note}"
 
 
 def main() -> None:

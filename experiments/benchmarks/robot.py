@@ -2,7 +2,7 @@
 
     python -m experiments.benchmarks.robot MODELS [--seconds S]
 
-MODELS as in experiments.robots_check. Two faults are planted; all candidates are asked. Writes
+MODELS as in experiments.robots_check. Two faults are planted; all candidates are considered. Writes
 experiments/results/benchmark_robot.json: time and processor time of the whole command.
 """
 

@@ -1,4 +1,4 @@
-"""Following a task while it runs: time a row, accuracy against lag beside off line, agreement, false alarms.
+"""Following a task while it runs: time a row, accuracy against lag and off line, agreement, false alarms.
 
     python -m experiments.benchmarks.watch FOLDER...
 
@@ -197,7 +197,7 @@ def main() -> None:
 
 
 def draw(by_lag: dict) -> None:
-    """Error of settled boundaries against the lag, beside the segmentation of the whole recording."""
+    """Error of settled boundaries against the lag, and that of the whole recording."""
     from hmmseg.plot.style import canvas
 
     lags = [lag for lag in LAGS if str(lag) in by_lag]

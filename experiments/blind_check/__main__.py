@@ -6,7 +6,7 @@
     python -m experiments.blind_check score --sealed DIR --results RESULTS [--json FILE]
 
 generate prints the seal's hash; diagnose reads user folders only and may be stopped and started again;
-open writes cases with their answers beside them, as other folders of recordings have them; score opens the
+open writes cases with their answers next to them, as other folders of recordings have them; score opens the
 seal, checks the hash and writes all figures. docs/blind_check.md has the protocol.
 """
 

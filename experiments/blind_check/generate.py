@@ -1,7 +1,7 @@
 """Write a set, sealed or open.
 
 Sealed (`generate`): user folders under cases/, what was done under sealed/, its hash for all to see. Open
-(`write_open`): folders of recordings with their answers beside the trials, for scripts that judge those.
+(`write_open`): folders of recordings with their answers next to the trials, for scripts that judge those.
 Whoever changes code by such a folder draws another one to judge the change.
 """
 

@@ -165,8 +165,8 @@ def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
     """Probability that each effect acts, and whether it does; of outside cases nothing is known."""
     if entry["tier"] in ("outside", "withheld"):
         return []
-    told = found.get("attribution") or {}
-    return [(float(a["probability"]), name in entry["effects"]) for name, a in told.items()]
+    acting = found.get("attribution") or {}
+    return [(float(a["probability"]), name in entry["effects"]) for name, a in acting.items()]
 
 
 def _covered(entry: dict, found: dict) -> dict[str, bool]:

@@ -1,6 +1,6 @@
 """A person's paths for any task of blocks, as knots that motions of some profile join.
 
-Every length, duration and force is drawn anew for each trial; profile and servo are the lab's.
+Every length, duration and force is drawn for each trial; profile and servo are the lab's.
 """
 
 from __future__ import annotations

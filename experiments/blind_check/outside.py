@@ -77,7 +77,7 @@ def kinked(v: Values) -> Stage:
 
 
 def posed(v: Values) -> Stage:
-    """Strain gauges beside the joint: a finger's gain depends on its outer link's angle."""
+    """Strain gauges next to the joint: a finger's gain depends on its outer link's angle."""
 
     def stage(s: Signals, rng: Rng) -> Signals:
         assert s.q is not None
@@ -215,7 +215,7 @@ def tied(v: Values) -> Stage:
 
 
 def snagging(v: Values) -> Stage:
-    """A cable that catches on the bench, is stretched by one finger's way, springs free and catches anew."""
+    """A cable that catches on the bench, is stretched by one finger's way, springs free and catches again."""
 
     def shift(s: Signals, rng: Rng) -> np.ndarray:
         finger, out = int(v["finger"]), np.zeros_like(s.force)

@@ -90,7 +90,7 @@ def by_posterior(found: Identification) -> dict:
 
 
 def posterior(found: Identification) -> dict:
-    """Draws for a corner plot, priors of the log properties beside them."""
+    """Draws for a corner plot, with the priors of the log properties."""
     chosen = np.linspace(0, len(found.draws) - 1, DRAWS).astype(int)
     mean, sd = property_priors(found.names)
     return {"names": [list(name) for name in found.names], "draws": found.draws[chosen],

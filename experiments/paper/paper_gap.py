@@ -29,7 +29,7 @@ def rigid(rig: Rig, shear: bool = False) -> Rig:
 
 
 def entry(found: Diagnosis, case: Case) -> dict[str, Any]:
-    """Verdict, parameters, shrinkage, and every property before and after beside the true and printed one."""
+    """Verdict, parameters, shrinkage, every property before and after, with the true and the printed one."""
     body = found.body
     best = "+".join(body["causes"]) if body["causes"] else next(iter(body["effects"]))
     shifts = {}

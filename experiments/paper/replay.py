@@ -21,7 +21,7 @@ LIMIT = 1.5  # times the sensors' noise, in free motion and carry
 
 
 def calibrated(found: Identification) -> Blocks:
-    """Blocks of the virtual model from posterior means; friction only where slip told it."""
+    """Blocks of the virtual model from posterior means; friction only where slip shows it."""
     return {name: Block(**{key: float(found.of(name, key).mean()) for key in UNITS})
             for name in found.task.objects}  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Figures 11 to 14: the calibrated virtual block 2 picked up and placed twice, beside the recording.
+"""Figures 11 to 14: the calibrated virtual block 2 picked up and placed twice, and the recording.
 
 python -m experiments.paper.virtual_block
 """
@@ -42,7 +42,7 @@ def shown(signals: Signals, found: Segmentation) -> dict:
 
 
 def main() -> None:
-    """Save the virtual trial, the recording beside it and a few frames of the scene."""
+    """Save the virtual trial, the recording and a few frames of the scene."""
     case = recorded()
     blocks = calibrated(identified(case))
     simulated = simulate_trial(TWICE, case.rig, {"block2": blocks["block2"]}, SEED)

@@ -1,4 +1,4 @@
-"""Whole logs of a servo run freely, of a gain or mass that took no part: the servo's model beside BAM's M6.
+"""Whole logs of a servo run freely, of a gain or mass that took no part: the servo's model against BAM's M6.
 
     python -m experiments.real.bam FOLDER [--output FILE.json]
 

@@ -1,4 +1,4 @@
-"""A real servo's logs against a simulator of it: what the diagnosis says, as the docs tell it.
+"""A real servo's logs against a simulator of it: what the diagnosis says, as in the docs.
 
     python -m experiments.real.robot_gap FOLDER [--output FILE.json] [--figures DIR]
 
@@ -43,12 +43,12 @@ KEPT = (
 
 
 def summary(found: RobotDiagnosis) -> dict:
-    """What the docs tell of a diagnosis."""
-    told = body(found)
-    likely = sorted(told["probabilities"].items(), key=lambda item: -item[1])[:8]
-    out: dict[str, Any] = {k: told[k] for k in KEPT} | {
+    """What the docs say of a diagnosis."""
+    document = body(found)
+    likely = sorted(document["probabilities"].items(), key=lambda item: -item[1])[:8]
+    out: dict[str, Any] = {k: document[k] for k in KEPT} | {
         "probabilities": dict(likely),
-        "remainder": {n: told["remainder"][n] for n in ("share", "rms_over_noise")},
+        "remainder": {n: document["remainder"][n] for n in ("share", "rms_over_noise")},
     }
     if found.shrinkage is not None:
         rows, far = found.composed.rows, found.shrinkage

@@ -9,13 +9,13 @@ repeats against first ones; motions against other motions), mass, length, gain, 
 samples that no servo can have made are in many logs; `spurious` cases, of which nothing changed, are given
 PLANTED more, which must be found and be no cause. --part takes one half of the configurations, split by the
 seed, so that what is developed on one can be judged on the other; `mixed` are changes from one half to the
-other. A CSV of all cases stands beside the output.
+other.
 
-What can be told from what, from the equations: at rest and in slow motion gravity gives m l alone. In fast
+What can be distinguished, from the equations: at rest and in slow motion gravity gives m l alone. In fast
 motion the inertia m l^2 + J adds to it, J the rotor's. Say that m l grew r times. By the mass, m l^2 grew r
 times; by the length, r^2 times. The two differ by m l^2 (r^2 - r) of J + m l^2 r; where that is less than
 TOLD, as J itself is known no better, mass and length are a set by right. The gain acts on the duty that is
-recorded for the same error, as nothing else does, so it is told alone.
+recorded for the same error, as nothing else does, so it is identified alone.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from simgap.robots.unchanged import Old, without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
-TOLD = 0.1  # chosen: share of the inertia; that of the rotor is told to some 5 %
+TOLD = 0.1  # chosen: share of the inertia; that of the rotor is known to some 5 %
 ROTOR = 0.0275  # cited: kg m^2; fits of this servo by Rhoban/bam's users, 0.027 to 0.028
 SIGN = 10.24  # data sheet: the load register's direction stands in bit 10, in units of a hundredth
 SPURIOUS = -3.14  # rad; what the bench's reader gives where it fails

@@ -101,12 +101,12 @@ def main() -> None:
             print({n: rounded(p["mean"], 3) for n, p in body["parameters"].items()})
         if given.diagnose:
             begun = time.process_time()
-            told = diagnose(loaded.simulator, logs, more=more)
-            v = told.verdict
+            diagnosed = diagnose(loaded.simulator, logs, more=more)
+            v = diagnosed.verdict
             out["diagnosis"] = {
                 "verdict": v.verdict, "causes": v.causes, "indistinguishable": v.indistinguishable,
                 "explanation": v.explanation, "rms_over_noise": v.over_noise, "doubts": v.doubts,
-                "heldout": None if told.shrinkage is None else told.shrinkage.fraction,
+                "heldout": None if diagnosed.shrinkage is None else diagnosed.shrinkage.fraction,
                 "processor": time.process_time() - begun,
             }  # fmt: skip
             print(out["diagnosis"])

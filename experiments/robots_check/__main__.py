@@ -5,7 +5,7 @@
     python -m experiments.robots_check MODELS --score DIR                      # writes experiments/results
 
 MODELS is a folder of unzipped wheels (`make robots-models` fetches them). Every case: a package's model with
-masses and damping drawn anew; logs of the same robot at a third of the step by another integrator, with
+masses and damping drawn at random; logs of the same robot at a third of the step by another integrator, with
 its faults; the diagnosis sees the model and the logs alone. Kinds take turns: healthy, one fault, two, four,
 none that is known.
 """
@@ -67,13 +67,13 @@ def case(number: int, seed: int, models: Path, turns: Sequence[str] = TURNS) -> 
         more = loaded.effects(logs)
         found = body(diagnose(loaded.simulator, logs, more=more, length=loaded.map.length))
     kept = ("verdict", "causes", "indistinguishable", "probabilities", "effects", "shrinkage", "detection")
-    told = {k: found[k] for k in kept} | {"remainder": found["remainder"]["share"]}
+    brief = {k: found[k] for k in kept} | {"remainder": found["remainder"]["share"]}
     return {
         "case": number,
         "robot": robot.name,
         "kind": kind,
         "faults": [vars(f) | {"nats": n} for f, n in zip(faults, seen.tolist(), strict=True)],
-        "found": told,
+        "found": brief,
         "seconds": time.process_time() - began,
     }
 
@@ -96,10 +96,8 @@ def main() -> None:
             if not path.exists():
                 found = case(number, given.seed, given.models, given.robots)
                 path.write_text(json.dumps(found, indent=1), encoding="utf-8")
-                told = found["found"]
-                print(
-                    number, found["robot"], [f["kind"] for f in found["faults"]], told["verdict"], flush=True
-                )
+                verdict = found["found"]["verdict"]
+                print(number, found["robot"], [f["kind"] for f in found["faults"]], verdict, flush=True)
     if given.score is not None:
         every = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(given.score.rglob("*.json"))]
         save(given.output, scored(every))

@@ -1,6 +1,6 @@
 """The faults that worlds have: how each is planted, how large it usually is, and what names it rightly.
 
-`outside` ones are of no candidate's family: the right answers are `unknown`, or a remainder that is told.
+`outside` ones are of no candidate's family: the right answers are `unknown`, or a remainder that is reported.
 """
 
 from __future__ import annotations

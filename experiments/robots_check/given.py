@@ -33,14 +33,14 @@ def diagnosed(case: Path) -> dict[str, Any]:
 
 
 def right(found: dict[str, Any], truth: list[list[str]]) -> bool:
-    """Whether each true cause is told, or in the set, and nothing else is named."""
+    """Whether each true cause is named, or in the set, and nothing else is named."""
     if not truth:
         return found["verdict"] == "none"
     if truth == [["unknown"]]:
         return found["verdict"] == "unknown"
-    told = {*found["causes"], *found["indistinguishable"]}
+    named = {*found["causes"], *found["indistinguishable"]}
     allowed = {name for each in truth for name in each}
-    met = all(told & {*each} for each in truth)
+    met = all(named & {*each} for each in truth)
     return found["verdict"] in ("named", "set") and met and bool({*found["causes"]} & allowed)
 
 

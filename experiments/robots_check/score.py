@@ -29,25 +29,25 @@ def _physical(names: Sequence[str]) -> list[str]:
 
 
 def right(one: Mapping[str, Any]) -> bool:
-    """Whether every fault above the floor is among causes or their rivals, and no other cause is told."""
-    told = one["found"]["causes"]
-    every = {*told, *one["found"]["indistinguishable"]}
+    """Whether every fault above the floor is among causes or their rivals, and no other cause is named."""
+    named = one["found"]["causes"]
+    every = {*named, *one["found"]["indistinguishable"]}
     allowed = {r for f in one["faults"] for r in f["right"]}
     met = all(every & set(f["right"]) for f in one["faults"] if above(f))
-    strange = [n for n in _physical(told) if n not in allowed]
+    strange = [n for n in _physical(named) if n not in allowed]
     # In a set, what stands for a fault may be any of its rivals.
-    spare = len([f for f in one["faults"] if not set(told) & set(f["right"])])
+    spare = len([f for f in one["faults"] if not set(named) & set(f["right"])])
     return met and len(strange) <= spare and one["found"]["verdict"] in ("named", "set")
 
 
 def alarm(one: Mapping[str, Any]) -> bool:
-    """Whether something is told of a healthy robot that is not its numerics."""
+    """Whether anything but its numerics is named of a healthy robot."""
     found = one["found"]
     return found["verdict"] == "unknown" or bool(_physical(found["causes"]))
 
 
 def held_back(one: Mapping[str, Any]) -> bool:
-    """Whether a fault of no known kind is called unknown, or its remainder told."""
+    """Whether a fault of no known kind is called unknown, or its remainder reported."""
     return one["found"]["verdict"] == "unknown" or (
         one["found"]["verdict"] != "none" and one["found"]["remainder"] > 0.1
     )

@@ -151,13 +151,13 @@ def nats(
     noise, by which windows begun from the true states go otherwise without it, straight lines left out."""
     states: list[np.ndarray] = []
     shown = run(robot, world_of(xml, faults, sizes), wanted, states=states)
-    told = _replayed(robot, world_of(xml, faults, sizes), shown, states)
+    faulty = _replayed(robot, world_of(xml, faults, sizes), shown, states)
     out = []
     for k in range(len(faults)):
         without = _replayed(robot, world_of(xml, faults[:k] + faults[k + 1 :], sizes), shown, states)
         total = 0.0
         for joint, sd in noise.items():
-            for one in np.split(told[joint] - without[joint], np.arange(WINDOW, len(states), WINDOW)):
+            for one in np.split(faulty[joint] - without[joint], np.arange(WINDOW, len(states), WINDOW)):
                 line = np.stack([np.ones(one.size), np.arange(one.size)], 1)
                 left = one - line @ np.linalg.lstsq(line, one, rcond=None)[0]
                 total += 0.5 * float(left @ left) / sd**2

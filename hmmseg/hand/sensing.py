@@ -1,6 +1,6 @@
 """Which readings of a hand are none: what a working sensor cannot have read is named and left out.
 
-One model of a sensor stands behind it. Its readings scatter, so that neighbours repeat each other to the
+This follows from a model of a sensor. Its readings scatter, so that neighbours repeat each other to the
 last digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow;
 they stay within a few times the range of all others; a position moves no farther between two samples than its
 velocity carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of

@@ -341,7 +341,7 @@ def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
     """InputError where free motion does not determine what the rig leaves open."""
     left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
     if (left_open or gripper.reaction is None) and abs(inertia) < SURE * error:
-        problem = "do not show the hand's own mass in free motion, so nothing tells how the sensor stands"
+        problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
         raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
                          "under [gripper], as they are mounted")  # fmt: skip
 

@@ -216,7 +216,7 @@ def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
 
 
 def not_numbers(log_likelihoods: np.ndarray, row: int) -> ValueError:
-    """What to raise for a row with NaN among numbers."""
+    """What to raise for a row with NaN beside numbers."""
     column = int(np.flatnonzero(np.isnan(np.asarray(log_likelihoods[row], dtype=float)))[0])
     where = f"log_likelihoods: NaN or +inf at {[row, column]}"
     return ValueError(f"{where}, expected numbers or -inf (a missing sample is NaN throughout)")

@@ -27,12 +27,15 @@ import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from hmmseg.hmm import recursions
+from hmmseg.hmm import durations, recursions
 from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
-from hmmseg.hmm.results import Alignment, AlignmentPosterior, Posterior
+from hmmseg.hmm.durations import DurationChain
+from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
 
+AnyChain = Chain | DurationChain
 SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
 TOGETHER = 64  # numerics: recordings of one shape that make one call; what is over is done one by one
+MAX_RANKS = 65_535  # limit: of k_best
 
 
 def ladder(num_samples: int) -> int:
@@ -42,23 +45,36 @@ def ladder(num_samples: int) -> int:
     return -(-num_samples // step) * step
 
 
-def viterbi(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
-            parallel: bool | None = None) -> Alignment:  # fmt: skip
+def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
+            parallel: bool | None = None) -> Any:  # fmt: skip
     """The most probable alignment; a tie goes to staying.
 
     Args:
-        log_likelihoods: (num_samples, num_states).
-        chain: of as many states.
-        length: how many samples are no padding; all unless given.
+        log_likelihoods: (num_samples, num_states). Several recordings, not under jit: a sequence of such
+            arrays, or (num_recordings, num_samples, num_states) with `lengths` (num_recordings,).
+        chain: one, or one for each recording.
+        lengths: how many samples are no padding; all unless given.
         parallel: see the module.
+
+    Returns:
+        Alignment, of several recordings Alignments.
 
     Raises:
         InfeasibleAlignment, ValueError: see the module.
     """
-    return _run(_viterbi, log_likelihoods, chain, length, parallel)
+    if _single(log_likelihoods, chain):
+        return _run(_viterbi, log_likelihoods, chain, lengths, parallel=parallel)
+    tables, chains = recordings(log_likelihoods, chain, lengths)
+    found = run_many(_viterbi, tables, chains, parallel=parallel)
+    num_states = chains[0].num_states if chains else 0
+    return Alignments(
+        np.array([a.starts for a in found], np.int64).reshape(len(found), num_states),
+        np.array([a.num_samples for a in found], np.int64),
+        np.array([a.log_prob for a in found], float),
+    )
 
 
-def log_evidence(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
+def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
                  parallel: bool | None = None) -> Any:  # fmt: skip
     """Log of the summed weight of all paths.
 
@@ -66,13 +82,43 @@ def log_evidence(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *
     probability of each state at each sample, with respect to the weights of a chain the expected number of
     moves. Arguments and exceptions as of `viterbi`.
     """
-    return _run(_log_evidence, log_likelihoods, chain, length, parallel, _differentiable)
+    return _run(_log_evidence, log_likelihoods, chain, length, parallel=parallel, inside=_differentiable)
 
 
-def smooth(log_likelihoods: ArrayLike, chain: Chain, length: Any = None, *,
+def filter(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
+           parallel: bool | None = None) -> Filtered:  # fmt: skip
+    """What each sample says together with those before it. Arguments and exceptions as of `viterbi`."""
+    return _run(_filter, log_likelihoods, chain, length, parallel=parallel)
+
+
+def smooth(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
            parallel: bool | None = None) -> Posterior:  # fmt: skip
     """Probabilities of states and boundaries given the whole recording; arguments as of `viterbi`."""
-    return _run(_smooth, log_likelihoods, chain, length, parallel)
+    return _run(_smooth, log_likelihoods, chain, length, parallel=parallel)
+
+
+def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: Any = 0,
+           length: Any = None) -> Alignments:  # fmt: skip
+    """Independent exact draws from the posterior over alignments.
+
+    `seed`: a number, or a key of jax.random. `log_prob` is NaN. Further arguments as of `viterbi`.
+    """
+    key = jax.random.key(seed) if isinstance(seed, (int, np.integer)) else seed
+    return _run(_sample, log_likelihoods, chain, length, key, num_draws=num_draws, parallel=None)
+
+
+def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int, length: Any = None) -> Alignments:
+    """The k most probable alignments, best first; fewer where fewer are possible (under jit: -inf).
+
+    Arguments and exceptions as of `viterbi`.
+    """
+    if not 0 < k <= MAX_RANKS:
+        raise ValueError(f"k: {k}, expected 1 to {MAX_RANKS}")
+    found = _run(_k_best, log_likelihoods, chain, length, k=k, parallel=None)
+    if not isinstance(found.log_prob, np.ndarray):
+        return found
+    keep = int(np.isfinite(found.log_prob).sum())
+    return Alignments(found.starts[:keep], found.num_samples[:keep], found.log_prob[:keep])
 
 
 # What the functions compute: of rows x without NaN and a length n, padded or not, the log weight that must be
@@ -84,32 +130,43 @@ def _tables(chain: Chain) -> tuple[jax.Array, jax.Array, jax.Array]:
     return chain.by_target(jnp), initial, final
 
 
-def _viterbi(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
-    starts, log_prob = recursions.best_path(x, *_tables(chain), n, parallel=parallel)
+def _viterbi(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
+    if isinstance(chain, DurationChain):
+        starts, log_prob = durations.rank(x, chain, n, 1)
+        starts, log_prob = starts[0], log_prob[0]
+    else:
+        starts, log_prob = recursions.best_path(x, *_tables(chain), n, parallel=parallel)
     return log_prob, Alignment(starts, n, log_prob)
 
 
-def _log_evidence(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
-    total = recursions.evidence(x, *_tables(chain), n, parallel=parallel)
+def _log_evidence(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
+    if isinstance(chain, DurationChain):
+        total = durations.evidence(x, chain, n)
+    else:
+        total = recursions.evidence(x, *_tables(chain), n, parallel=parallel)
     return total, total
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _differentiable(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> jax.Array:
+def _differentiable(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> jax.Array:
     """The log evidence in the precision of x. Its gradient is the posterior, in that of what it is of."""
     with jax.enable_x64(True):
         return _log_evidence(x, chain, n, parallel)[0].astype(x.dtype)
 
 
-def _with_gradient(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
+def _with_gradient(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
     with jax.enable_x64(True):
-        total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
-        bands = [moves[:, d, d:] for d in range(len(chain.bands))]
-        bands = [each if band.ndim == 2 else each.sum(0)
-                 for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
-        ends = states[0], recursions.row(states, n - 1)
-        by_chain = Chain.tree_unflatten(None, (tuple(bands), *ends))
-        by_chain = jax.tree.map(lambda by, of: by.astype(of.dtype), by_chain, chain)
+        if isinstance(chain, DurationChain):
+            total, states, _ = durations.posterior(x, chain, n)
+            by_chain = None
+        else:
+            total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+            bands = [moves[:, d, d:] for d in range(len(chain.bands))]
+            bands = [each if band.ndim == 2 else each.sum(0)
+                     for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
+            ends = states[0], recursions.row(states, n - 1)
+            by_chain = Chain.tree_unflatten(None, (tuple(bands), *ends))
+            by_chain = jax.tree.map(lambda by, of: by.astype(of.dtype), by_chain, chain)
         gradient = jnp.where(jnp.isnan(x), 0.0, states).astype(x.dtype)
         return total.astype(x.dtype), (gradient, by_chain)
 
@@ -122,12 +179,45 @@ def _pull_back(parallel: bool | None, gradients: Any, cotangent: jax.Array) -> t
 _differentiable.defvjp(_with_gradient, _pull_back)
 
 
-def _smooth(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
-    total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+def _filter(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Filtered]:
+    if isinstance(chain, DurationChain):
+        raise ValueError("chain: tables of durations, expected a Chain")
+    w, initial, final = _tables(chain)
+    table, taken = recursions.forward(x, w, initial, n, recursions.log_add, parallel)
+    table = jnp.where((recursions.numbers(len(x)) < n)[:, None], table, recursions.NEVER)
+    total = recursions.log_sum(recursions.row(table, n - 1) + final, 0) + taken
+    return total, Filtered(total, recursions.probabilities(table, 1))
+
+
+def _smooth(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
+    if isinstance(chain, DurationChain):
+        total, states, moves = durations.posterior(x, chain, n)
+    else:
+        total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
     return total, Posterior(total, states, tuple(moves[:, d, d:] for d in range(1, moves.shape[1])))
 
 
-def _align(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple]:
+def _sample(x: jax.Array, chain: Any, n: jax.Array, key: jax.Array, num_draws: int,
+            parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
+    if isinstance(chain, DurationChain):
+        total, starts = durations.draw(x, chain, n, key, num_draws)
+    else:
+        total, starts = recursions.draw(x, *_tables(chain), n, key, num_draws, parallel)
+    unknown = jnp.where(jnp.isfinite(total), jnp.nan, total)  # -inf where there was no path to draw
+    return total, Alignments(starts, jnp.full(num_draws, n), jnp.full(num_draws, unknown))
+
+
+def _k_best(x: jax.Array, chain: Any, n: jax.Array, k: int,
+            parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
+    del parallel  # ranks are found row by row on every device
+    if isinstance(chain, DurationChain):
+        starts, log_prob = durations.rank(x, chain, n, k)
+    else:
+        starts, log_prob = recursions.rank(x, *_tables(chain), n, k)
+    return log_prob[0], Alignments(starts, jnp.full(k, n), log_prob)
+
+
+def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple]:
     total, posterior = _smooth(x, chain, n, parallel)
     return total, (_viterbi(x, chain, n, parallel)[1], posterior)
 
@@ -135,17 +225,19 @@ def _align(x: jax.Array, chain: Chain, n: jax.Array, parallel: bool | None) -> t
 # How they are called.
 
 
-def _run(core: Callable, log_likelihoods: Any, chain: Chain, length: Any, parallel: bool | None,
-         inside: Callable | None = None) -> Any:  # fmt: skip
+def _single(log_likelihoods: Any, chain: Any) -> bool:
+    return getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain)
+
+
+def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
+         inside: Callable | None = None, parallel: bool | None, **static: Any) -> Any:  # fmt: skip
     """The core on one recording: traced where anything of it is, else compiled, as NumPy arrays."""
-    leaves = jax.tree.leaves((log_likelihoods, chain, length))
+    leaves = jax.tree.leaves((log_likelihoods, chain, length, keys))
     if not any(isinstance(leaf, Tracer) for leaf in leaves):
         table = checked(log_likelihoods, chain)
         if length is not None:
-            if not 0 < int(length) <= len(table):
-                raise ValueError(f"length: {length}, expected 1 to {len(table)}")
-            table = table[: int(length)]
-        return run_many(core, [table], [chain], parallel=parallel)[0]
+            table = table[: _checked_length(int(length), len(table))]
+        return run_many(core, [table], [chain], *keys, parallel=parallel, **static)[0]
     x = jnp.asarray(log_likelihoods)
     _check_shape(x, chain)
     with jax.enable_x64(True):
@@ -156,11 +248,11 @@ def _run(core: Callable, log_likelihoods: Any, chain: Chain, length: Any, parall
             return inside(
                 x.astype(kind), jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain), n, parallel
             )
-        found = core(x, chain, n, parallel)[1]
+        found = core(x, chain, n, *keys, parallel=parallel, **static)[1]
         return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, found)
 
 
-def checked(log_likelihoods: ArrayLike, chain: Chain) -> np.ndarray:
+def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
     """Doubles (num_samples, num_states); ValueError for what is no such table."""
     ll = np.asarray(log_likelihoods, dtype=np.float64)
     _check_shape(ll, chain)
@@ -172,7 +264,7 @@ def checked(log_likelihoods: ArrayLike, chain: Chain) -> np.ndarray:
     return ll
 
 
-def _check_shape(ll: Any, chain: Chain) -> None:
+def _check_shape(ll: Any, chain: AnyChain) -> None:
     if ll.ndim != 2 or 0 in ll.shape:
         raise ValueError(f"log_likelihoods: shape {ll.shape}, expected (num_samples, num_states)")
     num_samples, num_states = ll.shape
@@ -184,8 +276,31 @@ def _check_shape(ll: Any, chain: Chain) -> None:
         )
 
 
-def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Chain],
-             parallel: bool | None = None) -> list:  # fmt: skip
+def _checked_length(length: int, num_samples: int, recording: str = "") -> int:
+    if not 0 < length <= num_samples:
+        raise ValueError(f"lengths: {length}{recording}, expected 1 to {num_samples}")
+    return length
+
+
+def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
+               lengths: Sequence[int] | np.ndarray | None) -> tuple[list, list]:  # fmt: skip
+    """Checked tables and chains of several recordings."""
+    tables = list(log_likelihoods)
+    if lengths is not None:
+        if len(lengths) != len(tables):
+            raise ValueError(f"lengths: {len(lengths)} given, expected {len(tables)}, one a recording")
+        tables = [
+            ll[: _checked_length(n, len(ll), f" for recording {i}")]
+            for i, (ll, n) in enumerate(zip(tables, lengths, strict=True))
+        ]
+    chains = [chain] * len(tables) if isinstance(chain, AnyChain) else list(chain)
+    if len(chains) != len(tables):
+        raise ValueError(f"chain: {len(chains)} given, expected {len(tables)}, one a recording")
+    return [checked(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
+
+
+def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
+             parallel: bool | None = None, **static: Any) -> list:  # fmt: skip
     """The core on checked recordings, each padded to the ladder: one program for all of one shape.
 
     Raises InfeasibleAlignment, and ValueError for +inf.
@@ -210,44 +325,46 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Chai
                 row[: len(tables[i])] = tables[i]
             chain = jax.tree.map(lambda *leaves: np.stack(leaves), *(padded[i] for i in part))
             with jax.enable_x64(True):
-                program = compiled(core, parallel)
-                totals, results = jax.tree.map(np.asarray, program(x, chain, n))
+                program = compiled(core, parallel, tuple(sorted(static.items())))
+                totals, results = jax.tree.map(np.asarray, program(x, chain, n, *keys))
             for j, i in enumerate(part):
                 if not np.isfinite(totals[j]):
-                    raise why_infeasible(tables[i], chains[i])
+                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
+                    raise why(tables[i], chains[i])
                 found[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], results), len(tables[i]))
     return found
 
 
 def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
-    """`viterbi` and `smooth` of several recordings, each with its chain, as EM takes them."""
-    tables = [checked(ll, chain) for ll, chain in zip(log_likelihoods, chains, strict=True)]
+    """`viterbi` and `smooth` of several recordings, as EM takes them."""
     return [
         AlignmentPosterior(
             posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
         )
-        for best, posterior in run_many(_align, tables, chains)
+        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
     ]
 
 
 @cache
-def compiled(core: Callable, parallel: bool) -> Callable:
+def compiled(core: Callable, parallel: bool, static: tuple) -> Callable:
     """The core for several recordings as one program."""
+    kws = dict(static, parallel=parallel)
 
-    def run(x: jax.Array, chain: Chain, n: jax.Array) -> Any:
+    def run(x: jax.Array, chain: Any, n: jax.Array, *keys: jax.Array) -> Any:
         def one(args: tuple) -> Any:
-            return core(*args, parallel)
+            return core(*args, *keys, **kws)
 
         return jax.vmap(one)((x, chain, n)) if parallel else jax.lax.map(one, (x, chain, n))
 
     return jax.jit(run)
 
 
-def _padded(chain: Chain, num_samples: int) -> Chain:
+def _padded(chain: AnyChain, num_samples: int) -> AnyChain:
     """The chain for a recording that is padded to the ladder."""
     if chain.num_samples is None:
         return chain
     more = ladder(num_samples) - num_samples
+    assert isinstance(chain, Chain)
     bands = tuple(
         np.pad(band, ((0, more), (0, 0)), constant_values=-np.inf) if band.ndim == 2 else band
         for band in map(np.asarray, chain.bands)
@@ -262,6 +379,10 @@ def _trimmed(result: Any, n: int) -> Any:
     if isinstance(result, Posterior):
         moves = tuple(move[: n - 1] for move in result.moves)
         return Posterior(float(result.log_evidence), result.smoothed[:n], moves)
+    if isinstance(result, Filtered):
+        return Filtered(float(result.log_evidence), result.filtered[:n])
     if isinstance(result, Alignment):
         return Alignment(result.starts.astype(np.int64), int(result.num_samples), float(result.log_prob))
+    if isinstance(result, Alignments):
+        return Alignments(result.starts.astype(np.int64), result.num_samples, result.log_prob)
     return float(result)

@@ -4,7 +4,7 @@ Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods, a row
 missing; `w` (num_timesteps
 - 1 or 1, num_bands, num_states) log weights by their target, w[t, d, k] of going from k - d to k between
 the samples t and t + 1, -inf where k < d, one row where they do not vary; `n` int32, how many rows are
-no padding. A table of the recursion has a row for every timestep; what stands beyond row n - 1 means
+no padding. A table of the recursion has a row for every timestep; what lies beyond row n - 1 means
 nothing.
 
 A chain is triangular: no path returns to a state it has left. So there are two ways to run it. Row by
@@ -67,6 +67,12 @@ def argmax(values: Array, axis: int = 0) -> Array:
     """
     places = lax.broadcasted_iota(jnp.int32, values.shape, axis)
     return jnp.where(values == values.max(axis, keepdims=True), places, values.shape[axis] - 1).min(axis)
+
+
+def pick(key: Array, logits: Array, axis: int = 0) -> Array:
+    """A place along an axis drawn by log weights (Gumbel, 1954)."""
+    uniform = (jax.random.bits(key, logits.shape, jnp.uint32).astype(jnp.float64) + 0.5) * 2.0**-32
+    return argmax(logits - jnp.log(-jnp.log(uniform)), axis)
 
 
 def row(table: Array, t: Array) -> Array:
@@ -308,3 +314,60 @@ def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, *, para
         return log_sum(row(table, n - 1) + final, 0) + taken
 
     return one_by_one(core, parallel)(x, w, initial, final, n)
+
+
+def draw(x: Array, w: Array, initial: Array, final: Array, n: Array, key: Array,
+         num_draws: int, parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
+    """Log evidence, and starts (num_draws, num_states) of paths drawn from the posterior.
+
+    Forward filtering, backward sampling.
+    """
+    table, taken = forward(x, w, initial, n, log_add, parallel)
+    states, shifts = numbers(x.shape[1])[None], numbers(w.shape[1])[None]
+    ends = row(table, n - 1) + final
+    last = pick(key, jnp.broadcast_to(ends, (num_draws, len(ends))), 1)
+
+    def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        t, (k, starts) = n - 1 - i, carry
+        source = row(table, t - 1)[jnp.maximum(k[:, None] - shifts, 0)]
+        logits = source + row(w, t - 1).T[k]
+        jump = pick(jax.random.fold_in(key, t), logits, 1)
+        entered = (states > (k - jump)[:, None]) & (states <= k[:, None])
+        return k - jump, jnp.where(entered, t, starts)
+
+    starts = jnp.where(states > last[:, None], n, 0)
+    return log_sum(ends, 0) + taken, lax.fori_loop(jnp.int32(0), n - 1, step, (last, starts))[1]
+
+
+def rank(x: Array, w: Array, initial: Array, final: Array, n: Array, count: int) -> tuple[Array, Array]:
+    """Starts (count, num_states) and log weights (count,) of the best paths; -inf where fewer are possible.
+
+    Every state keeps its `count` best histories, each by the jump that led to it and the rank of what it
+    continues.
+    """
+    (num_timesteps, num_states), num_bands = x.shape, w.shape[1]
+    states = numbers(num_states)[None]
+    first = jnp.full((num_states, count), NEVER).at[:, 0].set(initial + known(x[0]))
+
+    def step(t: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        before, pointers = carry
+        weight = row(w, t - 1)
+        ways = [forwards(before.T, d).T + weight[d][:, None] for d in range(num_bands)]
+        best, pointer = lax.top_k(jnp.concatenate(ways, axis=1), count)
+        pointers = lax.dynamic_update_index_in_dim(pointers, pointer.astype(jnp.int32), t, 0)
+        return best + known(row(x, t))[:, None], pointers
+
+    pointers = jnp.zeros((num_timesteps, num_states, count), jnp.int32)
+    best, pointers = lax.fori_loop(jnp.int32(1), n, step, (first, pointers))
+    log_prob, ends = lax.top_k((best + final[:, None]).ravel(), count)
+    state, place = (ends // count).astype(jnp.int32), (ends % count).astype(jnp.int32)
+
+    def back(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        t, (k, place, starts) = n - 1 - i, carry
+        pointer = row(pointers, t)[k, place]
+        jump, place = pointer // count, pointer % count
+        entered = (states > (k - jump)[:, None]) & (states <= k[:, None])
+        return k - jump, place, jnp.where(entered, t, starts)
+
+    starts = jnp.where(states > state[:, None], n, 0)
+    return lax.fori_loop(jnp.int32(0), n - 1, back, (state, place, starts))[2], log_prob

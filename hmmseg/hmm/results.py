@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +57,43 @@ class Alignment:
 
 @register_dataclass
 @dataclass(frozen=True)
+class Alignments:
+    """Several paths; `alignments[i]` is one of them.
+
+    Attributes:
+        starts: (n, num_states), num_samples (n,), log_prob (n,), as in Alignment.
+    """
+
+    starts: Any
+    num_samples: Any
+    log_prob: Any
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def __getitem__(self, i: int) -> Alignment:
+        return Alignment(self.starts[i], int(self.num_samples[i]), float(self.log_prob[i]))
+
+    def __iter__(self) -> Iterator[Alignment]:
+        return (self[i] for i in range(len(self)))
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Filtered:
+    """On-line view.
+
+    Attributes:
+        log_evidence: log of the summed weight of all complete paths.
+        filtered: [t, k] = p(state k at t | samples up to t).
+    """
+
+    log_evidence: Any
+    filtered: Any
+
+
+@register_dataclass
+@dataclass(frozen=True)
 class Posterior:
     """Posterior over alignments given the whole recording, as probabilities.
 
@@ -78,18 +115,34 @@ class Posterior:
         """
         return crossings(self.moves)
 
-    def start_intervals(self, level: float = 0.9) -> np.ndarray:
-        """Central credible interval [samples] of each boundary, as its first sample (num_states - 1, 2).
+    def start_quantiles(self, q: float) -> np.ndarray:
+        """Quantile of the first sample of the states 1, 2, ... (num_states - 1,), given that they start.
 
         NaN for a boundary that the posterior never crosses.
         """
-        boundary, ends = np.asarray(self.boundary), np.array([1 - level, 1 + level]) / 2
-        found = np.full((boundary.shape[1], 2), np.nan)
+        return self._quantiles(q)[:, 0]
+
+    def start_intervals(self, level: float = 0.9) -> np.ndarray:
+        """Central credible interval [samples] of each boundary, as its first sample (num_states - 1, 2)."""
+        return self._quantiles((1 - level) / 2, (1 + level) / 2)
+
+    def _quantiles(self, *levels: float) -> np.ndarray:
+        boundary = np.asarray(self.boundary)
+        found = np.full((boundary.shape[1], len(levels)), np.nan)
         for k, probability in enumerate(boundary.T):
             cumulative = np.cumsum(probability)
             if cumulative.size and cumulative[-1] > 0:
-                found[k] = 1.0 + np.searchsorted(cumulative, ends * cumulative[-1])
+                found[k] = 1.0 + np.searchsorted(cumulative, np.array(levels) * cumulative[-1])
         return found
+
+    def confidence(self, alignment: Alignment, within: int = 0) -> np.ndarray:
+        """Probability (num_states - 1,) that each boundary of an alignment is right to `within` samples."""
+        cumulative = np.pad(np.cumsum(self.boundary, axis=0), ((1, 0), (0, 0)))
+        at = alignment.starts[1:] - 1  # the interval between two samples in which the boundary lies
+        low = np.clip(at - within, 0, len(cumulative) - 1)
+        high = np.clip(at + within + 1, 0, len(cumulative) - 1)
+        k = np.arange(cumulative.shape[1])
+        return cumulative[high, k] - cumulative[low, k]
 
 
 @register_dataclass

@@ -60,7 +60,7 @@ def validated(model: type[Model], table: dict[str, Any], where: str) -> Model:
 
 
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    """Keys of the table in which the unknown last part of `location` stands."""
+    """Keys of the table that contains the unknown last part of `location`."""
     for part in location[:-1]:
         named = {field.alias or name: field for name, field in model.model_fields.items()}
         field = named.get(str(part))

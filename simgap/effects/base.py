@@ -120,7 +120,7 @@ class HandEffect(Effect):
     `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]: least and most that
     blocks are held with, so that it shows. `restored(channels, values)`: recorded channels as they would be
     without it. `patched(document, found)`: puts what was found into numbers that rig.toml has of its own, and
-    says where each parameter stands; None where it has none. `wrong(problem, push)`: candidates of the gap
+    says where each parameter is found; None where it has none. `wrong(problem, push)`: candidates of the gap
     that stand for measurements rather than for what acts.
     """
 

@@ -380,7 +380,7 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    leading = [j for j in sought(forms(gap), 1)[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    leading = [j for j in sought(forms(gap))[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(

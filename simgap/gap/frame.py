@@ -339,7 +339,7 @@ class Arrays(NamedTuple):
     2 * phase, + 1 next to a contact change; `subtask` (T, N);
     `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
     `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
-    forces as they stand in `World`.
+    forces as they are in `World`.
     """
 
     there: np.ndarray

@@ -47,7 +47,7 @@ def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None)
                 )
                 axes.text(column, row, text, ha="center", va="center", color=colour)
         figure.colorbar(shown, label="share of the gap [%]")
-        axes.set_title("Where recording and model part (blank: nothing stands out of the noise)")
+        axes.set_title("Where recording and model differ (blank: within the noise)")
     return axes
 
 

@@ -60,7 +60,8 @@ MANY = 80  # numerics: candidates of which all pairs are tried
 @dataclass(frozen=True)
 class Settled:
     """A set where it fits best: its point, the gap linear about it in its own effects, the discrepancy that
-    it leaves, its log evidence; `composed`: with what the simulator's own numbers do as it is there."""
+    it leaves, its log evidence, and what straight lines from there promise; `composed`: with what the
+    simulator's own numbers do as it is there."""
 
     composed: Composed
     names: Names
@@ -72,6 +73,7 @@ class Settled:
     whiten: Whitener
     sets: Sets
     score: float
+    promise: float
 
     @cached_property
     def squares(self) -> np.ndarray:
@@ -146,7 +148,7 @@ class Search:
                     score, k = max((float(sets.scores([best.names], k)[0]), k) for k in range(len(levels)))
                     if score > best.score + NEAR:
                         begin = point_of(effects, sets.fit(best.names, k), best.names, self.along)
-                        best = self.settled(best.names, begin, levels[k], best.score)
+                        best = self.settled(best.names, begin, [levels[k]], best.score)
         return best
 
     def _calibrated(self) -> Settled | None:
@@ -158,12 +160,12 @@ class Search:
             return None
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
-        whole = self.settled(names, begin, self.known[frozenset()].covariances.whitener())
+        whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
         sets, levels = self.place(whole, names)
         level = max(range(len(levels)), key=lambda k: float(sets.scores([names], k)[0]))
         names = sets.pruned(names, level)
         begin = point_of(self.composed.effects, sets.fit(names, level), names, self.along)
-        return self.settled(names, begin, whole.whiten)
+        return self.settled(names, begin, [whole.whiten])
 
     def _off(self, name: str, values: Mapping[str, float]) -> bool:
         known = self.composed.effects[name].parameters
@@ -176,10 +178,10 @@ class Search:
         scores = [sets.scores([names], level)[0] for level in range(len(levels))]
         level = int(np.argmax(scores))
         begin = point_of(self.composed.effects, sets.fit(names, level), names, self.along)
-        found = self.settled(names, begin, levels[level])
+        found = self.settled(names, begin, [levels[level]])
         for out in names if len(names) > 1 else ():
             rest = tuple(n for n in names if n != out)
-            self.settled(rest, without(found.point, out), found.whiten)
+            self.settled(rest, without(found.point, out), [found.whiten])
         return found
 
     def nothing(self) -> Settled:
@@ -191,21 +193,31 @@ class Search:
             self.composed = wobbling(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
         self.starts = dict(linear.starts)
-        return self.settled((), point, covariances(self.composed, linear).whitener())
+        return self.settled((), point, [covariances(self.composed, linear).whitener()])
 
-    def settled(self, names: Names, begin: Point, whiten: Whitener, rival: float = -np.inf) -> Settled:
-        """A set at its best, from a start: whitened by what was left there, and anew by what it leaves itself
-        until that settles. What stays further behind a `rival`'s score than that can mend is not gone on
-        with."""
+    def settled(
+        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
+    ) -> Settled:
+        """A set at its best, from a start: whitened by the first of some scales, then by what it leaves
+        itself as long as straight lines from there promise more, and by the next where it stays behind a
+        `rival`'s score."""
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        here, key = self.composed.moved(begin), frozenset(names)
-        best = self._judged(here, names, self._moved(here, begin, whiten))
-        for _ in range(AGAIN if best.score >= rival - NEAR else 0):
-            there, before = self.composed.moved(best.point), best.score
-            again = self._judged(there, names, self._moved(there, best.point, best.whiten))
-            best = max((best, again), key=lambda one: one.score)
-            if best.score < before + NEAR:
+        here, best, key = self.composed.moved(begin), None, frozenset(names)
+        for whiten in scales:
+            one = self._judged(here, names, self._moved(here, begin, whiten))
+            for _ in range(AGAIN):
+                before = one.score
+                if one.promise < max(before + BETTER, rival - NEAR):
+                    break
+                there = self.composed.moved(one.point)
+                again = self._judged(there, names, self._moved(there, one.point, one.whiten))
+                one = max((one, again), key=lambda fitted: fitted.score)
+                if one.score < before + BETTER:
+                    break
+            best = one if best is None or one.score > best.score else best
+            if best.score >= rival - NEAR:
                 break
+        assert best is not None
         if key not in self.known or self.known[key].score < best.score:
             self.known[key] = best
         return self.known[key]
@@ -231,10 +243,11 @@ class Search:
             self.fold,
             self.log_odds,
         )
-        score = -np.inf
+        score = promise = -np.inf
         if not linear.diverged:
             white = whiten(left)
             fit = sets.fit(names, 0)
+            promise = fit.score + len(wide) * ALONE - 1e3 * linear.dropped
             loose = np.diag(fit.covariance)[len(fit.x) - sum(sets.size) :] > 0
             score = -0.5 * float(white @ white) - whiten.half_log_det - prior_cost(composed, point)
             score += 0.5 * loose.sum() * np.log(2 * np.pi) + len(names) * self.log_odds
@@ -242,7 +255,7 @@ class Search:
             score += 0.5 * float(np.linalg.slogdet(fit.covariance[np.ix_(inside, inside)])[1])
             score += _prior_constants(sets.size)
             score += len(wide) * ALONE - 1e3 * linear.dropped
-        return Settled(composed, names, point, linear, cov, off, wide, whiten, sets, score)
+        return Settled(composed, names, point, linear, cov, off, wide, whiten, sets, score, promise)
 
     def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
         """All candidates about a point, by the discrepancy there and less of it.
@@ -371,7 +384,8 @@ class Search:
             names = self._apart(near[k], begin)
             if frozenset(names) in self.known or (at is not best and {*best.names} < {*names}):
                 continue
-            one, tried = self.settled(names, begin, levels[level[k]], best.score), tried + 1
+            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
+            one, tried = self.settled(names, begin, scales, best.score), tried + 1
             if one.score > found.score and self._is_better(one, best):
                 found = one
                 if at is best and one.score > best.score + NEAR:  # about it all others are proposed anew
@@ -421,7 +435,7 @@ class Search:
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
             less = self.known.get(frozenset(rest)) or self.settled(
-                rest, without(best.point, out), best.whiten
+                rest, without(best.point, out), [best.whiten]
             )
             there = less if self._is_better(less, best) else self._better(less, best)
             if there is not None:

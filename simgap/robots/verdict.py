@@ -84,7 +84,7 @@ def verdict_on(
     doubts = _absurd(search.composed.effects, best, causes)
     right = 0.0 if doubts else known(left, 1.0 - left)
     others = _alternatives(search, best)
-    # What is too small to be told, and what takes its place, is no cause and stands in for none.
+    # What is too small to report, and its replacements, is no cause and replaces none.
     small = {*best.names} - {*causes}
     small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
     sets = _explanations(others, best, small - {*causes}, right)
@@ -152,8 +152,10 @@ def _alternatives(search: Search, best: Settled) -> list[Settled]:
 def _explanations(
     others: Sequence[Settled], best: Settled, small: set[str], right: float
 ) -> list[Explanation]:
-    """The sets that are left, by weight, without what is small."""
-    score = np.array([best.score, *(max(s.score, best.score - np.log(RULED_OUT)) for s in others)])
+    """The sets that are left, by weight, without what is small: none weighs more than the best, for held-out
+    logs do not bear out what is likelier."""
+    others_score = [np.clip(s.score, best.score - np.log(RULED_OUT), best.score) for s in others]
+    score = np.array([best.score, *others_score])
     weight = np.exp(score - np.logaddexp.reduce(score))
     each = [tuple(sorted({*s.names} - small)) for s in (best, *others)]
     return [
@@ -180,7 +182,7 @@ def _absurd(effects: Mapping[str, RobotEffect], best: Settled, causes: Sequence[
 
 
 def _where(search: Search, one: Settled, phases: Phases) -> tuple[Cell, ...]:
-    """Cells in which what a set leaves stands out of the noise."""
+    """Cells in which what a set leaves exceeds the noise."""
     composed, rows = search.composed, one.linear.rows
     whiten: Whitener = one.covariances.whitener()
     white = whiten(np.nan_to_num(one.linear.residual))

@@ -43,9 +43,9 @@ ENOUGH = 40  # numerics: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
 SMOOTH = 12  # numerics: directions of a channel in a block, of which what is smooth consists
 ALONE = -4.0  # prior: log odds of a window to be off for reasons of its own
-# numerics: log variances that a search for them begins below what they could be at most: from above, one that
-# is too large may stay in the place of another
-BELOW = 4.0
+# numerics: log variances below a first guess; one source may end in the place of another, so of two starts
+# the better is taken
+BELOW = (0.0, 8.0)
 WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 # numerics: log variances are found to a hundredth of a nat
 CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
@@ -184,13 +184,14 @@ class Covariances:
         smooth, names = self._smooth, self.names
         left, rest = smooth.projected(residual, wide or {})
         kept = list(range(len(names)))
-        x = smooth.first_guess(left) - BELOW
+        x = smooth.first_guess(left)
         plain = smooth.cost(np.zeros(0), left, rest, [])[0]
         while kept:
-            bounds = [(v - 16.0, v + 16.0) for v in x]
-            done = minimize(
-                smooth.cost, x, (left, rest, kept), jac=True, method="L-BFGS-B", bounds=bounds, options=CLOSE
-            )
+            bounds = [(v - 20.0, v + 12.0) for v in x]
+            given = {"args": (left, rest, kept), "jac": True, "bounds": bounds, "options": CLOSE}
+            begun = [x - below for below in BELOW[: 2 if len(kept) == len(names) else 1]]
+            ended = [minimize(smooth.cost, one, method="L-BFGS-B", **given) for one in begun]
+            done = min(ended, key=lambda one: one.fun)
             without = [
                 smooth.cost(np.delete(done.x, i), left, rest, kept[:i] + kept[i + 1 :])[0] - done.fun
                 for i in range(len(kept))

@@ -250,7 +250,7 @@ def residual_summary(
 # A recorded performance once more: commands under which a hand moves and presses as it did.
 #
 # What a healthy recording of just this operator would show, whatever its profile of speed, pace, grip and
-# order of fingers: no model of a person stands between. The tips follow the smoothed recorded motion; where
+# order of fingers: without a model of a person. The tips follow the smoothed recorded motion; where
 # they touch, the command lies beyond it by what the recorded force takes (impedance control, as
 # `simgap.world.dynamics` has it).
 

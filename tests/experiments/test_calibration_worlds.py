@@ -6,7 +6,7 @@ import pytest
 from experiments.calibration_worlds import clustered, summary
 from experiments.sbc import DRAWS, design_of, drawn
 from experiments.sbc import summary as rank_summary
-from experiments.worlds import BIAS, WORLDS, _coloured, _told, scene, task_of
+from experiments.worlds import BIAS, WORLDS, _coloured, _stated, scene, task_of
 from hmmseg.contact.decompose import decompose
 from hmmseg.io.trial import Trial
 
@@ -30,10 +30,10 @@ def test_coloured_noise_keeps_its_variance_and_has_its_correlation():
 
 def test_the_estimator_is_told_what_the_row_says():
     rig = scene()[0]
-    half, double = (_told(WORLDS[f"noise stated x{k}"], rig).noise.force for k in ("0.5", "2"))
+    half, double = (_stated(WORLDS[f"noise stated x{k}"], rig).noise.force for k in ("0.5", "2"))
     assert (half, double) == pytest.approx((0.5 * rig.noise.force, 2 * rig.noise.force))
-    assert _told(WORLDS["bias twice that"], rig).systematic.force_bias == (BIAS,) * 4
-    assert not any(_told(WORLDS["pads 30 % off, untold"], rig).systematic.pad_stiffness)
+    assert _stated(WORLDS["bias twice that"], rig).systematic.force_bias == (BIAS,) * 4
+    assert not any(_stated(WORLDS["pads 30 % off, untold"], rig).systematic.pad_stiffness)
 
 
 def test_coverage_with_replicates_as_clusters():

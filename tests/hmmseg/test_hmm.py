@@ -7,52 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_enumeration import brute, random_problem
+from scipy.stats import chisquare
 
 import hmmseg.hmm as hmm
 from hmmseg.hmm.dense import log_evidence as dense_evidence
 from hmmseg.hmm.dense import viterbi as dense_viterbi
 from hmmseg.hmm.inference import align
-
-
-def random_problem(num_timesteps, num_subtasks, seed=0, num_skips=0):
-    rng = np.random.default_rng(seed)
-    ll = rng.normal(size=(num_timesteps, num_subtasks)) * 2
-    bands = tuple(
-        rng.normal(size=(num_timesteps - 1, max(num_subtasks - d, 0))) - d for d in range(2 + num_skips)
-    )
-    return ll, bands
-
-
-def enumerate_paths(ll, bands, initial=None, final=None):
-    """All paths with any weight and their log weights."""
-    num_timesteps, num_subtasks = ll.shape
-    initial = {0: 0.0} if initial is None else dict(enumerate(initial))
-    final = {num_subtasks - 1: 0.0} if final is None else dict(enumerate(final))
-    paths, weights = [], []
-    for path in itertools.product(range(num_subtasks), repeat=num_timesteps):
-        jumps = np.diff(path)
-        if path[0] not in initial or path[-1] not in final or any(j < 0 or j >= len(bands) for j in jumps):
-            continue
-        weight = initial[path[0]] + final[path[-1]] + sum(ll[t, k] for t, k in enumerate(path))
-        weight += sum(bands[j][t, path[t]] for t, j in enumerate(jumps))
-        paths.append(path)
-        weights.append(weight)
-    return np.array(paths), np.array(weights)
-
-
-def brute(ll, bands, **ends):
-    """Paths, their log weights, log evidence, smoothed probabilities and moves (by how far)."""
-    paths, weights = enumerate_paths(ll, bands, **ends)
-    log_evidence = np.logaddexp.reduce(weights)
-    p = np.exp(weights - log_evidence)
-    smoothed = np.array([[p[paths[:, t] == k].sum() for k in range(ll.shape[1])] for t in range(len(ll))])
-    moves = [
-        np.array([[p[(paths[:, t] == k) & (paths[:, t + 1] == k + d)].sum() for k in range(ll.shape[1] - d)]
-                  for t in range(len(ll) - 1)]).reshape(len(ll) - 1, max(ll.shape[1] - d, 0))
-        for d in range(1, len(bands))
-    ]  # fmt: skip
-    return paths, weights, log_evidence, smoothed, moves
-
 
 SIZES = [(1, 1, 0), (8, 3, 0), (4, 4, 1), (8, 4, 1), (6, 3, 2)]  # samples, states, skips
 
@@ -81,6 +42,40 @@ def test_every_quantity_matches_enumeration(size, single):
     for ours, theirs in zip(posterior.moves, moves, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
     np.testing.assert_allclose(hmm.log_evidence(ll, chain), log_evidence, rtol=1e-12)
+
+    ranked = hmm.k_best(ll, chain, 7)
+    order = np.argsort(-weights)[:7]
+    np.testing.assert_allclose(ranked.log_prob, weights[order], rtol=1e-12)
+    assert [a.path.tolist() for a in ranked] == paths[order].tolist()
+
+
+@pytest.mark.parametrize("num_skips", [0, 1])
+def test_filtered_probabilities_are_posteriors_of_every_prefix(num_skips):
+    ll, bands = random_problem(7, 3, seed=3, num_skips=num_skips)
+    found = hmm.filter(ll, chain_of(bands))
+    np.testing.assert_allclose(found.log_evidence, brute(ll, bands)[2])
+    for t in range(7):
+        smoothed = brute(ll[: t + 1], tuple(band[:t] for band in bands), final=np.zeros(3))[3]
+        np.testing.assert_allclose(found.filtered[t], smoothed[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("num_skips", [0, 1])
+def test_draws_have_the_exact_path_probabilities(num_skips):
+    # Transitions vary strongly in time: a sampler off by one in t fails by a wide margin.
+    ll, bands = random_problem(5, 3, seed=11, num_skips=num_skips)
+    bands = tuple(2.0 * band for band in bands)
+    ends = {"initial": np.array([0.0, 0.5, -1.0]), "final": np.array([-1.0, 0.5, 0.0])}
+    paths, weights, log_evidence, *_ = brute(ll, bands, **ends)
+    chain = chain_of(bands, log_initial=ends["initial"], log_final=ends["final"])
+    num_draws = 20_000
+    drawn = np.array([a.path for a in hmm.sample(ll, chain, num_draws, seed=5)])
+    expected = np.exp(weights - log_evidence) * num_draws
+    counts = np.array([(drawn == path).all(1).sum() for path in paths])
+    assert counts.sum() == num_draws
+    common = expected >= 5
+    observed = np.append(counts[common], counts[~common].sum())
+    wanted = np.append(expected[common], expected[~common].sum())
+    assert chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > 1e-3
 
 
 def test_open_ends_and_transitions_that_do_not_vary():
@@ -216,7 +211,7 @@ def test_optional_states_may_be_passed_over():
         (lambda: hmm.viterbi(np.zeros((3, 2)), hmm.left_to_right([1, 1, 1])), "2 states, expected"),
         (lambda: hmm.smooth(np.zeros(3), hmm.left_to_right([1])), r"log_likelihoods: shape \(3,\)"),
         (lambda: hmm.smooth(np.zeros((9, 2)), hmm.Chain(np.zeros((4, 2)), [0.0])), "9 samples, expected 5"),
-        (lambda: hmm.viterbi(np.zeros((3, 1)), hmm.left_to_right([1]), 4), "length: 4, expected 1 to 3"),
+        (lambda: hmm.viterbi(np.zeros((3, 1)), hmm.left_to_right([1]), 4), "lengths: 4, expected 1 to 3"),
         (lambda: hmm.left_to_right([2.0, 3.0], [1.0]), r"presence: shape \(1,\), expected \(2,\)"),
         (lambda: hmm.left_to_right([2.0], [0.0]), r"probabilities in \(0, 1\]"),
         (lambda: hmm.smooth(np.full((3, 1), np.inf), hmm.left_to_right([1])), r"NaN or \+inf at \[0, 0\]"),
@@ -227,7 +222,7 @@ def test_refusals(make, message):
         make()
 
 
-@pytest.mark.parametrize("function", ["viterbi", "smooth", "log_evidence"])
+@pytest.mark.parametrize("function", ["viterbi", "smooth", "filter", "log_evidence", "k_best", "sample"])
 @pytest.mark.parametrize("num_skips", [0, 1])
 def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
     ll, bands = random_problem(6, 3, seed=1, num_skips=num_skips)
@@ -239,7 +234,9 @@ def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
     for table, subtask, reason in [(starved, 1, "no sample is possible under it"),
                                    (dead_end, 2, "cannot be held to the end")]:  # fmt: skip
         with pytest.raises(hmm.InfeasibleAlignment, match=reason) as caught:
-            getattr(hmm, function)(table, chain_of(bands))
+            getattr(hmm, function)(
+                table, chain_of(bands), *{"k_best": (3,), "sample": (3,)}.get(function, ())
+            )
         assert caught.value.subtask == subtask
 
 

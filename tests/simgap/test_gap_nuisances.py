@@ -9,7 +9,8 @@ from demo_recordings import recorded
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
-from simgap.effects.base import gradient, tips
+from simgap.effects import catalogue
+from simgap.effects.base import gradient, swung, tips
 from simgap.gap.assemble import _density, _likeliest, with_noise
 from simgap.gap.assemble import _turning as turned_variance
 from simgap.gap.frame import CHANNELS, build
@@ -143,3 +144,48 @@ def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_
         assert mine.sum() > 100
         expected = (net[..., k] * given.whitening.weight[..., c])[mine]
         np.testing.assert_allclose(out[..., c][mine], expected, atol=0.02 * np.abs(expected).max())
+
+
+def _moved(world, by):
+    """The world with both fingers' tips moved by (T, N) [m] to the right."""
+    jx, jy = swung(world)
+    turn = np.zeros_like(world.joints)
+    for k in (0, 2):
+        one, two = slice(k, k + 1), slice(k + 1, k + 2)
+        across = jx[..., one] * jy[..., two] - jx[..., two] * jy[..., one]
+        turn[..., one] = by[..., None] * jy[..., two] / across
+        turn[..., two] = -by[..., None] * jy[..., one] / across
+    return world._replace(joints=world.joints + turn)
+
+
+def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
+    """A step of the hand while it holds a block on the ground is no gap where the hand is seen to move."""
+    world, arrays, step = given.frame.world, given.frame.arrays, 4e-4
+    x, stands = CHANNELS.index("x"), arrays.phase[0, :, Phase.PICKUP] * arrays.there[0, :, 0] > 0
+    mine = np.flatnonzero(stands)[: np.flatnonzero(np.diff(np.flatnonzero(stands)) > 1)[0] + 1]
+    at = mine[mine.size // 2]
+    by = np.zeros(world.t.shape)
+    by[0, at:] = step
+    left = {}
+    for seen in (0.0, step):
+        pushed = arrays.pushed.copy()
+        pushed[0, at] += seen
+        other = arrays._replace(pushed=pushed)
+        raw, factor = residuals(_moved(world, by), other, given.centre, given.noise)
+        usual, _ = residuals(world, other, given.centre, given.noise)
+        after = mine[mine > at]  # a filter is off where the step is, and knows it
+        left[seen] = float(np.abs(raw - usual)[0, after, x].max())
+        assert (factor[0, at, x] > 5) == (seen > 0)
+    assert left[0.0] > 0.5 * step and left[step] < 0.1 * step
+
+
+def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
+    world, arrays = given.frame.world, given.frame.arrays
+    tilted = catalogue()["table_tilt"].correct(world, {"angle": 0.02, "turned": 0.8}, 1.0)
+    offset, width = CHANNELS.index("offset"), arrays.onehot @ (arrays.objects @ given.centre[:, 1])
+    change = [residuals(w, arrays, given.centre, given.noise)[0][..., offset] for w in (world, tilted)]
+    change = (change[1] - change[0])[0] * (arrays.there[0, :, offset] > 0)
+    held, move = arrays.onehot[0, :, 0] > 0, width[0][arrays.onehot[0, :, 0] > 0][0]
+    air = np.median(change[held & (arrays.phase[0, :, Phase.CARRY] > 0)])
+    ground = np.median(change[held & (arrays.phase[0, :, Phase.PICKUP] > 0) & (change != 0)])
+    assert air - ground == pytest.approx(0.02 * 0.8 * move, rel=0.05)

@@ -1,7 +1,7 @@
 """HDF5 in robomimic's layout, `data/demo_0/obs/...`, or with columns at the top; read with h5py.
 
 A column's name is its path below the demonstration, `obs/robot0_eef_pos[0]`. Robomimic stores no
-times: `t` is made from `control_freq` in the file's `env_args` where it stands there.
+times: `t` is made from `control_freq` in the file's `env_args` where present.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class Runs:
         return out
 
     def _pushed(self, column: str) -> int:
-        """Where among controls and applied torques a column of those stands."""
+        """Position of such a column among controls and applied torques."""
         joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, column.removeprefix(APPLIED))
         return self.model.nu + int(self.model.jnt_dofadr[joint])
 
