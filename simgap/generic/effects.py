@@ -331,16 +331,16 @@ def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([v[:n] for v in cut])
 
 
-def _range(length: int, rate: float, at_least: float) -> tuple[float, float] | None:
+def _range(length: int, rate: float) -> tuple[float, float] | None:
     """Lowest and highest frequency [Hz] that windows of so many samples tell; None where none."""
-    low, high = max(PERIODS * rate / max(length, 1), at_least), HIGHEST * rate
+    low, high = PERIODS * rate / max(length, 1), HIGHEST * rate
     return (low, high) if length >= SHORTEST and low < high else None
 
 
-def screen(windows: np.ndarray, rate: float, at_least: float = 0.0) -> tuple[float, float, float, float]:
+def screen(windows: np.ndarray, rate: float) -> tuple[float, float, float, float]:
     """Best frequency [Hz] and damping on a grid, the share of the square about the parabola explained and
     its mean square; zeros where windows are too short."""
-    edges = _range(windows.shape[1], rate, at_least)
+    edges = _range(windows.shape[1], rate)
     if edges is None:
         return np.nan, np.nan, 0.0, 0.0
     grid = [(f, z) for f in np.geomspace(*edges, FREQUENCIES) for z in DAMPINGS]
@@ -351,9 +351,9 @@ def screen(windows: np.ndarray, rate: float, at_least: float = 0.0) -> tuple[flo
     return *grid[best], float(shares[best]), float(shares[best] * (plain**2).mean())
 
 
-def fit_ring(windows: np.ndarray, rate: float, at_least: float = 0.0) -> Ring | None:
+def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
     """A ring common to windows (trials, n) of samples at `rate` [Hz]; None where they are too short."""
-    edges, start = _range(windows.shape[1], rate, at_least), screen(windows, rate, at_least)
+    edges, start = _range(windows.shape[1], rate), screen(windows, rate)
     if edges is None:
         return None
 
