@@ -72,7 +72,7 @@ class StreamingFilter:
     def __init__(self, chain: Chain | DurationChain, lag: int) -> None:
         if not isinstance(chain, Chain):
             raise ValueError("chain: tables of durations, expected a Chain: they would need the whole stream")
-        if chain.varying:
+        if chain.num_samples is not None:
             raise ValueError(
                 "chain: varies in time, expected one that does not, as a stream has no known end"
             )

@@ -321,12 +321,14 @@ def test_a_second_world_in_a_real_browser_is_seen_and_felt(tmp_path):
 def test_the_command_ends_with_its_terminal(tmp_path):
     command = [sys.executable, "-m", "hmmseg_cli.main", "play", "--no-open", "--output", str(tmp_path / "o")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        next(line for line in process.stdout if "http://127.0.0.1:" in line)
-        process.send_signal(2)
-        _, err = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert err == ""
+        try:
+            assert process.stdout is not None
+            next(line for line in process.stdout if "http://127.0.0.1:" in line)
+            process.send_signal(2)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert (process.returncode, err) == (0, "")
     assert not (tmp_path / "o").exists()
 
 

@@ -62,7 +62,7 @@ def test_what_acts_only_together_is_told_as_a_sum_and_what_does_nothing_not_at_a
     untold = {n for n, p in body["parameters"].items() if p["mean"] is None}
     assert untold == {"viscous", "more", "idle"} == set(body["reasons"])
     assert "told only together with more" in body["reasons"]["viscous"]
-    assert "little more" in body["reasons"]["idle"]
+    assert "add little" in body["reasons"]["idle"]
     (one,) = body["combinations"]
     assert set(one["of"]) == {"viscous", "more"}
     assert one["of"]["more"] / one["of"]["viscous"] == pytest.approx(2.0, rel=1e-3)
