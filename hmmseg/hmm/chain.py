@@ -94,11 +94,6 @@ class Chain:
         """How long recordings must be where weights vary in time, else None."""
         return next((len(band) + 1 for band in self.bands if band.ndim == 2), None)
 
-    @property
-    def varying(self) -> bool:
-        """Whether any weight changes in time."""
-        return self.num_samples is not None
-
     def _check(self, d: int, band: Any) -> None:
         width = max(self.num_states - d, 0)
         steps = None if self.num_samples is None else self.num_samples - 1
