@@ -91,7 +91,7 @@ def weights(models: list[Model]) -> np.ndarray:
 # prior: shares of groups off, besides the usual one: a gap may be in one place alone
 RARE = (0.002, 0.01, 0.03)
 ENOUGH = 4  # cited: twins as extreme after which a p-value is clear (Besag & Clifford's h)
-SURE = 1e-4  # chosen: so small a chance is clear, were the next twin twice as far as those before
+SURE = 1e-6  # chosen: so small a chance is clear, were the next twin twice as far as those before
 
 
 @dataclass(frozen=True)
