@@ -2,9 +2,7 @@
 
 There is a gap if some set, or a discrepancy alone, is likelier than the sensors' noise. Causes are known if
 they explain most of the whole gap, of all channels together, in logs that took no part, at values that a
-robot can have. How many times the noise is left does not matter for that: a real robot always leaves some, by
-which its sensors are as much finer than its model. It is in the discrepancy, by which causes are weighed, and
-is told.
+robot can have.
 """
 
 from __future__ import annotations
@@ -38,7 +36,8 @@ from simgap.robots.whiten import ALONE, Whitener
 
 OPEN = 0.1  # chosen: share of what is left without a small cause that may be left with it
 MATTERS = 1.1  # chosen: mean squares over the noise's; a smaller gap that nothing explains is told as none
-PART = 0.1  # chosen: share of the gap by which a set may leave more than the best and be compared with it
+SEVERAL = 3.0  # chosen: times the noise; causes that leave more, and a part of the gap, are not known
+PART = 0.1  # chosen: that part
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,8 @@ def verdict_on(
     causes = best.names if forced else tuple(n for n, big in zip(best.names, large, strict=True) if big)
     left = shares.remainder if far is None else max(1.0 - far.fraction, 0.0)
     doubts = _absurd(search.composed.effects, best, causes)
+    if over_noise > SEVERAL and left > PART:
+        doubts = (*doubts, f"{over_noise:.3g} times the noise is left")
     right = 0.0 if doubts else known(left, 1.0 - left)
     others = _alternatives(search, best)
     # What is too small to report, and its replacements, is no cause and replaces none.
