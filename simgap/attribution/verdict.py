@@ -22,9 +22,6 @@ ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
 SOFT = 0.5  # chosen: of the p-value's logarithm, logistic: so sharply an alarm turns into a gap
 MOST = 0.5  # cited: share of the gap left from which on it is unknown (the interface's definition)
 WIDTH = 0.25  # chosen: of that share's logarithm, logistic
-# cited: share of the whole gap of held-out trials; causes that explain less leave it unknown, wherever they
-# act (the interface's definition)
-MINOR = 0.3
 # chosen: share of the explained gap below which an effect is a cause only if its own size says so: an error
 # of a tenth in the form of the largest leaves half of that
 LEAST = 0.02
@@ -126,13 +123,12 @@ def known(left: float, explained: float, same: Iterable[float] = ()) -> float:
     """Probability that a set's effects are the cause: they leave little, and are the same everywhere.
 
     `left`: share of the gap that the set leaves where it acts, `explained`: what it explains of all of it in
-    trials that took no part.
-    Logistic in their logarithms. `same`: log Bayes factors of each effect, one cause against as many as there
-    are parts: an effect whose parameters wander is as likely an imitation as its factor says.
+    trials that took no part. Logistic in the logarithm of the larger share that is left. `same`: log Bayes
+    factors of each effect, one cause against as many as there are parts: an effect whose parameters wander is
+    as likely an imitation as its factor says.
     """
-    most = expit(np.log(MOST / max(left, 1e-6)) / WIDTH)
-    enough = expit(np.log(max(explained, 1e-6) / MINOR) / WIDTH)
-    return float(most * enough * min((expit(factor) for factor in same), default=1.0))
+    most = expit(np.log(MOST / max(left, 1 - explained, 1e-6)) / WIDTH)
+    return float(most * min((expit(factor) for factor in same), default=1.0))
 
 
 def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:
