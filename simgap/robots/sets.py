@@ -263,7 +263,7 @@ def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str
     how much of the second, in usual sizes, goes against one of the first."""
     first = 1 + sets.along + np.concatenate([[0], np.cumsum([1 + k for k in sets.size])]).astype(int)
     single = [j for j, k in enumerate(sets.size) if k == 1]
-    at = np.array([first[j] + 1 for j in single])
+    at = np.array([first[j] + 1 for j in single], int)
     product = sets.gram[-1].sum(0)[np.ix_(at, at)]
     length = np.sqrt(np.diag(product))
     seen = length > SEEN

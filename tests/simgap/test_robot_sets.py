@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -71,6 +73,8 @@ def test_what_an_encoder_and_a_command_do_against_each_other_is_found(drawn):
     ((one, other, against),) = cancelling(sets, {"a": read, "b": moved, "c": moved})
     assert (one, other) == ("a", "b") and against == pytest.approx(0.5, rel=0.05)
     assert not cancelling(sets, {"a": moved, "b": moved, "c": read})
+    sets = replace(sets, names=("a",), size=(2,))  # none of one parameter
+    assert not cancelling(sets, {"a": read})
 
 
 def block(window: int) -> Block:
