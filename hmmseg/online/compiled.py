@@ -7,13 +7,16 @@ each reading, and an empty call with the table of hypotheses takes about as long
 from __future__ import annotations
 
 import atexit
+import contextlib
 import hashlib
 import inspect
 import json
 import os
+import pickletools
 import shutil
 import sys
 import warnings
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,13 +38,24 @@ def _examine(folder: Path) -> None:
     """Empty the folder unless the programs that a run left there are as it left them.
 
     Numba runs what it finds, and what is cut short or garbled ends in errors of its own. What was added
-    since, by a process that runs still, is whole: numba writes a file elsewhere and then moves it.
+    since, by a process that runs still, is whole: numba writes a file elsewhere and then moves it. So is an
+    index that such a process wrote again, as long as it can be parsed to its end.
     """
     found, left = _digests(folder), json.loads(kept(folder / "digests.json") or b"{}")
-    if found and (not left or any(found.get(name, digest) != digest for name, digest in left.items())):
+    changed = [folder / name for name, digest in left.items() if found.get(name, digest) != digest]
+    if found and (not left or not all(path.suffix == ".nbi" and _is_index(path) for path in changed)):
         shutil.rmtree(folder, ignore_errors=True)
         if left:
             warnings.warn(f"{folder}: not as it was written; recomputed", CacheWarning, stacklevel=2)
+
+
+def _is_index(path: Path) -> bool:
+    """Whether a file is two pickles and nothing else, as numba's indices are; nothing of it is run."""
+    with contextlib.suppress(OSError, ValueError, UnicodeDecodeError, IndexError), path.open("rb") as file:
+        for _ in range(2):
+            deque(pickletools.genops(file), maxlen=0)
+        return not file.read(1)
+    return False
 
 
 def _leave(folder: Path) -> None:

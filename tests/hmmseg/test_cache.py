@@ -14,6 +14,7 @@ import pytest
 
 from hmmseg import cache
 from hmmseg.cache import CacheWarning, cache_folder, keep_value, kept_value
+from hmmseg.online.compiled import _is_index
 from simgap.attribution.problem import Rows
 from simgap.phases import Phase
 
@@ -137,3 +138,13 @@ def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp
     hit, said = run()
     assert programs and not hit and said.count("not as it was written") == 1
     assert run() == (True, "")
+
+
+def test_an_index_that_another_process_writes_again_is_no_damage(tmp_path):
+    index = tmp_path / "f.nbi"
+    whole = pickle.dumps("0.61") + pickle.dumps(("stamp", {"signature": "f.1.nbc"}))
+    index.write_bytes(whole)
+    assert _is_index(index)
+    for damaged in (b"", whole[:-1], whole[: len(whole) // 2], whole + b"x", bytes(b ^ 255 for b in whole)):
+        index.write_bytes(damaged)
+        assert not _is_index(index)
