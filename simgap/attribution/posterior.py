@@ -418,7 +418,7 @@ def _energies(f: Forms, model: Model, sets: Sequence[tuple[int, ...]], combined:
     for added, mine in alike.items():
         if added:
             new = np.concatenate([f.spectrum.own[j] for j in added])
-            old, more = at[mine], combined[np.ix_(mine, new)]
+            old, more = at[mine], combined[np.array(mine)[:, None], new]
             for ours, product in ((2 * old, f.product[:, base[:, None], new]),
                                   (more, f.product[:, new[:, None], new])):  # fmt: skip
                 both = (ours[:, :, None] * more[:, None, :]).reshape(len(mine), -1)

@@ -159,7 +159,7 @@ def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.nda
     to the next: as its speed says, unless that is `unseen`; then no one knows when. A band narrower than what
     an angle must turn on by to be seen moving is not seen either.
     """
-    half = half * np.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
+    band = half * np.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
     moves, calm = _moves_backlash(world.joints)
     (last, ago), (following, ahead) = _nearest_backlash(moves, False), _nearest_backlash(moves, True)
     rest = ago + ahead - 1
@@ -167,7 +167,7 @@ def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.nda
     share = np.where(last == 0, 1.0, np.where(following == 0, 0.0, share))
     midway = np.where(last == following, STAYED * (1 - 1 / rest), CROSSED)
     open_end = (last == 0) | (following == 0)
-    blind = np.square(half) * np.where(open_end, STAYED, 4 * share * (1 - share) * midway)
+    blind = np.square(band) * np.where(open_end, STAYED, 4 * share * (1 - share) * midway)
 
     # Speeds integrated less what the sensor saw: how far the joint went in its dead band, but for a constant.
     step = (world.t[:, 1:] - world.t[:, :-1])[..., None]
@@ -181,13 +181,13 @@ def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.nda
     before, after = (
         np.take_along_axis(hidden, np.clip(here + k.astype(int), 0, n - 1), axis=1) for k in (-ago, ahead)
     )
-    pinned = half * (last * (1 - share) + following * share)
+    pinned = band * (last * (1 - share) + following * share)
     free = (moves == 0) | (last != following)
     path = pinned + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
     walk = np.square(_noise_backlash(world.rates)[:, None] * np.median(step))
     length = np.where(open_end, np.minimum(ago, ahead), rest * share * (1 - share))
     seen = np.minimum(walk * length, blind)
-    return np.clip(path, -half, half), unseen * blind + (1 - unseen) * seen
+    return np.clip(path, -band, band), unseen * blind + (1 - unseen) * seen
 
 
 def _correct_backlash(world: World, values, on) -> World:

@@ -287,7 +287,7 @@ class Search:
         linear = self._where_they_act(composed, base, linear, sets, held)
         linear, both = self._together(composed, base, linear, sets, held)
         every = [*usable, *both]
-        return Sets.of(composed.effects | both, linear, levels, every, self.fold, self.log_odds), levels
+        return Sets.of({**composed.effects, **both}, linear, levels, every, self.fold, self.log_odds), levels
 
     def _together(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
@@ -375,7 +375,7 @@ class Search:
         if at is not best:  # what straight lines miss of the best they miss of what takes its place, too
             known = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(known - own + at.score - best.score)) - NEAR
-        effects = self.composed.effects | {n: _sized(n) for n in self.against}
+        effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
         tried, found = 0, best
         for k in np.argsort(-promised):
             if tried >= TRIED or promised[k] < least:

@@ -1,8 +1,7 @@
 """Evidence of sets in closed form against integrals, and what whitens rows against what it says it is."""
 
-from types import SimpleNamespace
-
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
