@@ -5,6 +5,7 @@ import base64
 import hashlib
 import json
 import os
+import signal
 import socket as socketlib
 import subprocess
 import sys
@@ -320,11 +321,14 @@ def test_a_second_world_in_a_real_browser_is_seen_and_felt(tmp_path):
 
 def test_the_command_ends_with_its_terminal(tmp_path):
     command = [sys.executable, "-m", "hmmseg_cli.main", "play", "--no-open", "--output", str(tmp_path / "o")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # A shell without job control has what it runs in the background ignore Ctrl-C.
+    heed = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
+    with subprocess.Popen(command, preexec_fn=heed, **pipes) as process:
         try:
             assert process.stdout is not None
             next(line for line in process.stdout if "http://127.0.0.1:" in line)
-            process.send_signal(2)
+            process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=60)
         finally:
             process.kill()
