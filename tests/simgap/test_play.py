@@ -320,11 +320,11 @@ def test_a_second_world_in_a_real_browser_is_seen_and_felt(tmp_path):
 
 
 def test_the_command_ends_with_its_terminal(tmp_path):
-    command = [sys.executable, "-m", "hmmseg_cli.main", "play", "--no-open", "--output", str(tmp_path / "o")]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     # A shell without job control has what it runs in the background ignore Ctrl-C.
-    heed = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
-    with subprocess.Popen(command, preexec_fn=heed, **pipes) as process:
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{heed}; from hmmseg_cli.main import main; main()"
+    command = [sys.executable, "-c", program, "play", "--no-open", "--output", str(tmp_path / "o")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             next(line for line in process.stdout if "http://127.0.0.1:" in line)
