@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json as jsonlib
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -63,11 +62,13 @@ def watch(
                 out.warn(f"{watcher.counts[key]} {text}")
         envelope = {"format": "hmmseg.watch/1", "version": hmmseg.__version__, "seed": seed,
                     "warnings": out.warnings, "figures": [], "counts": dict(watcher.counts)}  # fmt: skip
-        document = final.to_json() | envelope
+        line = final.line(envelope)
         if write is not None:
-            write(jsonlib.dumps(document, separators=(",", ":")) + "\n")
+            write(line + "\n")
         if destination is not None or out.lost:
-            out.finish(document)
+            import json as jsonlib
+
+            out.finish(jsonlib.loads(line))
 
 
 def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out: Output) -> None:

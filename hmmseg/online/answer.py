@@ -95,41 +95,47 @@ class Answer:
             step, reason = w.steps[k], f"the recording ends in {self.subtask.name}"
         return {"index": step.index, "subtask": step.name, "object": step.object, "reason": reason}
 
-    def to_json(self) -> dict[str, Any]:
-        """The line of JSON of this row as a dict."""
-        w, off = self._watcher, self.departed > 0.5
-        out = {
-            "t": _digits(self.t, 9), **_step(self.subtask),
-            "probabilities": [round(p, 6) for p in self.probabilities.tolist()],
-            "next": None if self.next is None else _step(self.next), "properties": self._properties(),
-            "fits": self.fits, "departed": round(self.departed, 6),
-        }  # fmt: skip
-        if off:
-            out["state"] = self._off[0]
+    def line(self, more: dict[str, Any] | None = None) -> str:
+        """One line of JSON, without its newline; `more`: further entries of the last one."""
+        step = self.subtask
+        w = self._watcher
+        state = step.state if self.departed <= 0.5 else self._off[0]
+        probabilities = ["0" if p < 5e-7 else f"{p:.6f}" for p in self.probabilities.tolist()]
+        parts = [
+            f'{{"t":{self.t:.9g},"subtask":{_name(step.name)},"object":{_name(step.object)},"state":"{state}"',
+            f'"probabilities":[{",".join(probabilities)}]',
+            f'"next":{_step(self.next)}',
+            f'"properties":{w.properties_text(self)}',
+            f'"fits":{"true" if self.fits else "false"}',
+            f'"departed":{_share(self.departed)}',
+        ]
         if w.cyclic:
-            out["repetition"] = self.round + 1
+            parts.append(f'"repetition":{self.round + 1}')
         if not self.final:
             at = int(self.smoothed.argmax())
-            then = {"subtask": w.steps[at].name, "object": w.steps[at].object}
-            out["smoothed"] = {"t": _digits(self.t - w.lag, 9), **then,
-                               "probability": round(float(self.smoothed[at]), 6)}  # fmt: skip
+            then, p = w.steps[at], _share(float(self.smoothed[at]))
+            parts.append(
+                f'"smoothed":{{"t":{self.t - w.lag:.9g},"subtask":{_name(then.name)},'
+                f'"object":{_name(then.object)},"probability":{p}}}'
+            )
         if not self.fits:
-            out["failed"] = self.failed
+            parts.append(f'"failed":{json.dumps(self.failed)}')
         if self.note is not None:
-            out["note"] = self.note
-        return out | ({"final": True, "segments": self.segments()} if self.final else {})
+            parts.append(f'"note":{json.dumps(self.note)}')
+        if self.final:
+            parts += ['"final":true', f'"segments":{json.dumps(self.segments())}']
+            parts += [f'"{key}":{json.dumps(value)}' for key, value in (more or {}).items()]
+        return ",".join(parts) + "}"
 
-    def line(self) -> str:
-        """One line of JSON, without its newline."""
-        return json.dumps(self.to_json(), separators=(",", ":"))
-
-    def _properties(self) -> dict[str, dict[str, Any]]:
-        out: dict[str, dict[str, Any]] = {}
+    def properties_json(self) -> str:
+        """The object `properties`, as text."""
+        objects: dict[str, list[str]] = {}
         for name, prop, mean, sd in self.properties:
-            ends = [_digits(mean - Z95 * sd, 6), _digits(mean + Z95 * sd, 6)]
-            entry = {"unit": UNITS[prop], "mean": _digits(mean, 6), "sd": _digits(sd, 3), "interval_95": ends}
-            out.setdefault(name, {})[prop] = entry
-        return out
+            objects.setdefault(name, []).append(
+                f'"{prop}":{{"unit":"{UNITS[prop]}","mean":{mean:.6g},"sd":{sd:.3g},'
+                f'"interval_95":[{mean - Z95 * sd:.6g},{mean + Z95 * sd:.6g}]}}'
+            )
+        return "{" + ",".join(f'{_name(name)}:{{{",".join(own)}}}' for name, own in objects.items()) + "}"
 
     def segments(self) -> list[dict[str, Any]]:
         """The spans so far, as in `segment`; the last one ends at this row."""
@@ -148,10 +154,15 @@ class Answer:
         return out
 
 
-def _digits(value: float, count: int) -> float:
-    """A number with so many significant digits."""
-    return float(f"{value:.{count}g}")
+def _share(p: float) -> str:
+    return "0" if p < 5e-7 else ("1" if p > 1 - 5e-7 else f"{p:.6f}")
 
 
-def _step(step: Subtask) -> dict[str, str | None]:
-    return {"subtask": step.name, "object": step.object, "state": step.state}
+def _name(name: str | None) -> str:
+    return json.dumps(name)
+
+
+def _step(step: Subtask | None) -> str:
+    if step is None:
+        return "null"
+    return f'{{"subtask":{_name(step.name)},"object":{_name(step.object)},"state":"{step.state}"}}'

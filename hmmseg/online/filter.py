@@ -120,6 +120,7 @@ class Filter:
         self._geometry = np.array([v for f in fingers for v in (*f.base, *f.links)] or [0.0] * 8)
         self._noise = np.array([(position or 0.0) ** 2, (noise.velocity or 0.0) ** 2])
         self._pads, self.force_noise = np.array(pads_of(rig), float), noise.force
+        self._written, self._written_t = "{}", -math.inf
         self.crossings: list[Crossing] = []
         self.first_t = math.nan  # of the first row [s]
         self.touches: list[tuple[float, float]] = []  # known apart from forces [s]
@@ -328,6 +329,12 @@ class Filter:
             if seen > 0:
                 width[name] = size / seen
         return Parameters(h["bias"][:, 0] / h["bias"][:, 1], weight, scale, width)
+
+    def properties_text(self, answer: Answer) -> str:
+        """The properties as JSON, written anew once an independent reading, as they change no faster."""
+        if answer.final or not answer.t < self._written_t + 1 / MAX_RATE:
+            self._written, self._written_t = answer.properties_json(), answer.t
+        return self._written
 
     def answer(self, final: bool = False) -> Answer:
         """What is known now."""
