@@ -135,7 +135,7 @@ class Answer:
                 f'"{prop}":{{"unit":"{UNITS[prop]}","mean":{mean:.6g},"sd":{sd:.3g},'
                 f'"interval_95":[{mean - Z95 * sd:.6g},{mean + Z95 * sd:.6g}]}}'
             )
-        return "{" + ",".join(f'{_name(name)}:{{{",".join(own)}}}' for name, own in objects.items()) + "}"
+        return "{" + ",".join(f"{_name(name)}:{{{','.join(own)}}}" for name, own in objects.items()) + "}"
 
     def segments(self) -> list[dict[str, Any]]:
         """The spans so far, as in `segment`; the last one ends at this row."""

@@ -14,7 +14,7 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import forms
+from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
 from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
@@ -380,15 +380,16 @@ def attributed(
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
-    leading = [j for j in sought(forms(gap))[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    models: list[Model] | None = sought(forms(gap))
+    leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(
             found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
         )
-        gap = together(found.problem, gap, found.healthy, joint, left, found.redrawn)
+        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
-    return gap, attribute(gap, twins, forced, seed, absorbed=absorbed)
+    return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 
 
 def _together(found: Search, which: Sequence[int]) -> Fitted:
