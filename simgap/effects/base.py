@@ -49,6 +49,7 @@ class World(NamedTuple):
     turned clockwise against how it stood.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
+    `off` [m] (T, N, 4): by how much x, y, distance and offset are off besides.
     `dead_band`: what is known of where joints lie in theirs, None where they have none.
     `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (6,): 1 where a candidate delays or
     smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE, SMOOTH, CREEPING,
@@ -87,6 +88,7 @@ class World(NamedTuple):
     carry: Array
     events: Array
     hang: Array | float = 0.0
+    off: Array | float = 0.0
     dead_band: DeadBand | None = None
 
 

@@ -18,16 +18,16 @@ from simgap.effects.base import (
     CREEPING,
     LATE,
     RINGING,
-    SLIDING,
     SMOOTH,
     YIELDING,
+    DeadBand,
     World,
     gradient,
     swung,
     tips,
 )
 from simgap.effects.filters import faded, lowpass
-from simgap.gap.frame import CHANNELS, OFFSET, Arrays
+from simgap.gap.frame import CHANNELS, Arrays
 from simgap.phases import Phase
 
 # Forces between two samples: read at other times, their slopes, and by how much these are in doubt.
@@ -233,11 +233,9 @@ def recorded(arrays: Arrays, channel: str) -> np.ndarray:
     return arrays.there[..., CHANNELS.index(channel)]
 
 
-def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray) -> np.ndarray:
-    """Values (T, N) less their weighted mean in every grip."""
-    total = (weight[:, None] @ arrays.onehot)[:, 0]
-    mean = ((weight * values)[:, None] @ arrays.onehot)[:, 0] / np.maximum(total, 1e-9)
-    return (values - (arrays.onehot @ mean[..., None])[..., 0]) * weight
+# prior: shares of the variances of anywhere in a dead band, of a slide of both pads and of one pad alone, by
+# which joints and pads move unseen between two samples, and their chances: as a rule they do not
+SHARES, CHANCES = np.array([[0, 0, 0], [0.01, 0.01, 0], [1, 1, 1]]), np.array([0.8, 0.1, 0.1])
 
 
 def in_grip(
@@ -245,74 +243,36 @@ def in_grip(
     arrays: Arrays,
 ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
     """x, y, distance and offset (T, N, 4), of which all but the distance are one constant in every grip, less
-    that constant; their variances over the `noise`'s squared, and what unseen moves of joints cost [nats].
+    their prediction from the samples before; its variance over the `noise`'s squared, and what unseen moves
+    cost [nats].
 
-    A block on the ground is taken along by a hand that moves: it stays where it was pushed to. Where pads may
-    slide the other constants walk, too, and joints in a dead band move unseen: values are less their
-    prediction from those before.
+    A block on the ground is taken along by a hand that moves: it stays where it was pushed to. Pads may
+    slide, and joints move in their dead bands. A grip's first value sets its constant and says nothing; the
+    distance counts as `firm`ly as the block is held.
     """
-    place = arrays.phase[..., Phase.PLACE]
-    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
-    pushed = _walk(arrays.pushed, parts.reshape(*place.shape, -1))
-    slides = _walk(SLIDE * world.slip, arrays.onehot)
-    if world.dead_band is not None:
-        walks = (pushed, slides, slides)
-        walk, new = (np.stack(each, -1) for each in zip(*walks, strict=True))
-        return _unseen(values, weight, noise, firm, world, walk, new)
-    out, loose = values * weight, np.ones_like(values)
-    out[..., 0], loose[..., 0] = _followed(values[..., 0], weight[..., 0], noise[..., 0], *pushed)
-    for c in (1, OFFSET):
-        if world.modes[SLIDING]:
-            out[..., c], loose[..., c] = _followed(values[..., c], weight[..., c], noise[..., c], *slides)
-        else:
-            out[..., c] = less_mean(values[..., c], arrays, weight[..., c])
-    return out, loose, 0.0
-
-
-def _walk(walk: np.ndarray, grips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variance (T, N) by which a grip's constant goes from one sample to the next, about the larger `walk` of
-    both squared, and where it is another grip's."""
-    other = np.ones(walk.shape, bool)
-    other[:, 1:] = (grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5
-    before = np.concatenate([walk[:, :1], walk[:, :-1]], 1)
-    return np.square(np.maximum(walk, before)), other
-
-
-def _followed(
-    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, walk: np.ndarray, other: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
-
-    The state is where a grip holds its block, or where that stands. A grip's first value sets it and says
-    nothing.
-    """
-    from simgap.recursions import innovations
-
-    return innovations(values, weight, sd, walk, other, ANYWHERE**2)
-
-
-# prior: shares of the variance of anywhere in a dead band by which a joint moves unseen between two samples,
-# and their chances: as a rule it does not
-SHARES, CHANCES = np.array([0.0, 0.01, 1.0]), np.array([0.8, 0.1, 0.1])
-
-
-def _unseen(
-    values: np.ndarray, weight: np.ndarray, noise: np.ndarray, firm: np.ndarray, world: World,
-    walk: np.ndarray, new: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
-    """As `in_grip`, where joints lie somewhere in a dead band: of the distance that counts as `firm`ly as the
-    block is held."""
     from simgap.recursions import tracked
 
-    assert world.dead_band is not None
-    band, (x, y) = world.dead_band, swung(world)
-    apart = np.array([-1.0, -1.0, 1.0, 1.0])
-    levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)
-    recorded = values - (levers @ band.place[..., None])[..., 0]
+    place = arrays.phase[..., Phase.PLACE]
+    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
+    grip, part = _others(arrays.onehot), _others(parts.reshape(*place.shape, -1))
+    band = world.dead_band or DeadBand(*np.zeros((4, *place.shape, 0)), np.zeros((len(place), 0)))
+    (x, y), apart = swung(world), np.array([-1.0, -1.0, 1.0, 1.0])
+    levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)[..., : band.place.shape[-1]]
     return tracked(
-        recorded, weight, noise, -levers, walk, new, ANYWHERE**2, band.pinned, band.place, band.drift,
-        band.wander, band.jump, SHARES, CHANCES,
+        values - (levers @ band.place[..., None])[..., 0], weight, noise, -levers,
+        np.square(_wider(arrays.pushed)), np.stack([part, grip, grip], -1), ANYWHERE**2, SLIDE**2,
+        _wider(world.slip), band.pinned > 0, *band[:1], *band[2:], SHARES, CHANCES,
     )  # fmt: skip
+
+
+def _others(grips: np.ndarray) -> np.ndarray:
+    """Samples (T, N) of another grip than the one before, of those that each is in (T, N, G)."""
+    return np.pad((grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5, ((0, 0), (1, 0)), constant_values=True)
+
+
+def _wider(values: np.ndarray) -> np.ndarray:
+    """The larger of each value (T, N) and the one before."""
+    return np.maximum(values, np.concatenate([values[:, :1], values[:, :-1]], 1))
 
 
 TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
@@ -367,7 +327,7 @@ def residuals(
     weight_of = np.stack([still, closed * world.ground, held, closed * held], -1) * there
     sd = np.sqrt(np.square(noise[..., :4]) + _doubt(world, firm))
     geometry, loose, unseen = in_grip(
-        np.stack([x, y, distance, offset], -1), weight_of, sd, firm, world, arrays
+        np.stack([x, y, distance, offset], -1) + world.off, weight_of, sd, firm, world, arrays
     )
     factor = loose * np.square(sd / noise[..., :4])
 

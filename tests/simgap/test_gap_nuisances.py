@@ -164,6 +164,8 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     change = [residuals(w, arrays, given.centre, given.noise)[0][..., offset] for w in (world, tilted)]
     change = (change[1] - change[0])[0] * (arrays.there[0, :, offset] > 0)
     held, move = arrays.onehot[0, :, 0] > 0, width[0][arrays.onehot[0, :, 0] > 0][0]
-    air = np.median(change[held & (arrays.phase[0, :, Phase.CARRY] > 0)])
-    ground = np.median(change[held & (arrays.phase[0, :, Phase.PICKUP] > 0) & (change != 0)])
-    assert air - ground == pytest.approx(0.02 * 0.8 * move, rel=0.05)
+    there = held & (arrays.there[0, :, offset] > 0)
+    # Predictions from the samples before miss it once, at the first that is in the air.
+    first = np.flatnonzero(there & (arrays.phase[0, :, Phase.CARRY] > 0))[0]
+    assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05)
+    assert np.abs(change[:first]).max() < 1e-9
