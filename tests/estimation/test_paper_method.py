@@ -67,12 +67,6 @@ def test_threshold_is_tri_valued_and_keeps_missing_samples_missing():
     np.testing.assert_array_equal(out, [1, 0, 0, 0, -1, np.nan])
 
 
-def test_states_in_the_paper_s_numbering():
-    labels = label_states(make_signals("123s0"))
-    np.testing.assert_array_equal(labels.state, [1, 2, 3, 3, 0])
-    np.testing.assert_array_equal(labels.sliding, [False, False, False, True, False])
-
-
 @pytest.mark.parametrize(("state", "change", "options", "expected"), [
     ("1", {"fx1": -0.06}, {}, 0), ("1", {"fy1": -0.06}, {}, 0), ("1", {"fx2": -0.06}, {}, 0),
     ("1", {"fy2": -0.06}, {}, 0), ("3", {"vy1": 0.04, "vy2": 0.04}, {}, 3),
@@ -124,11 +118,6 @@ def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
     np.testing.assert_allclose(starts(first)[1:4], (np.array([5, 6, 7]) - 0.5) * 0.05)
 
 
-def test_equal_agreement_goes_to_holding_on_the_ground():
-    out = segment("111" + "323" + "2222" + "333" + "111", PICK)
-    assert out.spans[2].start == pytest.approx(5.5 * 0.05)
-
-
 def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
     carried = segment("1113s3222233s11", PICK)
     assert carried.complete
@@ -148,13 +137,6 @@ def test_a_move_that_never_happens_fails_at_its_pickup_and_keeps_the_rest():
     assert [s.subtask for s in out.spans] == ["pregrasp", "pickup", "carry", "place", "release"]
     assert out.spans[-1].end == pytest.approx(18 * 0.05)
     json.dumps(out.to_json(), allow_nan=False)
-
-
-def test_flicker_does_not_pass_for_a_later_move():
-    # Agreeing with the first 2 and 3 of the flicker would make the rest the moves of block2.
-    out = segment("1" * 30 + "2" + "3" * 12 + "2" * 30 + "3" * 12 + "1" * 30, STACK)
-    assert out.failed is not None and out.failed.index == 5
-    assert [s.object for s in out.spans] == ["block1"] * 5
 
 
 def test_an_unknown_number_of_repeats_is_counted():

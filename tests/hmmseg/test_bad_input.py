@@ -17,6 +17,7 @@ from experiments.fuzz import run
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder
 from hmmseg.hand.read import read_trial
+from hmmseg.io.formats import npz
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import parse_task, read_task
 from hmmseg.io.trial import Trial
@@ -182,6 +183,13 @@ def test_a_hostile_archive_is_refused_and_runs_nothing(read, make, tmp_path, mon
     make(path)
     told(READERS[read], path)
     assert [each.name for each in tmp_path.iterdir()] == ["t.npz"]
+
+
+def test_an_archive_that_unpacks_to_much_more_than_it_has_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(npz, "BOMB", 10**6)
+    np.savez_compressed(tmp_path / "t.npz", t=np.zeros(10**7))
+    for read in ("trial", "model"):
+        assert "unpacks from" in told(READERS[read], tmp_path / "t.npz")
 
 
 SOME = settings(

@@ -90,15 +90,6 @@ def test_physics_gives_width_on_the_ground_and_weight_only_above_it():
     }  # fmt: skip
 
 
-def test_one_object_picked_and_placed():
-    found = decompose(BlockTask({"cup": GROUND}, (Move("cup", GROUND),)))
-    assert [s.name for s in found.subtasks] == ["pregrasp", "pickup", "carry", "place", "release"]
-    assert ways(found, "cup", "weight") == [(2,)]
-    height = found.properties["cup"]["height"]
-    assert (height.kind, height.evidence) == (None, ())
-    assert height.reason == "no recorded move changes the height at which something rests by cup's height"
-
-
 def test_tower_heights_take_several_moves():
     found = decompose(TOWER)
     assert height_equations(TOWER) == [
