@@ -32,6 +32,7 @@ from mcap.reader import make_reader
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.io.formats import kind_of, parts_of, read_table, split_part
+from hmmseg.io.formats.logs import interpolated
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
 from hmmseg.segmentation.spans import Span
@@ -166,6 +167,13 @@ def test_stamps_since_1970_in_another_unit_are_refused_in_any_recording(tmp_path
     else:
         with pytest.raises(InputError, match=rf"a\.csv: column t: is {line}"):
             read_trial(tmp_path / "a.csv", task=task)
+
+
+def test_interpolation_by_hand():
+    ticks = np.array([0, 5, 10, 15, 20, 100, 110])
+    values, marked = interpolated(ticks, np.array([0, 10, 20, 110]), np.array([0.0, 1.0, 4.0, 5.0]))
+    np.testing.assert_allclose(values, [0.0, 0.5, 1.0, 2.5, 4.0, np.nan, 5.0])
+    assert marked.tolist() == [False, True, False, True, False, False, False]
 
 
 def test_robomimic_demonstrations(tmp_path):

@@ -9,17 +9,15 @@ from scipy.stats import multivariate_normal
 
 from simgap.attribution.attribute import _examined, _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import WANDER, Heldout, invariance, scatter_between
-from simgap.attribution.posterior import Background, Forms, fitted, forms
+from simgap.attribution.posterior import Background, Forms, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
-from simgap.attribution.search import detected, sought, statistic, weights
+from simgap.attribution.search import detected, leniently, sought, statistic, weights
 from simgap.attribution.verdict import (
     ALARM,
     Explanation,
     acting,
-    alike,
     conclude,
     known,
-    leading,
     probabilities,
     significant,
 )
@@ -129,6 +127,15 @@ def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
     assert np.mean(np.exp(-np.maximum(values, 0)) < 0.05) <= 0.1
     assert statistic(forms(gap_of({0: 3.0}))) > 20
     assert detected(1e3).p_value == 0.0 and detected(-2.0).p_value == 1.0
+
+
+def test_neighbours_are_screened_by_what_one_step_of_each_gives():
+    f = forms(gap_of({0: 3.0, 2: -2.0}))
+    m = fitted(f, (0,))
+    sets = [(), (0, 2), (1,), (1, 3), (0, 1, 2)]
+    each = [mode(f, quadratic_forms(f, e), m.precision, steps=1).score for e in sets]
+    # but for the volume of the mode, by how groups count before the step
+    np.testing.assert_allclose(screened(f, m, sets), each, atol=0.2)
 
 
 def test_twins_are_taken_until_the_answer_is_clear():
@@ -254,6 +261,16 @@ def test_a_prior_that_tolerates_is_a_prior_and_leaves_what_matters_as_likely():
     assert (
         prior[b.log_phi.searchsorted(np.log(5.0)), 2] > b.log_prior[b.log_phi.searchsorted(np.log(5.0))] + 2
     )
+
+
+def test_what_is_below_the_tolerance_speaks_less_for_a_gap():
+    rng, gap = np.random.default_rng(13), gap_of({}, seed=12)
+    gap = replace(gap, residual=gap.residual + 1.5 * rng.standard_normal(gap.residual.size))
+    f = forms(replace(gap, tolerance=np.full(gap.residual.size, 2.0)))
+    models = sought(f)
+    other = forms(replace(gap, tolerance=np.full(gap.residual.size, 0.01)))
+    assert statistic(*leniently(f, models)) < 0.5 * statistic(f, models)
+    assert statistic(*leniently(other, models)) == pytest.approx(statistic(other, models))
 
 
 def test_what_has_no_name_explains_only_what_names_do_not():
@@ -431,9 +448,9 @@ def test_probabilities_are_the_weights_where_every_set_is_known():
 
 
 def test_what_a_set_is_not_known_to_explain_is_unknown():
-    found = probabilities([one("a", 0.8, 0.25), one("b", 0.2, 0.5)], SURE)
-    assert found["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
-    assert conclude([one("a", 0.8, 0.25), one("b", 0.2, 0.5)], SURE).verdict == "unknown"
+    sets = [one("a", 0.8, 0.25), one("b", 0.2, 0.5)]
+    assert probabilities(sets, SURE)["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
+    assert conclude(sets, SURE).verdict == "unknown"
 
 
 def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
@@ -441,46 +458,34 @@ def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
     assert probabilities(sets, ALARM)["none"] == pytest.approx(0.5)
     assert acting(sets, ALARM)["a"] == pytest.approx(0.45)
     assert conclude(sets, 1.01 * ALARM).verdict == "none" and conclude(sets, 0.99 * ALARM).verdict == "named"
+    small = conclude(sets, SURE, matters=False)  # a gap that does not matter is none however sure
+    assert small.verdict == "none" and small.causes == () and small.probabilities["none"] > 0.99
 
 
-def test_a_gap_that_does_not_matter_is_none_however_sure():
-    told = conclude([one("a", 1.0)], SURE, matters=False)
-    assert told.verdict == "none" and told.causes == () and told.probabilities["none"] > 0.99
+B_IN_TWO = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
 
 
-def test_forced_effects_are_named_whatever_the_gap():
-    assert conclude([one("ab", 1.0, 0.0)], 0.9, forced=("b", "a")).causes == ("a", "b")
-
-
-def test_sets_of_the_same_causes_count_together():
-    """Two sets whose smaller effects differ have the same cause, likelier than the single likeliest set."""
-    sets = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
-    assert leading(sets) == ("b",)
-    assert conclude(sets, SURE).causes == ("b",)
-    assert conclude(sets, SURE, chosen=("a",)).causes == ("a",)
-
-
-@pytest.mark.parametrize(("odds", "verdict"), [(19.0, "set"), (21.0, "named")])
-def test_what_takes_a_causes_place_is_told_down_to_one_in_twenty(odds, verdict):
-    weight = odds / (1 + odds)
-    told = conclude([one("a", weight), one("b", 1 - weight)], SURE)
-    assert told.verdict == verdict and told.indistinguishable == (("b",) if verdict == "set" else ())
-
-
-def test_an_effect_too_small_to_be_a_cause_is_no_cause_beside_an_alternative_either():
-    """Beside a and beside b stands the same small effect s: b takes a's place, s takes nobody's."""
-    sets = [one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))]
-    assert alike(sets, ("a",)) == ("b",)
-
-
-def test_a_larger_set_is_no_alternative():
-    assert alike([one("a", 0.5), one("bc", 0.5)], ("a",)) == ()
-
-
-def test_what_a_set_can_do_without_is_no_cause():
-    nested = [one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)]
-    assert conclude(nested, SURE).causes == ("a",)
-    assert conclude([one("ab", 0.96), one("a", 0.03)], SURE).causes == ("a", "b")  # ruled out
-    assert conclude([one("ab", 0.6), one("a", 0.3, 0.01)], SURE).causes == ("a", "b")  # it leaves too much
-    other = conclude([one("ab", 0.6), one("c", 0.3)], SURE)  # not a part of the set but an alternative to it
-    assert other.causes == ("a", "b") and other.indistinguishable == ("c",)
+@pytest.mark.parametrize(
+    ("sets", "more", "causes", "others"),
+    [
+        # Sets of the same causes count together; what was chosen, or forced, is named all the same.
+        (B_IN_TWO, {}, ("b",), ("a",)),
+        (B_IN_TWO, {"chosen": ("a",)}, ("a",), ()),
+        ([one("ab", 1.0, 0.0)], {"p_value": 0.9, "forced": ("b", "a")}, ("a", "b"), ()),
+        # What takes a cause's place is told down to one in twenty: an effect too small to be a cause is none
+        # beside an alternative either, and a larger set is no alternative.
+        ([one("a", 19 / 20), one("b", 1 / 20)], {}, ("a",), ("b",)),
+        ([one("a", 21 / 22), one("b", 1 / 22)], {}, ("a",), ()),
+        ([one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))], {}, ("a",), ("b",)),
+        ([one("a", 0.5), one("bc", 0.5)], {}, ("a",), ()),
+        # What a set can do without is no cause, unless that is ruled out or leaves too much.
+        ([one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)], {}, ("a",), ()),
+        ([one("ab", 0.96), one("a", 0.03)], {}, ("a", "b"), ()),
+        ([one("ab", 0.6), one("a", 0.3, 0.01)], {}, ("a", "b"), ()),
+        ([one("ab", 0.6), one("c", 0.3)], {}, ("a", "b"), ("c",)),  # not a part of the set but an alternative
+    ],
+)
+def test_causes_and_what_takes_their_place(sets, more, causes, others):
+    told = conclude(sets, **{"p_value": SURE} | more)
+    assert (told.causes, told.indistinguishable) == (causes, others)
+    assert told.verdict == ("set" if others else "named")
