@@ -37,19 +37,18 @@ class Topic:
         if self.kind == "std_msgs/msg/Float64":
             return types[self.kind](data=float(v["data"][k]))
         geometry = {n.split("/")[-1]: made for n, made in types.items() if n.startswith("geometry_msgs/")}
-        header, nothing = types["std_msgs/msg/Header"], np.zeros((k + 1, 3))
+        header = types["std_msgs/msg/Header"]
         stamp = types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
         one = {"seq": 0} if "seq" in header.__dataclass_fields__ else {}
         head = header(stamp=stamp, frame_id="tool", **one)
         if self.kind == WRENCH:
-            parts = {n: geometry["Vector3"](*map(float, v.get(n, nothing)[k])) for n in ("force", "torque")}
+            three = {n: v[n][k] if n in v else np.zeros(3) for n in ("force", "torque")}
+            parts = {n: geometry["Vector3"](*map(float, each)) for n, each in three.items()}
             return types[self.kind](header=head, wrench=geometry["Wrench"](**parts))
         if self.kind == POSE:
-            place, turn = (
-                geometry["Point"](*map(float, v["position"][k])),
-                geometry["Quaternion"](0.0, 0.0, 0.0, 1.0),
-            )
-            return types[self.kind](header=head, pose=geometry["Pose"](position=place, orientation=turn))
+            place, straight = geometry["Point"](*map(float, v["position"][k])), (0.0, 0.0, 0.0, 1.0)
+            pose = geometry["Pose"](position=place, orientation=geometry["Quaternion"](*straight))
+            return types[self.kind](header=head, pose=pose)
         joints = {n: np.array([c[k] for c in v[n].values()], float) for n in ("position", "velocity")}
         return types[self.kind](header=head, name=list(v["position"]), effort=np.zeros(0), **joints)
 
@@ -65,11 +64,9 @@ def mcap_of(path: Path, topics: list[Topic]) -> Path:
             schema = writer.register_schema(kind, "ros2msg", text.encode())
             channels[name] = writer.register_channel(name, "cdr", schema)
         for topic, k in _ordered(topics):
-            ns, data = (
-                int(topic.ns[k]) + DELAY,
-                store.serialize_cdr(topic.message(store.types, k), topic.kind),
-            )
-            writer.add_message(channels[topic.name], ns, bytes(data), ns)
+            ns, message = int(topic.ns[k]) + DELAY, topic.message(store.types, k)
+            data = bytes(store.serialize_cdr(message, topic.kind))
+            writer.add_message(channels[topic.name], ns, data, ns)
         writer.finish()
     return path
 

@@ -5,11 +5,20 @@ and gives the edited trial with the index of the first subtask that it does not 
 joined with continuous time; positions jump where pieces meet, as they would under a cut.
 """
 
+import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from hmmseg.hand.read import read_trial
+from hmmseg.io.rig import read_rig
 from hmmseg.io.trial import Trial
+
+STACK = Path(__file__).parent / "data/stack"
+RIG = read_rig(STACK / "rig.toml")
+TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
+TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
 
 Edit = Callable[[Trial, Sequence[float]], tuple[Trial, int]]
 FORCES = ("fx1", "fy1", "fx2", "fy2")

@@ -341,6 +341,7 @@ def test_a_weighted_median_is_that_of_repeated_values():
     values, times = rng.normal(size=31), rng.integers(1, 9, 31)
     times[0] += 1 - times.sum() % 2  # an odd number of values has one in the middle
     assert weighted_median(values, times.astype(float)) == np.median(np.repeat(values, times))
+    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0  # of what is there
 
 
 def test_gaps_are_bridged_in_time():
@@ -350,17 +351,6 @@ def test_gaps_are_bridged_in_time():
     assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ValueError, match="empty"):
         bridged(np.full(3, np.nan))
-
-
-def test_a_weighted_median_is_of_what_is_there():
-    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0
-
-
-NUMBERS = range(76100, 76106)
-
-
-def _without_column(trial):
-    return replace(trial, channels={k: v for k, v in trial.channels.items() if k != ROLL})
 
 
 def test_equations_of_a_rolled_block():
