@@ -33,7 +33,6 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.table import plain_table
 from hmmseg.io.task import read_task
-from hmmseg_cli.inspect import sparkline
 from hmmseg_cli.main import main
 
 NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
@@ -155,13 +154,6 @@ def test_a_rate_that_is_not_the_files_is_said(tmp_path):
     rig = read_rig(NONE / "rig.toml").model_copy(update={"rate": 50.0})
     trial = read_trial(NONE / "trial_01.csv", rig)
     assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
-
-
-def test_sparkline():
-    assert sparkline((0.0, 7.0, float("nan"), 3.5)) == "▁█ ▅"
-    assert sparkline((1.0, 1.0)) == "▁▁"
-    assert sparkline((float("nan"),)) == ""
-    assert len(sparkline((-1e308, 0.0, float("nan"), 1e308))) == 4
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from hmmseg import Watcher
-from hmmseg_cli.live import Live, picture, spark
 from hmmseg_cli.main import main
 
 CASE = Path(__file__).parents[2] / "recordings" / "paper_blocks"
@@ -85,19 +82,3 @@ def test_bad_rows_can_be_left_out(run):
     code, lines, err = run(rows, "--skip-bad-rows")
     assert code == 0 and len(lines) == 20
     assert "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
-
-
-def test_the_live_picture_shows_where_the_task_is():
-    watcher = Watcher(COMMAND[2], COMMAND[4])
-    live = Live(watcher, lines=False)
-    live._console.file = io.StringIO()
-    for row in ROWS[1:60]:
-        t, *values = map(float, row.split(","))
-        answer = watcher.update(t, values)
-        live.update(answer)
-    live.close()
-    console = Console(file=io.StringIO(), width=140)
-    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
-    text = console.file.getvalue()
-    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
-    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"

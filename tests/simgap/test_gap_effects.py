@@ -95,34 +95,17 @@ def test_every_name_of_the_contract_is_an_effect():
 
 
 @pytest.mark.parametrize("name", DETERMINISTIC)
-def test_slopes_are_finite_at_every_start(name):
-    """By differences over the step that a fit takes, in every parameter."""
-    effect, world = fitted()[name], world_of(performance())
-
-    def corrected(u):
-        values = {p.name: p.value(u[k]) for k, p in enumerate(effect.parameters.values())}
-        return effect.correct(world, values, 1.0)
-
-    for which in (0, -1):
-        start = np.array([
-            p.coordinate(p.starts[which]) if p.starts else p.coordinate(p.nominal)
-            for p in effect.parameters.values()
-        ])  # fmt: skip
-        steps = np.vstack([start, start + STEP * np.eye(start.size)])
-        first, *others = (corrected(u) for u in steps)
-        for leaves in others:
-            for before, after in zip(first, leaves, strict=True):
-                assert np.isfinite(before).all() and np.isfinite(after).all()
-                assert np.abs(after - before).max() < 1e9 * STEP
-
-
-@pytest.mark.parametrize("name", DETERMINISTIC)
-def test_an_effect_that_is_off_changes_nothing(name):
+def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(name):
     effect, world = fitted()[name], world_of(performance())
     out = effect.correct(world, {p.name: p.nominal for p in effect.parameters.values()}, 0.0)
     for before, after, field in zip(world, out, World._fields, strict=True):
         if field not in ("creep_time", "ring"):  # without a share that creeps or rings they say nothing
             np.testing.assert_allclose(after, before, atol=1e-12, err_msg=field)
+    for which in (0, -1):
+        start = {p.name: p.starts[which] if p.starts else p.nominal for p in effect.parameters.values()}
+        steps = [{**start, p.name: p.value(p.coordinate(start[p.name]) + STEP)}
+                 for p in effect.parameters.values()]  # fmt: skip
+        assert all(np.isfinite(z).all() for v in (start, *steps) for z in effect.correct(world, v, 1.0))
 
 
 PLANTED = {
