@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from hmmseg.errors import InputError
 from simgap.attribution.attribute import _examined, _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import WANDER, Heldout, invariance, scatter_between
 from simgap.attribution.posterior import Background, Forms, fitted, forms, mode, quadratic_forms, screened
@@ -284,6 +285,11 @@ def test_what_has_no_name_explains_only_what_names_do_not():
     # Where names leave most of the gap it is unknown.
     rest = attribute(replace(gap, candidates=(b, c, anything)), heldout=False)
     assert rest.verdict == "unknown" and rest.causes == ()
+
+
+def test_an_effect_that_cannot_act_on_these_recordings_is_not_taken():
+    with pytest.raises(InputError, match=r"'actual': cannot act on these recordings; expected a, b, c, d"):
+        attribute(gap_of({1: 3.0}), heldout=False, forced=("actual",))
 
 
 def test_a_cause_of_a_sliver_of_the_gap_leaves_it_unknown():
