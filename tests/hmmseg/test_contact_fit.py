@@ -19,7 +19,6 @@ from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import (
     LOST,
     RUNG,
-    STRAY,
     Features,
     Parameters,
     _log_ungripped,
@@ -130,28 +129,6 @@ def score(f: Features, state: str) -> np.ndarray:
     return log_likelihoods(f, step(state), PARAMETERS, 0)[:, 0]
 
 
-def own_sample(state: str, num: int, rng) -> Features:
-    """Samples drawn as the state has them (Gaussian noise at the parameters' scales)."""
-    p, scale = PARAMETERS, PARAMETERS.scale
-    noise = scale["force"] * rng.normal(size=(num, 4))
-    if state == FREE:
-        return features(num, force=p.bias + noise, vx=rng.uniform(-0.2, 0.2, num),
-                        vy=rng.uniform(-0.15, 0.15, num), y=rng.uniform(0, 0.06, num),
-                        d=rng.uniform(0.02, 0.06, num))  # fmt: skip
-    grip = rng.uniform(1, 3, num)
-    above = state == ABOVE_GROUND
-    ay = rng.normal(size=num) if above else np.zeros(num)
-    fy = 0.4 * (1 + ay / 9.81) if above else rng.uniform(-1, 0.2, num)
-    force = np.stack([grip, fy / 2, -grip, fy / 2], axis=1) + p.bias + noise
-    moving = rng.uniform(-0.2, 0.2, num)
-    still = 0.003 * rng.normal(size=(2, num))
-    return features(
-        num, force=force, ay=ay, d=0.02 - 2 * grip * 2.5e-4 + 1e-4 * rng.normal(size=num),
-        vx=still[0] if state == ON_GROUND else moving, vy=moving if above else still[1],
-        y=rng.uniform(0.015, 0.06, num) if above else 0.01 + fy * 2e-4 + 1e-4 * rng.normal(size=num),
-    )  # fmt: skip
-
-
 def test_soft_uniform_is_a_density():
     def density(x):
         return float(np.exp(log_between(np.array([x]), 0.5, 4.0, 0.05))[0])
@@ -218,21 +195,6 @@ def test_density_over_one_feature_integrates_to_one(state, name):
 def test_a_sample_without_values_says_nothing(state):
     f = features(3, force=np.full(4, np.nan), vx=np.nan, vy=np.nan, ay=np.nan, y=np.nan, d=np.nan)
     np.testing.assert_allclose(score(f, state), np.zeros(3), atol=1e-12)
-
-
-def test_one_missing_channel_leaves_the_others():
-    f = own_sample(ON_GROUND, 50, np.random.default_rng(1))
-    lost = replace(f, vx=np.full(50, np.nan))
-    difference = score(f, ON_GROUND) - score(lost, ON_GROUND)
-    spread = np.hypot(2e-3, PARAMETERS.scale["velocity"])
-    close, broad = stats.t.pdf(f.vx, TAIL, scale=spread), 1 / f.span["vx"]
-    off = f.block_y(PARAMETERS.bias) - PARAMETERS.levels[0][1]
-    level = stats.t.pdf(off, TAIL, scale=np.hypot(3e-5, PARAMETERS.scale["level"]))
-    near = stats.t.pdf(off, TAIL, scale=MOVED)
-    rest, astray = stats.t.pdf(f.vy, TAIL, scale=spread) * level, near / f.span["vy"]
-    with_it = ((1 - 2 * STRAY) * close + STRAY * broad) * rest + STRAY * broad * astray
-    expected = np.log(with_it / ((1 - STRAY) * rest + STRAY * astray))
-    np.testing.assert_allclose(difference, expected, rtol=1e-9)
 
 
 def test_a_block_held_still_above_its_place_is_not_at_rest_on_it():

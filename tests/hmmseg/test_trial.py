@@ -301,21 +301,6 @@ def test_mappings_that_do_not_fit_the_file():
         read_trial(ours, parse_rig({"columns": {"xl": "x1"}}))
 
 
-def test_gripper_tolerance_and_mapping_stand_in_the_rig():
-    rig = parse_rig({
-        "tolerance": {"position": 1e-3, "force": 0.05},
-        "gripper": {"opening": "width", "wrench": ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], "tool_mass": 0.5,
-                    "centre_of_mass": [0, 0, 0.05]},
-    })  # fmt: skip
-    assert rig.tolerance.position == 1e-3
-    assert rig.tolerance.property is None
-    assert rig.gripper is not None
-    assert rig.gripper.channels == ("x", "y", "z", "width", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
-    columns = {name: np.linspace(0, 1, 9) for name in ("t", *rig.gripper.channels)}
-    with pytest.raises(InputError, match="Fx, Fy, Fz: show no free motion"):
-        read_trial(columns, rig)
-
-
 def test_units():
     assert si_factor("mm") == 1e-3
     assert known_unit("Milliseconds") == "ms"
