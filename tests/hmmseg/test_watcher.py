@@ -23,6 +23,7 @@ from hmmseg.online import hypothesis as one
 from hmmseg.online.hypotheses import Table, absorb
 from hmmseg.online.hypothesis import HYPOTHESIS, RANGES, READING
 from hmmseg.online.watcher import Watcher
+from hmmseg.online.wrist import Closings
 from hmmseg.segmentation.align import align, segment
 from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, features, log_likelihoods
 from hmmseg_cli.main import main
@@ -327,6 +328,24 @@ def test_a_first_grip_without_free_motion_is_told(performed):
     late = {name: c[columns["t"] > 1.7] for name, c in columns.items()}
     with pytest.raises(InputError, match="no free motion"):
         follow_wrist(late, wrist_rig(SETUP))
+
+
+def test_an_opening_is_read_as_it_comes():
+    """Closes at 0.1 m/s on something 30 mm wide that gives 1 mm, and opens again."""
+    t = np.arange(0, 3, 0.01)
+    way = 0.05 - 0.1 * np.clip(t - 0.5, 0, None)
+    held = 0.029 + 0.001 * np.exp(-(t - 0.7) / 0.03)
+    opening = np.where(way > 0.03, way, held) + np.where(t > 2, 0.1 * (t - 2), 0)
+    closings, known = Closings(lambda t, opening: None), []
+    for at, value in zip(t, opening, strict=True):
+        closings.take(float(at), float(value))
+        known.append(closings.known)
+    assert closings.number == 1
+    grip = closings.grips[-1]
+    assert grip.grip.width == pytest.approx(0.03, abs=3 * grip.grip.width_sd)
+    assert grip.start == pytest.approx(0.7, abs=0.03) and grip.stop == pytest.approx(2.0, abs=0.03)
+    assert (np.diff(known) >= 0).all() and (t - known).max() < 0.3
+    assert closings.free(0.3, 0.05) and not closings.free(1.0, 0.029)
 
 
 def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
