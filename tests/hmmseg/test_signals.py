@@ -205,10 +205,7 @@ def test_velocities_of_their_own_stay():
     trial, rig = _trial()
     signals = task_space(trial, rig)
     assert timely(signals, trial, rig) is signals
-
-
-def test_positions_that_never_change_prove_nothing():
-    still = np.zeros(50)
+    still = np.zeros(50)  # positions that never change prove nothing
     assert not late_differences(np.arange(50) * 0.05, still, still)
 
 
@@ -218,9 +215,6 @@ def test_rates_beside_a_kink_are_those_of_their_own_side():
     left, right = one_sided(t, np.where(t < kink, 0.3 * t + 0.1 * t**2, 0.3 * kink + 0.1 * kink**2))[0]
     assert left[20] == pytest.approx(0.3 + 0.2 * kink, rel=1e-6)
     assert right[20] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_noise_of_one_sided_rates():
     t, rng = np.arange(20_000) * 0.05, np.random.default_rng(1)
     rates, noise = one_sided(t, rng.standard_normal(t.size))
     assert rates[:, 5:-5].std() == pytest.approx(noise, rel=0.03)
