@@ -67,21 +67,20 @@ def bare_pickle(path):
     path.write_bytes(pickle.dumps(Exploding()))
 
 
-def zip_bomb(path):
-    """An array that claims a thousand times what the file holds."""
+def claiming(path, size, held, how):
+    """An archive of an array that claims so many numbers, of which the file holds so many bytes."""
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (2_000_000_000,)}
-    )
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bomb:
-        bomb.writestr("t.npy", header.getvalue() + bytes(50_000_000))
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (size,)})
+    with zipfile.ZipFile(path, "w", how) as file:
+        file.writestr("t.npy", header.getvalue() + bytes(held))
+
+
+def zip_bomb(path):
+    claiming(path, 2_000_000_000, 50_000_000, zipfile.ZIP_DEFLATED)
 
 
 def huge_claim(path):
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr("t.npy", header.getvalue() + bytes(80))
+    claiming(path, 10**15, 80, zipfile.ZIP_STORED)
 
 
 def climbing(path):

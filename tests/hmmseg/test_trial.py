@@ -143,15 +143,6 @@ REFUSED_CSV = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "message"), REFUSED_CSV)
-def test_csv_refused_with_its_message(tmp_path, text, message):
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=rf"a\.csv: {message}") as caught:
-        read_trial(path, JOINTED)
-    assert "\n" not in str(caught.value)
-
-
 REFUSED_TABLES = [
     (table().assign(fx1=np.nan), "DataFrame: column fx1: has no values; expected at least one number"),
     (table().assign(fx1=["a"] * 12), "DataFrame: row 1, column fx1: a is not a finite number"),
@@ -438,10 +429,13 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "line"), REFUSED)
-def test_refused_with_its_line(tmp_path, text, line):
+@pytest.mark.parametrize(
+    ("text", "line", "read"),
+    [*((*each, {"rig": JOINTED}) for each in REFUSED_CSV), *((*each, {"task": TWO}) for each in REFUSED)],
+)
+def test_csv_refused_with_its_line(tmp_path, text, line, read):
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=rf"a\.csv: ({line})") as caught:
-        read_trial(path, task=TWO)
+        read_trial(path, **read)
     assert "\n" not in str(caught.value)
