@@ -220,6 +220,16 @@ def test_jax_and_numpy_agree_on_the_density():
     assert 0 < np.isinf(found).sum() < 20  # beyond the farthest as well
 
 
+def test_the_mode_is_found_in_a_process_of_single_precision():
+    post = posterior(drawn(make_design(deviations=2), 8)[0])
+    double = find_mode(post)
+    with jax.enable_x64(False):
+        single = find_mode(post)
+        assert jnp.zeros(1).dtype == np.float32  # as it was
+    np.testing.assert_array_equal(single.scales, double.scales)
+    assert single.converged
+
+
 @pytest.mark.parametrize("share", [0.02, 0.2])
 def test_planted_scatter_is_found_and_widens_what_it_touches(share):
     """Pads that differ by 2 % or 20 % from grip to grip, where the prior has 0.1 %."""

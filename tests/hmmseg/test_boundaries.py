@@ -376,18 +376,12 @@ def test_a_grip_that_does_not_slide_ends_when_it_did():
         assert found.sd < 1.5 * plain.sd
 
 
-@pytest.fixture(scope="module")
-def example():
-    """Signals of a recording, its subtasks, and what was learned of it, with no biases."""
+def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets():
     folder = example_folder()
     rig = Rig.read(folder / "rig.toml")
-    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
     signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
-    return signals, aligned.subtasks, replace(aligned.fit.parameters, bias=np.zeros(4))
-
-
-def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets(example):
-    signals, _, parameters = example
+    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
+    parameters = aligned.fit.parameters
     stiff = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(4e-4, 1e-6, 0.0), 0.0, 1e-3)
     n, step = signals.t.size, 1.5e-3
     still = np.full(n, 0.01)
@@ -396,7 +390,7 @@ def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets(exam
         signals, x1=-still - pushed, x2=still - pushed, vx1=0 * still, vx2=0 * still,
         fx1=0 * still, fx2=np.full(n, -1.0),
     )  # fmt: skip
-    table = contacts(made, stiff, parameters)
+    table = contacts(made, stiff, replace(parameters, bias=np.zeros(4)))
     held = np.zeros(n, bool)
     held[n // 4 : n // 2] = True
     moved, _ = table._pushed(1, held)
@@ -404,13 +398,16 @@ def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets(exam
     np.testing.assert_allclose(moved[n // 2 :], step, atol=1e-9)
 
 
-def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger(example):
-    signals, steps, parameters = example
+def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():
+    folder = example_folder()
+    rig = Rig.read(folder / "rig.toml")
+    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
+    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
     late = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(1e-5, 1e-6, 0.0), 5e-3, 1e-3)
     n = signals.t.size
     shaking = 5e-3 * np.random.default_rng(0).standard_normal(n)
     still = replace(signals, vy1=shaking, vy2=shaking, fy1=np.zeros(n), fy2=np.zeros(n))
-    table = contacts(still, late, parameters)
-    load = table._load(steps[1], np.ones(n, bool), making=False)
+    table = contacts(still, late, replace(aligned.fit.parameters, bias=np.zeros(4)))
+    load = table._load(aligned.subtasks[1], np.ones(n, bool), making=False)
     np.testing.assert_allclose(load.pressed, load.pressed[0], rtol=1e-9)
     assert load.hidden and load.pressed[0] > 0

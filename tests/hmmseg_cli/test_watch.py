@@ -8,7 +8,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from hmmseg import Watcher
+from hmmseg_cli.live import Live, picture, spark
 from hmmseg_cli.main import main
 
 CASE = Path(__file__).parents[2] / "recordings" / "paper_blocks"
@@ -46,10 +49,12 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
         (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
         (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
         (lambda rows: [], "standard input: is empty"),
-        (lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
-         "row 6, column fy2: 1e+300 is no"),
+        (
+            lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
+            "row 6, column fy2: 1e+300 is no",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_input_gets_one_line(run, change, message):
     code, _, err = run(change(ROWS[:10]))
     assert code == 2
@@ -80,3 +85,19 @@ def test_bad_rows_can_be_left_out(run):
     code, lines, err = run(rows, "--skip-bad-rows")
     assert code == 0 and len(lines) == 20
     assert "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
+
+
+def test_the_live_picture_shows_where_the_task_is():
+    watcher = Watcher(COMMAND[2], COMMAND[4])
+    live = Live(watcher, lines=False)
+    live._console.file = io.StringIO()
+    for row in ROWS[1:60]:
+        t, *values = map(float, row.split(","))
+        answer = watcher.update(t, values)
+        live.update(answer)
+    live.close()
+    console = Console(file=io.StringIO(), width=140)
+    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
+    text = console.file.getvalue()
+    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
+    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"
