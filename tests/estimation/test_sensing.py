@@ -95,17 +95,8 @@ ALTERED = {
 }  # fmt: skip
 
 
-QUICK = (
-    "frozen force",
-    "constant",
-    "frozen encoder",
-    "wild cell",
-    "saturated",
-    "twice",
-    "one finger",
-    "one vertical",
-    "clock",
-)
+QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "twice", "one finger",
+         "one vertical", "clock")  # fmt: skip
 
 
 @pytest.mark.parametrize(
