@@ -118,6 +118,11 @@ def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
     np.testing.assert_allclose(starts(first)[1:4], (np.array([5, 6, 7]) - 0.5) * 0.05)
 
 
+def test_equal_agreement_goes_to_holding_on_the_ground():
+    out = segment("111" + "323" + "2222" + "333" + "111", PICK)
+    assert out.spans[2].start == pytest.approx(5.5 * 0.05)
+
+
 def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
     carried = segment("1113s3222233s11", PICK)
     assert carried.complete
@@ -137,6 +142,13 @@ def test_a_move_that_never_happens_fails_at_its_pickup_and_keeps_the_rest():
     assert [s.subtask for s in out.spans] == ["pregrasp", "pickup", "carry", "place", "release"]
     assert out.spans[-1].end == pytest.approx(18 * 0.05)
     json.dumps(out.to_json(), allow_nan=False)
+
+
+def test_flicker_does_not_pass_for_a_later_move():
+    # Agreeing with the first 2 and 3 of the flicker would make the rest the moves of block2.
+    out = segment("1" * 30 + "2" + "3" * 12 + "2" * 30 + "3" * 12 + "1" * 30, STACK)
+    assert out.failed is not None and out.failed.index == 5
+    assert [s.object for s in out.spans] == ["block1"] * 5
 
 
 def test_an_unknown_number_of_repeats_is_counted():

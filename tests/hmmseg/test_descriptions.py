@@ -33,6 +33,12 @@ def test_systematic_uncertainty_by_number_list_or_name():
     assert rig.systematic.link_length == (0.0,) * 4
 
 
+def test_gripper_and_tolerance():
+    rig = parse_rig({"tolerance": {"position": 1e-3}, "gripper": {"opening": "width", "tool_mass": 0.5}})
+    assert (rig.tolerance.position, rig.tolerance.property) == (1e-3, None)
+    assert rig.gripper.channels[:4] == ("x", "y", "z", "width") and rig.gripper.tool_mass == 0.5
+
+
 REFUSED = [
     ({"speed": 1}, r"rig: key speed: unknown key; expected one of .*rate.* \(did you mean"),
     ({"noise": {"forse": 1}}, r"rig: key noise.forse: unknown key; .*did you mean force"),

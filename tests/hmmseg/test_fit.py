@@ -163,6 +163,13 @@ def test_trials_that_fit_are_not_called_failures():
     assert all(r.complete for r in segment_sequence([t for t, _ in data], TASK, taught()))
 
 
+def test_saved_models_segment_alike(tmp_path):
+    trial, _ = record(62)
+    save_model(taught(), tmp_path / "m.npz")
+    loaded = load_model(tmp_path / "m.npz", TASK)
+    assert segment_sequence([trial], TASK, loaded) == segment_sequence([trial], TASK, taught())
+
+
 def broken_models(tmp_path):
     path = tmp_path / "m.npz"
     save_model(taught(), path)

@@ -124,6 +124,13 @@ def test_boundaries_and_properties_agree_with_those_off_line(watched):
     assert blocks["block1"]["height"]["mean"] == pytest.approx(0.016, abs=2e-4)
 
 
+def test_uncertainties_tighten(watched):
+    _, lines, _ = watched
+    sds = [line["properties"]["block1"]["weight"]["sd"] for line in lines
+           if "weight" in line["properties"].get("block1", {}) and 2.5 < line["t"] < 3.7]  # fmt: skip
+    assert sds[-1] < 0.7 * sds[0]
+
+
 def test_nothing_is_looked_ahead(watched):
     """What comes later changes no answer before."""
     _, lines, _ = watched

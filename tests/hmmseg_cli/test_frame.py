@@ -208,6 +208,14 @@ def test_standard_output_is_kept_clean(capsys):
     assert "warning: beware\n" in printed.err
 
 
+def test_quiet(capsys):
+    with Output("test", quiet=True) as out:
+        out.print("to people")
+        out.warn("beware")
+        out.finish({})
+    assert tuple(capsys.readouterr()) == ("", "")
+
+
 def test_strict_json():
     document = {"a": np.array([1.0, np.nan]), "b": (np.float32(0.5), np.int64(3), np.bool_(True)),
                 "c": float("inf"), "d": [float("-inf"), None, "x"], "e": Path("p"), 3: "µ"}  # fmt: skip

@@ -11,6 +11,7 @@ from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.replay import replay, residual_summary, smooth
 from simgap.world.simulate import simulate_trial
 from simgap.world.virtual_model import (
+    RIGID_PAD,
     PassivityControl,
     VirtualModel,
     physics,
@@ -62,6 +63,12 @@ def test_a_step_refuses_what_is_no_motion():
         model.step([[np.nan, 0], [0, 0]], np.zeros((2, 2)), 1e-3)
     with pytest.raises(ValueError, match="dt > 0"):
         model.step(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)
+
+
+def test_rigid_fingertips_get_a_stiff_pad_and_smaller_steps():
+    rigid = physics(HAND.model_copy(update={"fingertip": type(HAND.fingertip)()}), [PAPER_BLOCKS["block1"]])
+    assert float(rigid.pad_normal[0]) == RIGID_PAD
+    assert substeps_for(rigid, 1e-3) > substeps_for(physics(HAND, [PAPER_BLOCKS["block1"]]), 1e-3)
 
 
 def test_replay_of_a_simulated_trial_leaves_the_sensors_noise(performed):
