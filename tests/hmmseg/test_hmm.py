@@ -305,6 +305,16 @@ def test_inside_jit_what_is_impossible_is_minus_infinity():
     assert np.isnan(jax.jit(hmm.log_evidence)(ll, chain))
 
 
+def test_a_process_in_single_precision_gets_the_same():
+    ll, bands = random_problem(8, 3, seed=2)
+    chain = chain_of(bands)
+    inside = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
+    with jax.enable_x64(False):
+        outside = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
+    for a, b in zip(jax.tree.leaves(inside), jax.tree.leaves(outside), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_in_single_precision_a_long_recording_keeps_its_labels_inside_jit():
     rng = np.random.default_rng(3)
     n, num_states = 1_000_000, 5

@@ -13,15 +13,7 @@ from simgap.attribution.heldout import WANDER, Heldout, invariance, scatter_betw
 from simgap.attribution.posterior import Background, Forms, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import detected, leniently, sought, statistic, weights
-from simgap.attribution.verdict import (
-    ALARM,
-    Explanation,
-    acting,
-    conclude,
-    known,
-    probabilities,
-    significant,
-)
+from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known, probabilities, significant
 
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
@@ -440,6 +432,18 @@ def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
 
 
 SURE = 1e-12  # a p-value that leaves no doubt of a gap
+
+
+def test_what_changes_sign_between_trials_is_no_cause():
+    rows = rows_of(samples=30)
+    push = np.ones(rows.time.size) * (rows.channel == 0)
+    sizes = np.array([3.0, -1.0, 2.5, 0.2])[rows.trial]
+    residual = np.random.default_rng(0).standard_normal(rows.time.size) + sizes * push
+    gap = Gap(rows, residual, np.zeros((rows.time.size, 0)), (linear("a", push[:, None]),))
+    f = forms(gap)
+    model = next(m for m in sought(f) if m.effects == (0,))
+    assert invariance(f, model, 0, rows.trial).log_bayes_factor < -3
+    assert attribute(gap, heldout=False).verdict == "unknown"
 
 
 def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | None = None) -> Explanation:
