@@ -23,14 +23,8 @@ SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", 
 
 
 def cell(channel: str, subtask: str, share: float, trial: str = "trial_01.csv", band=(0.0, 1.0)) -> dict:
-    return {
-        "trial": trial,
-        "channel": channel,
-        "subtask": subtask,
-        "band": list(band),
-        "share": share,
-        "z": 100 * share,
-    }
+    where = {"trial": trial, "channel": channel, "subtask": subtask, "band": list(band)}
+    return where | {"share": share, "z": 100 * share}
 
 
 def body(verdict: str, causes: list[str], **more) -> dict:

@@ -17,7 +17,6 @@ import sys
 import tempfile
 import threading
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -314,21 +313,6 @@ def test_properties_that_nothing_has_are_refused(value, key, lab, capsys):
     assert f"block1.{key}" in capsys.readouterr().err
 
 
-def test_an_archive_that_unpacks_to_a_gigabyte_of_nothing_is_refused(lab, capsys):
-    with zipfile.ZipFile("trial.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        with archive.open("t.npy", "w", force_zip64=True) as member:
-            header = io.BytesIO()
-            np.lib.format.write_array_header_1_0(
-                header, {"descr": "<f8", "fortran_order": False, "shape": (2**25 + 2**20,)}
-            )
-            member.write(header.getvalue())
-            for _ in range(2**8 + 2**3):
-                member.write(bytes(2**20))
-        archive.writestr("x1.npy", b"")
-    assert main(["segment", "trial.npz", *HAND]) == 2
-    assert "unpacks from" in capsys.readouterr().err
-
-
 # Slow, as an alarm that goes off in the wrong place ends the whole test run.
 # A reader interrupted between opening a file and holding on to it leaves its closing to Python.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -378,7 +362,8 @@ def test_ctrl_c_in_a_callback_is_heard(capsys):
     try:
         with pytest.raises(KeyboardInterrupt), heard():
             called()
-            time.sleep(5)
+            for _ in range(100):
+                time.sleep(0.05)
     finally:
         signal.signal(signal.SIGINT, usual)
     assert capsys.readouterr().err == ""
@@ -446,13 +431,3 @@ def test_the_same_seed_gives_the_same_digits(name, lab):
     restore(lab, before)
     main([*COMMANDS[name], "--seed", "5"])
     assert files(lab) == first
-
-
-def test_a_run_that_fails_leaves_another_s_results(lab):
-    assert main(COMMANDS["identify"]) == 0
-    kept = files(lab)
-    (lab / "bad.csv").write_text("t,x\n0,1\n")
-    assert main(["identify", "bad.csv", *HAND, "--json", "out.json"]) == 2
-    (lab / "bad.csv").unlink()
-    assert files(lab) == kept
-    assert json.loads(kept["out.json"])["format"] == "hmmseg.identify/1"
