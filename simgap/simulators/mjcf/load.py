@@ -89,8 +89,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     if not SHORTEST <= plain.opt.timestep <= 1.0:
         raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
                          f"from {SHORTEST:g} to 1 s")  # fmt: skip
-    from simgap.simulators.mjcf.settable import setting_of
-    from simgap.simulators.mjcf.setting import names_of
+    from simgap.simulators.mjcf.setting import names_of, setting_of
 
     for column in described.columns.values():
         known = names_of(plain, column.thing)

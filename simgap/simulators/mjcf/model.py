@@ -15,8 +15,8 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import Map
 from simgap.simulators.mjcf.play import Played
-from simgap.simulators.mjcf.runs import ACTS, HOLD, LATE, Runs
-from simgap.simulators.mjcf.setting import Changed, Setting
+from simgap.simulators.mjcf.runs import ACTS, Runs
+from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting
 from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
@@ -61,7 +61,7 @@ class MjcfSimulator:
         self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
-        self._nominal = {n: s.get(self.model) for n, s in self.settings.items()}
+        self._nominal = {n: s.nominal for n, s in self.settings.items()}
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
         """One run; channels that are not finite where it diverged."""

@@ -14,13 +14,12 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.laws import Laws
 from simgap.simulators.mjcf.laws import run as run_with
+from simgap.simulators.mjcf.setting import HOLD, LATE
 from simgap.simulators.mjcf.signals import Held, Side, aligned
 from simgap.simulators.protocol import Channel, Channels
 from simgap.simulators.recording import Recording
 
 APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
-HOLD = "option.hold"  # the setting of how commands are held between samples
-LATE = "option.late"  # the setting of how late within a step they come
 # A column of the times [s] from which on each row's commands are carried out; with "next" behind it when
 # those that follow are, and with a command's name what these are.
 ACTS = "acts:"
