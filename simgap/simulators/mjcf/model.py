@@ -13,16 +13,14 @@ import numpy as np
 from hmmseg.robust import bridged
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
-from simgap.simulators.mjcf.map import Map
+from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs
-from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting
+from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting, object_id
 from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
-
-POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 @dataclass
@@ -141,7 +139,7 @@ class MjcfSimulator:
         if self.map.keyframe is None:
             mujoco.mj_resetData(self.model, data)
         else:
-            mujoco.mj_resetDataKeyframe(self.model, data, _key(self.model, self.map.keyframe))
+            mujoco.mj_resetDataKeyframe(self.model, data, object_id(self.model, "key", self.map.keyframe))
         mujoco.mj_getState(self.model, data, state, int(self._spec))
         state[0] = 0.0
         return state
@@ -235,7 +233,3 @@ class MjcfSimulator:
 
 def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | None:
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
-
-
-def _key(model: Any, name: str) -> int:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)

@@ -55,7 +55,7 @@ def name_of(model: Any, kind: str, number: int) -> str:
 
 def names_of(model: Any, kind: str) -> list[str]:
     """Names of all objects of a kind, those without one left out."""
-    count = model.nu if kind == "actuator" else getattr(model, "njnt" if kind == "joint" else f"n{kind}")
+    count = model.nu if kind == "actuator" else getattr(model, {"joint": "njnt"}.get(kind, f"n{kind}"))
     return [name for name in (name_of(model, kind, i) for i in range(count)) if name]
 
 
