@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from hmmseg.io.rig import FORCE_CHANNELS
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.frame import CHANNELS
@@ -19,42 +18,26 @@ from simgap.report.robot import Course, Own, courses
 from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
 
-LABELS = {
-    "x": "x [cm]",
-    "y": "y [cm]",
-    "distance": "distance [cm]",
-    "offset": "offset [cm]",
-    "vx": "vx [cm/s]",
-    "vy": "vy [cm/s]",
-    "fx": "net fx [N]",
-    "fy": "net fy [N]",
-    "grip": "grip [N]",
-    "shear": "shear [N]",
-}
+
+def _unit(channel: str) -> tuple[float, str]:
+    """How a channel of task space is shown: a factor, and its label."""
+    if channel in ("fx", "fy", "grip", "shear"):
+        return 1.0, f"{'net ' if channel.startswith('f') else ''}{channel} [N]"
+    return 100.0, f"{channel} [cm{'/s' if channel.startswith('v') else ''}]"
 
 
 def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     """A recorded signal in task space, SI."""
-
     from simgap.effects.base import tips
 
-    w = found.problem.frame.world
-    position, velocity = (z[trial] for z in tips(w))
-    force = dict(zip(FORCE_CHANNELS, w.force[trial].T, strict=True))
-    x1, y1, x2, y2 = position.T
-    table = {
-        "x": (x1 + x2) / 2,
-        "y": (y1 + y2) / 2,
-        "distance": x2 - x1,
-        "offset": y2 - y1,
-        "vx": (velocity[:, 0] + velocity[:, 2]) / 2,
-        "vy": (velocity[:, 1] + velocity[:, 3]) / 2,
-        "fx": force["fx1"] + force["fx2"],
-        "fy": force["fy1"] + force["fy2"],
-        "grip": np.minimum(force["fx1"], -force["fx2"]),
-        "shear": (force["fy1"] - force["fy2"]) / 2,
-    }
-    return table[channel]
+    world = found.problem.frame.world
+    (x1, y1, x2, y2), (vx1, vy1, vx2, vy2) = (each[trial].T for each in tips(world))
+    fx1, fy1, fx2, fy2 = world.force[trial].T
+    return {
+        "x": (x1 + x2) / 2, "y": (y1 + y2) / 2, "distance": x2 - x1, "offset": y2 - y1,
+        "vx": (vx1 + vx2) / 2, "vy": (vy1 + vy2) / 2, "fx": fx1 + fx2, "fy": fy1 + fy2,
+        "grip": np.minimum(fx1, -fx2), "shear": (fy1 - fy2) / 2,
+    }[channel]  # fmt: skip
 
 
 def draw_signal(found: Diagnosis, path: Path) -> None:
@@ -65,14 +48,14 @@ def draw_signal(found: Diagnosis, path: Path) -> None:
     t, there = frame.world.t[r, :n], found.problem.whitening.weight[r, :n, c] > 0
     with canvas(path, height=3.4) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        factor = 100.0 if "cm" in LABELS[cell.channel] else 1.0
+        factor, label = _unit(cell.channel)
         recorded = _recorded(found, r, cell.channel)[:n]
         above.plot(t, factor * recorded, color="black", lw=1.2, label="recorded")
         off = found.problem.whitening.weight[r, :n, c]
         for residual, colour, name in ((found.before, RED, "simulated"), (found.after, BLUE, "corrected")):
             left = np.divide(residual[r, :n, c], off, out=np.full(n, np.nan), where=off > 0)
             above.plot(t, factor * (recorded - left), ".", color=colour, ms=2, label=name)
-        above.set_ylabel(LABELS[cell.channel])
+        above.set_ylabel(label)
         above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
         inside = t[frame.arrays.subtask[r, :n] == cell.subtask]
         for axes in (above, below):
