@@ -62,7 +62,7 @@ def simulate(
             require_encoder(f".{animation_format.value}")
         description, hand = read_task(task), read_rig(rig)
         if hand.effects:
-            from simgap.patch.write import checked
+            from simgap.patch import checked
 
             checked(hand.effects, str(rig))
         if not isinstance(description, BlockTask):

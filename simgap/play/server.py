@@ -24,8 +24,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from hmmseg.errors import InputError
-from simgap.play.felt import effect_values, felt_effects
 from simgap.play.session import Session
+from simgap.play.world import effect_values, felt_effects
 
 HOST = "127.0.0.1"
 FRAME = 1 / 60  # look: s

@@ -15,8 +15,11 @@ from simgap.simulators.mjcf.engine import rollout, warned  # noqa: E402
 from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
 from simgap.simulators.mjcf.patch import attribute_set, option_set  # noqa: E402
-from simgap.simulators.mjcf.runs import _carried_out, _commanded  # noqa: E402
-from simgap.simulators.mjcf.signals import Held  # noqa: E402
+from simgap.simulators.mjcf.runs import (  # noqa: E402
+    Held,
+    _carried_out,
+    _commanded,
+)
 
 XML = """<mujoco model="swing">
   <compiler angle="radian"/>

@@ -25,9 +25,9 @@ from hmmseg.io.task import read_task
 from hmmseg.segmentation.align import align
 from hmmseg_cli.main import main
 from hmmseg_cli.play import diagnosed
-from simgap.play.felt import effect_values, felt_effects, scene_with, sensed
 from simgap.play.server import PlayServer
 from simgap.play.session import Session, default_rig, default_task
+from simgap.play.world import effect_values, felt_effects, scene_with, sensed
 from simgap.world.properties import PAPER_BLOCKS
 
 

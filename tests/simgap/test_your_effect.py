@@ -16,7 +16,7 @@ from simgap import channels, effects
 from simgap.generic import effects as of_ensembles
 from simgap.generic.diagnose import diagnose
 from simgap.generic.trials import align
-from simgap.play.felt import felt_effects
+from simgap.play.world import felt_effects
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
 from simgap.simulators.user import checked

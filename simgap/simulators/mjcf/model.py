@@ -15,9 +15,8 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
-from simgap.simulators.mjcf.runs import ACTS, Runs
+from simgap.simulators.mjcf.runs import ACTS, Held, Runs, body_rate
 from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting, object_id
-from simgap.simulators.mjcf.signals import Held, body_rate
 from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording

@@ -17,9 +17,8 @@ import numpy as np
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.laws import MOTOR
-from simgap.simulators.mjcf.runs import Runs
+from simgap.simulators.mjcf.runs import Held, Runs
 from simgap.simulators.mjcf.setting import Changed, Setting, setting_of
-from simgap.simulators.mjcf.signals import Held
 from simgap.simulators.protocol import Channels, Job
 from simgap.simulators.recording import Recording
 
