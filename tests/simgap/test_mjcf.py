@@ -60,16 +60,19 @@ def loaded(files, *candidates: str):
     return found, log, effects
 
 
-def test_a_window_is_the_linear_pendulum(files):
-    """Small swings at omega^2 = m g l / (m l^2 + I) from a start between samples of the grid."""
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_a_window_is_the_linear_pendulum(files, share):
+    """Small swings at omega^2 = m g l / (m l^2 + I) between samples of the grid, of the weight
+    that no drive carries."""
     found, log, _ = loaded(files)
     simulator = found.simulator
     nominal = {n: p.nominal for n, p in simulator.parameters.items()}
     window = Recording("a.csv", log.t[7:60], {n: v[7:60] for n, v in log.columns.items()}, 7)
+    nominal["drive.gravity_compensation"] = share
     (channels,) = simulator.simulate_many([Job(nominal, window, {"q": 1e-3, "q_rate": -2e-3})])
     assert channels is not None
     inertia = 0.5 * 0.2**2 + 0.4 * 0.5 * 0.01**2
-    omega = np.sqrt(0.5 * 9.81 * 0.2 / inertia)
+    omega = np.sqrt((1 - share) * 0.5 * 9.81 * 0.2 / inertia)
     t = window.t - window.t[0]
     np.testing.assert_allclose(
         channels["q"], 1e-3 * np.cos(omega * t) - 2e-3 / omega * np.sin(omega * t), atol=2e-8

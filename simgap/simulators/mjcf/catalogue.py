@@ -35,7 +35,6 @@ from simgap.simulators.mjcf.transmission import (
     SHARE,
     Motion,
     elasticity,
-    gravity_compensation,
     motion_of,
     sizes_of,
 )
@@ -73,8 +72,7 @@ def offered(
     catalogue.add_play(joints, motions, {log.name: log for log in recordings})
     simulator.__post_init__()
     simulator.prepare(recordings)
-    beyond = (gravity_compensation, elasticity)
-    return [effect for family in beyond for effect in family(simulator, recordings, motions, joints)]
+    return elasticity(simulator, recordings, motions, joints)
 
 
 class _Catalogue:
@@ -216,6 +214,8 @@ class _Catalogue:
     def add_options(self) -> None:
         """Gravity's direction, and of the simulation its step, its solver and how it holds commands."""
         if np.linalg.norm(self.model.opt.gravity) > 0:
+            says = "drives carry this share of the weights by themselves (gravity compensation)"
+            self.add("drive.gravity_compensation", 0.1, says, low=-0.5, high=1.5)
             for axis in ("tilt_x", "tilt_y"):
                 self.add(f"option.{axis}", 0.01, "the base is tilted", effect="gravity.direction")
         says = "the simulator's own time step, relative"

@@ -77,25 +77,24 @@ def _friction(model: Any, joint: str, own: Mapping[str, float]) -> _Friction:
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Sensors (B, steps, sensors) of runs from full states (B, size) with controls, and behind these applied
-    torques, (B, steps, width): as `mujoco.rollout` gives them, with laws that act."""
+    """Sensors (B, steps, sensors) of runs from full states (B, size) with controls (B, steps, actuators), as
+    `mujoco.rollout` gives them, with laws that act."""
     out = np.empty((*control.shape[:2], model.nsensordata))
-    spec, nu = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), model.nu
-    plain, applied = np.array(model.dof_frictionloss), control.shape[2] > nu
+    spec, plain = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), np.array(model.dof_frictionloss)
     step, limit, rate = mujoco.mj_step, model.dof_frictionloss, data.qvel
     motor, bias, force, pushed = data.qfrc_actuator, data.qfrc_bias, data.actuator_force, data.qfrc_applied
-    extra = applied or bool(laws.fading) or any(f.drag for f in laws.friction)
+    extra = bool(laws.fading) or any(f.drag for f in laws.friction)
     try:
         for b in range(len(first)):
             limit[:] = plain
             mujoco.mj_resetData(model, data)
             mujoco.mj_setState(model, data, first[b], spec)
-            data.ctrl[:] = control[b, 0, :nu]
+            data.ctrl[:] = control[b, 0]
             mujoco.mj_forward(model, data)
             data.qacc_warmstart[:] = 0.0
             for k in range(control.shape[1]):
                 if extra:
-                    pushed[:] = control[b, k, nu:] if applied else 0.0
+                    pushed[:] = 0.0
                 for f in laws.friction:
                     d, w = f.dof, float(rate[f.dof])
                     most = plain[d]
@@ -111,7 +110,7 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
                 for a, by, arm in laws.fading:
                     now = float(force[a])
                     pushed -= by * abs(now) * now * arm
-                data.ctrl[:] = control[b, k, :nu]
+                data.ctrl[:] = control[b, k]
                 step(model, data)
                 out[b, k] = data.sensordata
     finally:

@@ -92,7 +92,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     if not SHORTEST <= plain.opt.timestep <= 1.0:
         raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
                          f"from {SHORTEST:g} to 1 s")  # fmt: skip
-    from simgap.simulators.mjcf.setting import names_of, setting_of
+    from simgap.simulators.mjcf.setting import compiled, names_of, setting_of
 
     def check(key: str, kind: str, name: str, known: Sequence[str]) -> None:
         if name not in known:
@@ -112,9 +112,9 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
         if hasattr(body, "simple"):
             body.simple = False
-    model = spec.compile()
+    model = compiled(spec)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    simulator, warnings = _simulator(mujoco, model, described, address, str(map_file))
+    simulator, warnings = _simulator(mujoco, model, described, address)
     simulator.spec = spec
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, whole)
@@ -159,13 +159,13 @@ def _add_sensors(mujoco: Any, spec: Any, columns: Mapping[str, Mapped]) -> dict[
 
 
 def _simulator(
-    mujoco: Any, model: Any, described: Map, address: Mapping[str, tuple[str, int]], file: str
+    mujoco: Any, model: Any, described: Map, address: Mapping[str, tuple[str, int]]
 ) -> tuple[MjcfSimulator, list[str]]:
     """The simulator of a model and its map, without parameters; what its columns leave open."""
     from simgap.simulators.mjcf.model import MjcfSimulator
     from simgap.simulators.mjcf.setting import name_of, object_id
 
-    kinds = mujoco.mjtJoint
+    file, kinds = described.file, mujoco.mjtJoint
     channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
     for column, m in described.columns.items():
         unit = _unit(mujoco, model, m)

@@ -135,6 +135,7 @@ class Map(StrictTable):
     uncertain: tuple[Name, ...] = ()
     sd: dict[Name, FinitePositive] = Field(default_factory=dict)
     payload_at: dict[Name, Place] = Field(default_factory=dict)
+    _file: str = ""
 
     @field_validator("columns")
     @classmethod
@@ -142,6 +143,11 @@ class Map(StrictTable):
         if all(m.kind == "command" for m in columns.values()):
             raise ValueError("are all commands: nothing to compare; expected a joint, sensor or body")
         return columns
+
+    @property
+    def file(self) -> str:
+        """The file that it was read from."""
+        return self._file
 
     @property
     def time(self) -> str:
@@ -156,7 +162,9 @@ class Map(StrictTable):
 
 def read_map(path: Path) -> Map:
     """The map of a TOML file; InputError names the key at fault."""
-    return validated(Map, read_toml(path), str(path))
+    found = validated(Map, read_toml(path), str(path))
+    found._file = str(path)
+    return found
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}

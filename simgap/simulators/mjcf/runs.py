@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.engine import rollout
 from simgap.simulators.mjcf.laws import Laws
 from simgap.simulators.mjcf.laws import run as run_with
 from simgap.simulators.mjcf.setting import HOLD, LATE
@@ -109,7 +109,6 @@ def aligned(log: Recording, out: dict[str, np.ndarray], columns: Mapping[str, st
             out[n] = out[n] * sign
 
 
-APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
 # A column of the times [s] from which on each row's commands are carried out; with "next" behind it when
 # those that follow are, and with a command's name what these are.
 ACTS = "acts:"
@@ -152,52 +151,39 @@ class Runs:
         h = float(self.model.opt.timestep)
         span = max(float(log.t[-1] - log.t[0]) for log in logs)
         times = np.arange(int(np.ceil(span / h - 1e-9)) + 2) * h
-        alike: dict[tuple, list[int]] = defaultdict(list)
+        alike: dict[int, list[int]] = defaultdict(list)
         for i, log in enumerate(logs):
-            alike[len(log), *(n for n in log.columns if n.startswith(APPLIED))].append(i)
-        parts = [(mine, [logs[i] for i in mine], applied) for (_, *applied), mine in alike.items()]
-        sides = [self._side(own, times) for _, own, _ in parts]
-        width = self.model.nu + (self.model.nv if any(applied for _, _, applied in parts) else 0)
-        control = np.zeros((len(logs), times.size, width))
+            alike[len(log)].append(i)
+        parts = [(mine, [logs[i] for i in mine]) for mine in alike.values()]
+        sides = [self._side(own, times) for _, own in parts]
+        control = np.zeros((len(logs), times.size, self.model.nu))
         line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
-        for (mine, own, applied), side in zip(parts, sides, strict=True):
+        for (mine, own), side in zip(parts, sides, strict=True):
             held = _carried_out(own, side.held, late * h)
             for column, place in self.driven.items():
                 control[mine, :, place] = held(np.array([_commanded(log, column) for log in own]), line)
-            for column in applied:
-                control[mine, :, self._pushed(column)] = side.held(np.array([log[column] for log in own]))
         sensed = self._sensed(first, control, changed)
         out: list[Channels | None] = [None] * len(logs)
-        for (mine, own, _), side in zip(parts, sides, strict=True):
+        for (mine, own), side in zip(parts, sides, strict=True):
             for i, channels in zip(mine, self._read(own, sensed[mine], side, times), strict=True):
                 out[i] = channels
         return out
 
-    def _pushed(self, column: str) -> int:
-        """Position of such a column among controls and applied torques."""
-        joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, column.removeprefix(APPLIED))
-        return self.model.nu + int(self.model.jnt_dofadr[joint])
-
     def _sensed(self, first: np.ndarray, control: np.ndarray, changed: tuple) -> np.ndarray:
         """Sensors (B, steps, sensors) of runs from these states."""
-        steps, width = control.shape[1:]
-        spec = int(mujoco.mjtState.mjSTATE_CTRL)
-        if width > self.model.nu:
-            spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
-
         laws = Laws.of(self.model, changed)
 
         def run() -> np.ndarray:
             if laws:
                 return run_with(self.model, self.data[0], laws, first, control)
             return rollout.rollout(
-                self.model, self.data, first, control if width else None,
-                control_spec=spec, nstep=steps, persistent_pool=True,
+                self.model, self.data, first, control if self.model.nu else None,
+                nstep=control.shape[1], persistent_pool=True,
             )[1]  # fmt: skip
 
         given = hashlib.blake2b(first.tobytes() + control.tobytes()).digest()
         key = (changed, first.shape, control.shape, given)
-        size = 8 * len(first) * steps * max(self.model.nsensordata, 1)
+        size = 8 * len(first) * control.shape[1] * max(self.model.nsensordata, 1)
         return latest(self._ran, key, run, int(KEPT / size))
 
     def _side(self, logs: Sequence[Recording], times: np.ndarray) -> Side:

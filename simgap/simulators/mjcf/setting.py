@@ -80,6 +80,17 @@ def most_of(model: Any, actuator: int) -> float:
     return 0.0
 
 
+def compiled(spec: Any) -> Any:
+    """The model of an MjSpec, such that gravity compensation can be set where the spec has none."""
+    own = [body.gravcomp for body in spec.bodies]
+    for body in spec.bodies:
+        body.gravcomp = 1.0
+    model = spec.compile()
+    for body, share in zip(spec.bodies, own, strict=True):
+        body.gravcomp = model.body_gravcomp[body.id] = share
+    return model
+
+
 def nothing(model: Any, value: float) -> None:
     """Set nothing: the parameter acts while the model runs."""
 
@@ -236,11 +247,26 @@ def _option(model: Any, _: str, attribute: str) -> Setting | None:
     return Setting(whole, unit, 0.0, put, xml=None if key is None else ("option", "", key, None), mixed=mixed)
 
 
+def _drive(model: Any, _: str, attribute: str) -> Setting | None:
+    """gravity_compensation: the share of the weights that drives carry by themselves, of all bodies that
+    are not free."""
+    roots = np.asarray(model.body_rootid)
+    first = np.asarray(model.body_jntadr)[roots]
+    free = np.array([j >= 0 and int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) for j in first])
+    held, own = np.flatnonzero(~free), np.array(model.body_gravcomp)
+
+    def put(m: Any, value: float) -> None:
+        m.body_gravcomp[held] = own[held] + value
+
+    return Setting(f"drive.{attribute}", "1", 0.0, put) if attribute == "gravity_compensation" else None
+
+
 KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...]]] = {
     "joint": (_joint, ("damping", "frictionloss", "armature", "stiffness", "springref", *OF_JOINTS)),
     "body": (_body, ("mass", "com_x", "com_y", "com_z", "payload", "length")),
     "geom": (_geom, ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size")),
     "actuator": (_actuator, ("gain", "damping", "limit", FADE)),
+    "drive": (_drive, ("gravity_compensation",)),
     "option": (_option, ("tilt_x", "tilt_y", "timestep", "iterations", "hold", "late")),
 }
 
@@ -250,7 +276,7 @@ def setting_of(model: Any, name: str) -> Setting:
 
     Args:
         model: A compiled MuJoCo model.
-        name: `KIND:NAME.ATTRIBUTE`, or `option.ATTRIBUTE`.
+        name: `KIND:NAME.ATTRIBUTE`; `option.ATTRIBUTE` and `drive.ATTRIBUTE` of the whole model.
 
     Returns:
         The setting, whose nominal value is the model's.
@@ -261,7 +287,7 @@ def setting_of(model: Any, name: str) -> Setting:
     where = f"--candidate {name}"
     head, dot, attribute = name.rpartition(".")
     kind, colon, thing = head.partition(":")
-    if not dot or kind not in KINDS or bool(colon) == (kind == "option"):
+    if not dot or kind not in KINDS or bool(colon) == (kind in ("option", "drive")):
         raise InputError(
             where, "names nothing of the model", "KIND:NAME.ATTRIBUTE, such as joint:elbow.damping"
         )
@@ -278,7 +304,7 @@ def setting_of(model: Any, name: str) -> Setting:
 
 FIELDS = (
     *("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness", "qpos_spring"),
-    *("body_mass", "body_inertia", "body_ipos", "body_pos"),
+    *("body_mass", "body_inertia", "body_ipos", "body_pos", "body_gravcomp"),
     *("geom_friction", "geom_solref", "geom_solimp", "geom_size", "geom_rbound"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
 )  # all that settings set
