@@ -259,9 +259,8 @@ def _draw(
     if out.figures is None and out.report is None:
         return
     from hmmseg.contact.decompose import subtasks
-    from hmmseg_cli.gap_figures import draw_generic, draw_signal
     from hmmseg_cli.pages import Setting, page
-    from simgap.report.figures import draw_all, draw_how_far
+    from simgap.report.figures import draw_all, draw_generic, draw_how_far, draw_signal
 
     body, names = found.body, list(dict.fromkeys(s.label for s in subtasks(task)))
     signal = draw_generic if pads is None else draw_signal
