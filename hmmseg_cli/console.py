@@ -421,7 +421,7 @@ def _put(temporaries: dict[Path, Path]) -> None:
 def scratch() -> Iterator[Path]:
     """A folder of temporary files for this run."""
     try:
-        folder = tempfile.TemporaryDirectory(prefix="hmmseg-", ignore_cleanup_errors=True)
+        folder = tempfile.TemporaryDirectory(prefix="hmmseg_", ignore_cleanup_errors=True)
     except OSError as error:
         raise InputError("the folder for temporary files", f"cannot be used ({error.strerror})",
                          "TMPDIR to name one that can be written to") from None  # fmt: skip

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.schema import parse_toml
+from hmmseg.tables import listed
 from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed, check_file
 
 FilesArgument = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of any kind.")]
@@ -80,16 +80,12 @@ def _show(out: Output, found: Any) -> None:
     if found.gaps:
         longest = max(end - start for start, end in found.gaps)
         head += f"; {len(found.gaps)} gaps, the longest {longest:.3g} s"
-    table = Table(title=head, title_justify="left")
-    for name, justify in (("column", "left"), ("unit", "left"), ("rate [Hz]", "right"), ("missing", "right"),
-                          ("least", "right"), ("most", "right"), ("course", "left")):  # fmt: skip
-        table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
-    for channel in found.channels:
-        unit = "text" if channel.text else channel.unit or ""
-        rate = "" if channel.rate is None else f"{channel.rate:.4g}"
-        table.add_row(channel.name, unit, rate, str(channel.missing or ""), _number(channel.minimum),
-                      _number(channel.maximum), sparkline(channel.course))  # fmt: skip
-    out.print(table)
+    heads = ("column", "unit", "rate [Hz]", "missing", "least", "most", "course")
+    rows = [
+        (c.name, "text" if c.text else c.unit or "", _number(c.rate), str(c.missing or ""),
+         _number(c.minimum), _number(c.maximum), sparkline(c.course)) for c in found.channels
+    ]  # fmt: skip
+    out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
     for line in found.said:
         out.warn(line)
     if found.toml:

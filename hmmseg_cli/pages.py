@@ -78,7 +78,7 @@ def identification_page(
 
 def picture(draw: Callable[[Path], Any], caption: str) -> dict[str, str]:
     """A figure as base64 PNG with its caption."""
-    with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
+    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
         path = Path(folder) / "figure.png"
         draw(path)
         return {"data": embedded(path), "caption": caption}
@@ -182,7 +182,7 @@ class Setting:
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
     """The page as text; `draw(path)` draws figures at path(name.png), which are embedded."""
-    with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
+    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
         draw(lambda name: Path(folder) / name)
         images = {p.stem: embedded(p) for p in sorted(Path(folder).iterdir())}
     effect = body["effects"].get("+".join(body["causes"]))
