@@ -265,8 +265,8 @@ def _digest(path: Path) -> str:
 
 
 TASK_KEYS = {"objects", "moves", "sequence"}  # without any of which there is no task
-MAPS, NO_HAND = {"columns", "topics"}, {"columns", "topics", "rate", "gravity"}  # keys of a rig that tells
-# how files are read, as `inspect --write` makes it, and those beside which it describes no hand
+MAPS = {"columns", "topics"}  # keys of a rig that describe how files are read, as `inspect --write` makes it
+NO_HAND = MAPS | {"rate", "gravity"}  # keys that describe no hand
 
 
 def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:

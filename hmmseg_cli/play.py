@@ -53,7 +53,7 @@ def play(
         session.check_folder(output)
         out.print("preparing the blocks ...")
         if effects:
-            session.beside(session.world_with(effects))
+            session.compare_with(session.world_with(effects))
         server = PlayServer(session, output)
         with contextlib.suppress(KeyboardInterrupt):
             asyncio.run(_serve(out, server, port, open_page))

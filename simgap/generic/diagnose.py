@@ -6,7 +6,7 @@ ways in which whole trials differ (offset, slope, size, time) and an autocorrela
 & Ware, Biometrics 38, 1982) by moments. Rows are whitened by its symmetric root, which leaves every row
 closest to its own feature (Kessy, Lewin & Strimmer, Am. Stat. 72, 2018). All real trials share the error of
 the simulated mean, S trials of covariance B: for R real ones of covariance A, rows are whitened by
-A + B R / S, so that their mean is known as well as it is; their mean square, less than one, is in `told`.
+A + B R / S, so that their mean is known as well as it is; `Block.expected` has their mean square, below one.
 
 Whether there is a gap is judged by exchanging the labels real and simulated (Besag & Clifford, Biometrika 78,
 1991): exchanged trials are healthy twins.
@@ -154,7 +154,7 @@ class Block:
     index: np.ndarray
     root: np.ndarray
     variance: np.ndarray
-    told: np.ndarray
+    expected: np.ndarray
     trials: int
 
 
@@ -170,8 +170,8 @@ def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Block, .
         of_row = a + b * len(real) / len(sim)
         values, vectors = np.linalg.eigh(of_row)
         root = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))) @ vectors.T
-        told = np.einsum("ij,jk,ik->i", root, a + b / len(sim), root)
-        out.append(Block(c, index, root, np.diag(of_row), told, len(real)))
+        expected = np.einsum("ij,jk,ik->i", root, a + b / len(sim), root)
+        out.append(Block(c, index, root, np.diag(of_row), expected, len(real)))
     return tuple(out)
 
 
@@ -244,12 +244,12 @@ def gap_of(
         np.tile(time, count), tuple(cut.trial.file for cut in lay.ensembles.real[:count]),
         (*names, *(n + POWER for n in names), DURATIONS), lay.ensembles.subtasks,
     )  # fmt: skip
-    told = np.zeros(lay.kind.size)
+    expected = np.zeros(lay.kind.size)
     for block in white:
-        told[block.index] = block.told
+        expected[block.index] = block.expected
     residual = np.concatenate([_whitened(white, row) for row in real - sim.mean(0)])
     return Gap(parts, residual, np.zeros((residual.size, 0)), tuple(candidates),
-               told=np.tile(told, count), parts_alike=True)  # fmt: skip
+               told=np.tile(expected, count), parts_alike=True)  # fmt: skip
 
 
 def _whitened(white: Sequence[Block], values: np.ndarray) -> np.ndarray:

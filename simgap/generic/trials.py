@@ -266,7 +266,7 @@ def transformed(values: np.ndarray) -> np.ndarray:
 def windowed(
     given: Layout, cut: Cut, channel: int, subtask: int, values: np.ndarray | None = None
 ) -> np.ndarray:
-    """Samples (window,) of a channel from a subtask's start on, or of `values` in its stead."""
+    """Samples (window,) of a channel from a subtask's start on, or of other `values` at its times."""
     n, t = int(given.window[subtask]), cut.trial.t
     if values is None:
         values = cut.trial.channels[given.ensembles.channels[channel]]

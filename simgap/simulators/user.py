@@ -149,9 +149,8 @@ class Checks:
         found = self.call(lambda: list(run(lent)))
         if len(found) != len(jobs):
             raise InputError(self.of(run), f"gave {len(found)} runs", f"{len(jobs)}, one for each job")
-        told = [None if f is None else self.given_back(run, f, j.recording)
+        return [None if f is None else finite(self.given_back(run, f, j.recording))
                 for f, j in zip(found, jobs, strict=True)]  # fmt: skip
-        return [None if f is None else finite(f) for f in told]
 
     def state_at(self, run: Callable[..., Any], recording: Recording, t: float) -> dict[str, Any]:
         """State name -> (value, standard deviation)."""

@@ -38,7 +38,7 @@ def made() -> Session:
 
 @pytest.fixture
 def session(made):
-    made.beside(None)
+    made.compare_with(None)
     return made
 
 
@@ -105,7 +105,7 @@ def test_numbers_that_are_none_change_nothing(session, tmp_path):
 
 
 def test_an_effect_beside_is_felt(session):
-    session.beside(session.world_with({"force_gain": {"gain": 0.5}}))
+    session.compare_with(session.world_with({"force_gain": {"gain": 0.5}}))
     session.aim(session.x["block1"], 0.008, False)
     session.advance(1500)
     session.aim(session.x["block1"], 0.008, True)

@@ -246,7 +246,7 @@ class _Catalogue:
             self.add(f"geom:{name}.size", 0.01, f"size of {name}", low=-0.5)
 
     def add_named(self, named: Sequence[str]) -> None:
-        """What the user asks for beyond these."""
+        """What the user names beyond these."""
         for name in named:
             if name not in self.parameters:
                 nominal = setting_of(self.model, name).nominal

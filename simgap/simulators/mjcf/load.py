@@ -41,21 +41,21 @@ class Loaded:
             [name for name, mapped in columns.items() if mapped.kind == "command"], self.simulator.acts,
         )  # fmt: skip
         values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
-        told = list(raw.warnings)
+        warnings = list(raw.warnings)
         for name, mapped in columns.items():
             if mapped.kind == "command":  # a drive holds it until the next
                 values[name] = held(values[name])
             elif mapped.thing == "joint" and mapped.kind == "position" and self.turns(mapped.name):
                 wrapped, values[name] = values[name], unwrapped(values[name])
                 if not np.array_equal(wrapped, values[name], equal_nan=True):
-                    told.append(f"{path}: column {name} jumps by whole turns, which were taken out")
+                    warnings.append(f"{path}: column {name} jumps by whole turns, which were taken out")
         log = raw.with_columns(values)
         for pose in self.simulator.free.values():
             log = continuous(log, [pose[a] for a in POSE[3:]])
         _check_ranges(self.simulator.model, columns, log, str(path))
         _check_goals(self.simulator, log, str(path))
-        told += _clipped(self.simulator, log, str(path))
-        return replace(log, warnings=tuple(told))
+        warnings += _clipped(self.simulator, log, str(path))
+        return replace(log, warnings=tuple(warnings))
 
     def turns(self, joint: str) -> bool:
         """Whether a joint is a hinge, whose angle may be recorded with jumps by whole turns."""

@@ -122,7 +122,7 @@ class Runs:
     """Runs of the `model` in threads, one for each of `data`; the rest as in `MjcfSimulator`.
 
     The same windows are run hundreds of times: how they lie on the steps is kept. So are the latest runs, for
-    many are asked for again: a finite difference in one number of the solver has all others' runs in it.
+    many are needed again: a finite difference in one number of the solver contains all others' runs.
     """
 
     model: Any
