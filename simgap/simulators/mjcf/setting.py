@@ -258,7 +258,8 @@ def _drive(model: Any, _: str, attribute: str) -> Setting | None:
     def put(m: Any, value: float) -> None:
         m.body_gravcomp[held] = own[held] + value
 
-    return Setting(f"drive.{attribute}", "1", 0.0, put) if attribute == "gravity_compensation" else None
+    # Derived: mj_setConst counts the bodies that have it, and without any none is carried.
+    return Setting(f"drive.{attribute}", "1", 0.0, put, True) if attribute == "gravity_compensation" else None
 
 
 KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...]]] = {
