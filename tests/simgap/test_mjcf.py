@@ -68,7 +68,7 @@ def test_a_window_is_the_linear_pendulum(files, share):
     simulator = found.simulator
     nominal = {n: p.nominal for n, p in simulator.parameters.items()}
     window = Recording("a.csv", log.t[7:60], {n: v[7:60] for n, v in log.columns.items()}, 7)
-    simulator.simulate(nominal | {"body:bob.mass": 0.6}, log, {"q": 0.1, "q_rate": 0.0})  # must leave no trace
+    simulator.simulate(nominal | {"body:bob.mass": 0.6}, log, {"q": 0.1, "q_rate": 0.0})  # leaves no trace
     nominal["drive.gravity_compensation"] = share
     (channels,) = simulator.simulate_many([Job(nominal, window, {"q": 1e-3, "q_rate": -2e-3})])
     assert channels is not None
