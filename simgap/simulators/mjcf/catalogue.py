@@ -207,7 +207,7 @@ class _Catalogue:
             made[found.width] = found
             sd = GAP * sizes_of(motions, j).reach
             self.parameters[found.width] = Parameter(0.0, sd, unit, low=0.0, effect=effect)
-            self.settings[found.width] = Setting(found.width, unit, 0.0, nothing)
+            self.settings[found.width] = Setting(found.width, unit, 0.0, nothing, stored=False)
             self.says[effect] = f"play between motor and {name}"
         simulator.played = made
 

@@ -26,9 +26,9 @@ LATE = "option.late"  # by which share of a step they come later
 class Setting:
     """One quantity that can be set: its `nominal` value, and `put(model, value)`, which sets it.
 
-    `derived`: whether constants derived from it (mj_setConst) must be recomputed. `xml`: its attribute, for a
-    patch, as (object kind, object name, attribute, index or None). `mixed`: what comes only in whole steps is
-    interpolated between two runs, without it and with it at this value.
+    `derived`: whether constants derived from it (mj_setConst) must be recomputed. `stored`: whether MuJoCo
+    writes it. `mixed`: what comes only in whole steps is interpolated between two runs, without it and with
+    it at this value.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Setting:
     nominal: float
     put: Put
     derived: bool = False
-    xml: tuple[str, str, str, int | None] | None = None
+    stored: bool = True
     mixed: float | None = None
 
 
@@ -121,7 +121,7 @@ def _joint(model: Any, name: str, attribute: str) -> Setting | None:
     force, way = ("N m", "rad") if turning else ("N", "m")
     laws = dict(zip(OF_JOINTS, ("1", force, force, f"{way}/s", f"{force} s^2/{way}^2"), strict=True))
     if attribute in laws:
-        return Setting(f"joint:{name}.{attribute}", laws[attribute], 0.0, nothing)
+        return Setting(f"joint:{name}.{attribute}", laws[attribute], 0.0, nothing, stored=False)
     dofs = np.flatnonzero(np.asarray(model.dof_jntid) == j)
     found = {
         "damping": ("dof_damping", dofs, f"{force} s/{way}"),
@@ -134,8 +134,7 @@ def _joint(model: Any, name: str, attribute: str) -> Setting | None:
         return None
     array, at, unit = found
     nominal = float(getattr(model, array)[at[0]])
-    return Setting(f"joint:{name}.{attribute}", unit, nominal, _to(array, at), attribute == "armature",
-                   ("joint", name, attribute, None))  # fmt: skip
+    return Setting(f"joint:{name}.{attribute}", unit, nominal, _to(array, at), attribute == "armature")
 
 
 def _body(model: Any, name: str, attribute: str) -> Setting | None:
@@ -148,13 +147,12 @@ def _body(model: Any, name: str, attribute: str) -> Setting | None:
         def put(m: Any, value: float) -> None:
             m.body_mass[b], m.body_inertia[b] = value, inertia * (value / mass)
 
-        return Setting(whole, "kg", mass, put, True, ("body", name, "mass", None))
+        return Setting(whole, "kg", mass, put, True)
     if attribute in ("com_x", "com_y", "com_z"):
         k = "xyz".index(attribute[-1])
-        return Setting(whole, "m", float(model.body_ipos[b, k]), _to("body_ipos", (b, k)), True,
-                       ("body", name, "ipos", k))  # fmt: skip
+        return Setting(whole, "m", float(model.body_ipos[b, k]), _to("body_ipos", (b, k)), True)
     if attribute == "length" and np.any(model.body_pos[b]):
-        return Setting(whole, "1", 0.0, _larger(model, ("body_pos", b)), True, ("body", name, "pos", None))
+        return Setting(whole, "1", 0.0, _larger(model, ("body_pos", b)), True)
     return None
 
 
@@ -183,7 +181,7 @@ def _geom(model: Any, name: str, attribute: str) -> Setting | None:
     g, whole = object_id(model, "geom", name), f"geom:{name}.{attribute}"
     if attribute == "size" and int(model.geom_type[g]) != int(mujoco.mjtGeom.mjGEOM_MESH):
         put = _larger(model, ("geom_size", g), ("geom_rbound", g))
-        return Setting(whole, "1", 0.0, put, xml=("geom", name, "size", None))
+        return Setting(whole, "1", 0.0, put)
     found = {
         "friction": ("friction", 0, "1"),
         "torsional": ("friction", 1, "m"),
@@ -195,26 +193,24 @@ def _geom(model: Any, name: str, attribute: str) -> Setting | None:
         return None
     key, k, unit = found
     array = f"geom_{key}"
-    return Setting(whole, unit, float(getattr(model, array)[g, k]), _to(array, (g, k)),
-                   xml=("geom", name, key, k))  # fmt: skip
+    return Setting(whole, unit, float(getattr(model, array)[g, k]), _to(array, (g, k)))
 
 
 def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
     a, whole = object_id(model, "actuator", name), f"actuator:{name}.{attribute}"
     if attribute == "gain":  # of a position servo its stiffness
         put = _larger(model, ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1)))
-        key = "kp" if model.actuator_biasprm[a, 1] else "gainprm"
-        return Setting(whole, "1", 0.0, put, xml=("actuator", name, key, None))
+        return Setting(whole, "1", 0.0, put)
     if attribute == "damping":
         put = _to("actuator_biasprm", (a, 2), -1.0)
         nominal = -float(model.actuator_biasprm[a, 2])
-        return Setting(whole, "N m s/rad", nominal, put, xml=("actuator", name, "kv", None))
+        return Setting(whole, "N m s/rad", nominal, put)
     if attribute == FADE and most_of(model, a):
-        return Setting(whole, "1", 0.0, nothing)
+        return Setting(whole, "1", 0.0, nothing, stored=False)
     if attribute == "limit" and model.actuator_forcelimited[a]:
         put = _to("actuator_forcerange", a, np.array([-1.0, 1.0]))
         nominal = float(model.actuator_forcerange[a, 1])
-        return Setting(whole, "N", nominal, put, xml=("actuator", name, "forcerange", None))
+        return Setting(whole, "N", nominal, put)
     return None
 
 
@@ -233,18 +229,15 @@ def _option(model: Any, _: str, attribute: str) -> Setting | None:
     def more(m: Any, value: float) -> None:
         m.opt.iterations = 10 * count
 
-    made: dict[str, tuple[str, Put, str | None, float | None]] = {
-        "tilt_x": ("rad", tilt, "gravity", None),
-        "tilt_y": ("rad", tilt, "gravity", None),
-        "timestep": ("1", scale, "timestep", -0.75),
-        "iterations": ("1", more, "iterations", 1.0),
-        "hold": ("1", nothing, None, None),
-        "late": ("1", nothing, None, None),
+    made = {
+        "tilt_x": Setting(whole, "rad", 0.0, tilt),
+        "tilt_y": Setting(whole, "rad", 0.0, tilt),
+        "timestep": Setting(whole, "1", 0.0, scale, mixed=-0.75),
+        "iterations": Setting(whole, "1", 0.0, more, stored=False, mixed=1.0),
+        "hold": Setting(whole, "1", 0.0, nothing, stored=False),
+        "late": Setting(whole, "1", 0.0, nothing, stored=False),
     }
-    if attribute not in made:
-        return None
-    unit, put, key, mixed = made[attribute]
-    return Setting(whole, unit, 0.0, put, xml=None if key is None else ("option", "", key, None), mixed=mixed)
+    return made.get(attribute)
 
 
 def _drive(model: Any, _: str, attribute: str) -> Setting | None:
@@ -259,7 +252,8 @@ def _drive(model: Any, _: str, attribute: str) -> Setting | None:
         m.body_gravcomp[held] = own[held] + value
 
     # Derived: mj_setConst counts the bodies that have it, and without any none is carried.
-    return Setting(f"drive.{attribute}", "1", 0.0, put, True) if attribute == "gravity_compensation" else None
+    made = Setting("drive.gravity_compensation", "1", 0.0, put, derived=True, stored=False)
+    return made if attribute == "gravity_compensation" else None
 
 
 KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...]]] = {
