@@ -54,12 +54,18 @@ FORMAT = "hmmseg.ranges/1"
 
 
 def files(rig_text: str, body: Body) -> dict[str, str]:
-    """Texts of rig.toml, ranges.json and actual.toml by name; none where no cause was named.
+    """Write out a corrected virtual model.
 
-    rig.toml is the given one, its comments kept, with each found value's interval after it; what the rig
-    has no number for is under [effects], which `hmmseg simulate` applies. ranges.json holds every found
-    parameter by its place in rig.toml, and every block's properties, as mean, sd and 90 % interval in SI
-    units. actual.toml holds the blocks as identified with the causes in the model.
+    Args:
+        rig_text: The rig.toml that was diagnosed.
+        body: The diagnosis's document.
+
+    Returns:
+        By name the texts of three files; none where no cause was named. rig.toml is the given one, its
+        comments kept, with each found value's interval after it; what the rig has no number for is under
+        [effects], which `hmmseg simulate` applies. ranges.json holds every found parameter by its place in
+        rig.toml, and every block's properties, as mean, sd and 90 % interval in SI units. actual.toml holds
+        the blocks as identified with the causes in the model.
     """
     name = "+".join(body["causes"])
     entry = body["effects"].get(name)

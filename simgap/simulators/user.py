@@ -51,10 +51,17 @@ class UserSimulator:
 
 
 def load_simulator(spec: str) -> UserSimulator:
-    """The simulator NAME of a file, from `FILE.py:NAME`: an object, a class (made without arguments) or a
-    function with attributes `parameters` and `channels`.
+    """Load a simulator from a user's Python file.
 
-    InputError where the file or the name is missing, its code fails, or what it declares cannot be used.
+    Args:
+        spec: `FILE.py:NAME`; the name is of an object, a class (made without arguments) or a function with
+            attributes `parameters` and `channels`.
+
+    Returns:
+        The simulator, all its calls checked.
+
+    Raises:
+        InputError: The file or the name is missing, its code fails, or what it declares cannot be used.
     """
     file, _, name = spec.rpartition(":")
     where = f"--simulator {spec}"

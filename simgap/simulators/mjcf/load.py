@@ -72,7 +72,20 @@ class Loaded:
 
 
 def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Loaded:
-    """Read and check a model and its map; InputError names the file and the column or thing at fault."""
+    """Read and check a model and its map.
+
+    Args:
+        xml: The MJCF or URDF file.
+        map_file: Its map (TOML).
+        candidates: Names of further settings that are to be causes.
+
+    Returns:
+        The simulator, and how logs are read for it.
+
+    Raises:
+        InputError: MuJoCo is missing or does not read the model, or the map or a candidate names what the
+            model does not have.
+    """
     try:
         from simgap.simulators.mjcf.engine import mujoco
     except ImportError:
