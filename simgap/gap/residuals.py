@@ -27,7 +27,7 @@ from simgap.effects.base import (
     tips,
 )
 from simgap.effects.filters import faded, lowpass
-from simgap.gap.frame import CHANNELS, Arrays
+from simgap.gap.frame import CHANNELS, OFFSET, Arrays
 from simgap.phases import Phase
 
 # Forces between two samples: read at other times, their slopes, and by how much these are in doubt.
@@ -241,33 +241,78 @@ def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray) -> np.ndar
 
 
 def in_grip(
-    values: np.ndarray, firm: np.ndarray, channel: str, arrays: Arrays, noise: np.ndarray, world: World
-) -> tuple[np.ndarray, np.ndarray]:
-    """Values (T, N) that are one constant in every grip, less that constant; and their variance's factor.
+    values: np.ndarray, weight: np.ndarray, noise: np.ndarray, firm: np.ndarray, world: World,
+    arrays: Arrays,
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
+    """x, y, distance and offset (T, N, 4), of which all but the distance are one constant in every grip, less
+    that constant; their variances over the `noise`'s squared, and what unseen moves of joints cost [nats].
 
-    Where pads may slide the constant walks at random; the values are less its prediction from those before.
+    A block on the ground is taken along by a hand that moves: it stays where it was pushed to. Where pads may
+    slide the other constants walk, too, and joints in a dead band move unseen: values are less their
+    prediction from those before.
     """
-    weight = firm * recorded(arrays, channel)
-    if world.modes[SLIDING]:
-        sd = noise[..., CHANNELS.index(channel)]
-        return _followed(values, weight, sd, SLIDE * world.slip, arrays.onehot)
-    return less_mean(values, arrays, weight), np.ones_like(values)
+    place = arrays.phase[..., Phase.PLACE]
+    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
+    pushed = _walk(arrays.pushed, parts.reshape(*place.shape, -1))
+    slides = _walk(SLIDE * world.slip, arrays.onehot)
+    if world.dead_band is not None:
+        walks = (pushed, slides, slides)
+        walk, new = (np.stack(each, -1) for each in zip(*walks, strict=True))
+        return _unseen(values, weight, noise, firm, world, walk, new)
+    out, loose = values * weight, np.ones_like(values)
+    out[..., 0], loose[..., 0] = _followed(values[..., 0], weight[..., 0], noise[..., 0], *pushed)
+    for c in (1, OFFSET):
+        if world.modes[SLIDING]:
+            out[..., c], loose[..., c] = _followed(values[..., c], weight[..., c], noise[..., c], *slides)
+        else:
+            out[..., c] = less_mean(values[..., c], arrays, weight[..., c])
+    return out, loose, 0.0
 
 
-def _followed(
-    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, walk: np.ndarray, grips: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
-
-    The state is where a grip holds its block, or where that stands: it goes by about `walk` (T, N) from one
-    sample to the next, the larger of both. A grip's first value sets it and says nothing.
-    """
-    from simgap.recursions import innovations
-
+def _walk(walk: np.ndarray, grips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variance (T, N) by which a grip's constant goes from one sample to the next, about the larger `walk` of
+    both squared, and where it is another grip's."""
     other = np.ones(walk.shape, bool)
     other[:, 1:] = (grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5
     before = np.concatenate([walk[:, :1], walk[:, :-1]], 1)
-    return innovations(values, weight, sd, np.square(np.maximum(walk, before)), other, ANYWHERE**2)
+    return np.square(np.maximum(walk, before)), other
+
+
+def _followed(
+    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, walk: np.ndarray, other: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
+
+    The state is where a grip holds its block, or where that stands. A grip's first value sets it and says
+    nothing.
+    """
+    from simgap.recursions import innovations
+
+    return innovations(values, weight, sd, walk, other, ANYWHERE**2)
+
+
+# prior: shares of the variance of anywhere in a dead band by which a joint moves unseen between two samples,
+# and their chances: as a rule it does not
+SHARES, CHANCES = np.array([0.0, 0.01, 1.0]), np.array([0.8, 0.1, 0.1])
+
+
+def _unseen(
+    values: np.ndarray, weight: np.ndarray, noise: np.ndarray, firm: np.ndarray, world: World,
+    walk: np.ndarray, new: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
+    """As `in_grip`, where joints lie somewhere in a dead band: of the distance that counts as `firm`ly as the
+    block is held."""
+    from simgap.recursions import tracked
+
+    assert world.dead_band is not None
+    band, (x, y) = world.dead_band, swung(world)
+    apart = np.array([-1.0, -1.0, 1.0, 1.0])
+    levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)
+    recorded = values - (levers @ band.place[..., None])[..., 0]
+    return tracked(
+        recorded, weight, noise, -levers, walk, new, ANYWHERE**2, band.pinned, band.place, band.drift,
+        band.wander, band.jump, SHARES, CHANCES,
+    )  # fmt: skip
 
 
 TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
@@ -277,8 +322,9 @@ CLOSED = 0.8  # chosen: share of its usual force by which a grip has closed: unt
 
 def residuals(
     world: World, arrays: Arrays, properties: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (T, N, C) in units of the channels, and how far their variance exceeds `noise` squared.
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Residuals (T, N, C) in units of the channels, how far their variance exceeds `noise` squared, and what
+    joints cost [nats] that move unseen.
 
     `properties` (O, 3): weight, width, height. The variance's factor is 1 where the correction of an effect
     leaves nothing in doubt.
@@ -317,14 +363,13 @@ def residuals(
     both = firmness(lesser, held, arrays.onehot, CLOSED)
     closed = firm * both
     still = closed * (arrays.phase[..., Phase.PICKUP] + place)
-    offset, loose_offset = in_grip(offset, closed * held, "offset", arrays, noise, world)
-    # A hand that moves takes what it holds on the ground along: the block stays where it was pushed to.
-    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
-    x, loose_x = _followed(
-        x, still * recorded(arrays, "x"), noise[..., CHANNELS.index("x")], arrays.pushed,
-        parts.reshape(*x.shape, -1),
-    )  # fmt: skip
-    y, loose_y = in_grip(y, closed * world.ground, "y", arrays, noise, world)
+    there = arrays.there[..., :4]
+    weight_of = np.stack([still, closed * world.ground, held, closed * held], -1) * there
+    sd = np.sqrt(np.square(noise[..., :4]) + _doubt(world, firm))
+    geometry, loose, unseen = in_grip(
+        np.stack([x, y, distance, offset], -1), weight_of, sd, firm, world, arrays
+    )
+    factor = loose * np.square(sd / noise[..., :4])
 
     acceleration, _ = fivepoint(world, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
@@ -343,31 +388,22 @@ def residuals(
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     speeds = _compact(mean_v) - gradient(world.t, mean_p)
-    geometry = np.stack([x, y, distance * held, offset], -1)
     # In the units of what was recorded: an effect must not gain by scaling the noise down.
     size = np.mean(world.link)
-    loose = np.stack([loose_x, loose_y, np.ones_like(x), loose_offset], -1)
-    factor = loose + _doubt(world, firm) / np.square(noise[..., :4])
     return (
         np.concatenate([geometry / size, speeds / size, forces], -1),
         np.concatenate([factor, np.ones_like(speeds), 1 + either / np.square(noise[..., 6:])], -1),
+        unseen,
     )
 
 
 def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
-    """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of angles and forces."""
-    if not (world.doubt_joints.any() or world.modes[LATE] or world.modes[SMOOTH]):
+    """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of forces."""
+    if not (world.modes[LATE] or world.modes[SMOOTH]):
         return np.zeros((*firm.shape, 4))
-    turn_x, turn_y = (np.where(world.jointed > 0.5, turn, 0.0) for turn in swung(world))
     pads = doubt_between(world)
-
-    def finger(turn: np.ndarray, give: np.ndarray, force: int) -> tuple[np.ndarray, np.ndarray]:
-        place = np.square(turn) * world.doubt_joints
-        pad = pads[..., force::2] * np.square(give)
-        return (place[..., :2].sum(-1) + pad[..., 0]), (place[..., 2:].sum(-1) + pad[..., 1])
-
-    (x1, x2), (y1, y2) = finger(turn_x, world.give_normal, 0), finger(turn_y, world.give_shear, 1)
-    x, y = x1 + x2, y1 + y2
+    x = (pads[..., ::2] * np.square(world.give_normal)).sum(-1)
+    y = (pads[..., 1::2] * np.square(world.give_shear)).sum(-1)
     return np.stack([x / 4, y / 4, x, y], -1) * np.square(firm)[..., None]
 
 

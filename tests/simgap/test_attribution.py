@@ -369,13 +369,14 @@ def test_causes_of_less_than_the_wanted_share_of_held_out_gap_are_unknown():
     assert attribute(gap).causes == ("a",)
 
 
-def test_a_cause_is_not_known_where_other_trials_show_no_gap_that_it_could_shrink():
-    """Noise of nine times the squares that there are: nothing to be gone, so no share of it is."""
+def test_a_cause_that_leaves_nothing_that_can_be_seen_is_known_however_little_it_was():
+    """Noise of nine times the squares that there are: no share is certain, unless something is left."""
     gap = gap_of({0: 3.0}, seed=6)
-    f, rng = forms(gap), np.random.default_rng(0)
-    for variance, likely in ((1.0, True), (9.0, False)):
-        others = Heldout.of(gap, np.full(3, variance), (0,))
-        found = _examined(f, (0,), np.full(f.count.size, variance), rng, others)
+    rest = 9.0 * np.sin(gap.rows.time * 40.0 + gap.rows.trial) * (gap.rows.channel == 2)
+    for more, likely in ((0.0, True), (rest, False)):
+        f, rng = forms(replace(gap, residual=gap.residual + more)), np.random.default_rng(0)
+        others = Heldout.of(f.gap, np.full(3, 9.0), (0,))
+        found = _examined(f, (0,), sought(f), np.full(f.count.size, 9.0), rng, others)
         assert found.causes == (0,)
         assert (found.known > 0.5) == likely
 

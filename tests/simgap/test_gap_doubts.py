@@ -7,13 +7,14 @@ from scipy.stats import multivariate_normal
 
 from simgap.channels import play
 from simgap.effects.geometry import within
-from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, driven, sensed
+from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, _walk, driven, sensed
+from simgap.recursions import tracked
 from tests.simgap.test_gap_effects import performance, world_of
 
 
 def _cost(values, weight, sd, slip, grips) -> float:
-    out, factor = _followed(*(np.asarray(z)[None] for z in (values, weight, sd, SLIDE * slip, grips)))
-    out, factor = np.asarray(out)[0], np.asarray(factor)[0]
+    walk = _walk(SLIDE * slip[None], grips[None])
+    out, factor = (z[0] for z in _followed(values[None], weight[None], sd[None], *walk))
     return float(0.5 * ((out / sd) ** 2 / factor + np.log(factor)).sum())
 
 
@@ -48,28 +49,82 @@ def test_a_joint_lies_where_it_was_pushed_to():
     played = np.stack([play(each, width) for each in true.T], 1)
     recorded = played + 1e-4 * rng.standard_normal(true.shape)
     half, inner = width / 2, slice(10, -10)
-
-    def off_and_variance(rates, unseen: float) -> tuple[np.ndarray, np.ndarray]:
-        world = world_of(performance())._replace(
-            t=np.asarray(t)[None], joints=np.asarray(recorded)[None], rates=np.asarray(rates)[None]
-        )
-        place, variance = (
-            np.asarray(z)[0, inner] for z in within(world, np.asarray(half), np.asarray(unseen))
-        )
-        return ((true - recorded)[inner] - place) / half, variance / half**2
-
+    world = world_of(performance())._replace(t=t[None], joints=recorded[None])
     # An encoder's speeds say nothing of the dead band.
-    off, blind = off_and_variance(np.gradient(recorded, t, axis=0), 1.0)
-    sure = blind < 0.02
-    assert sure.mean() > 0.7
-    assert np.sqrt(np.mean(off[sure] ** 2)) < 0.15
-    assert 0.3 < np.sqrt(np.mean(off[~sure] ** 2 / blind[~sure])) < 1.5
+    band = within(world._replace(rates=np.gradient(recorded, t, axis=0)[None]), half, 1.0)
+    off, pinned = (((true - recorded) - band.place[0]) / half)[inner], band.pinned[0, inner]
+    assert pinned.mean() > 0.6
+    assert np.sqrt(np.mean(off[pinned] ** 2)) < 0.15
+    assert np.abs(off[~pinned]).max() < 2.2 and (band.jump > 0).all() and not band.wander.any()
     # A tachometer's say how the joint crosses it.
-    off, variance = off_and_variance(
-        np.gradient(true, t, axis=0) + 2e-3 * rng.standard_normal(true.shape), 0.0
-    )
-    assert variance.sum() < 0.2 * blind.sum()
+    rates = np.gradient(true, t, axis=0) + 2e-3 * rng.standard_normal(true.shape)
+    band = within(world._replace(rates=rates[None]), half, 0.0)
+    off = (((true - recorded) - band.place[0]) / half)[inner]
     assert np.sqrt(np.mean(off**2)) < 0.15
+    assert not band.jump.any() and (band.wander > 0).all()
+
+
+def _tracked(values, sd, levers, pinned, place, jump, shares, chance):
+    """What a filter of two joints makes of one trial's values (N, 4) without constants that walk."""
+    n = len(values)
+    walk, new = np.zeros((1, n, 3)), np.zeros((1, n, 3), bool)
+    drift, wander = np.zeros((1, n, 2)), np.full((1, n, 2), 1e-6)
+    return tracked(
+        values[None], np.ones((1, n, 4)), np.full((1, n, 4), sd), levers[None], walk, new, ANYWHERE**2,
+        pinned[None], place[None], drift, wander, np.full((1, 2), jump), *map(np.asarray, (shares, chance)),
+    )  # fmt: skip
+
+
+def test_joints_in_dead_bands_are_marginalised_exactly():
+    """Without jumps: the joint normal density of all values, given the first of each constant."""
+    rng = np.random.default_rng(0)
+    n, sd, jump = 7, 0.03, 0.5
+    levers, values = rng.standard_normal((n, 4, 2)), rng.standard_normal((n, 4))
+    pinned = np.zeros((n, 2), bool)
+    pinned[3, 0] = True
+    place = rng.standard_normal((n, 2))
+    out, factor, cost = _tracked(values, sd, levers, pinned, place, jump, [0.0], [1.0])
+    assert cost == 0.0
+    # The oracle: states as sums of steps, one joint set anew at the fourth sample.
+    mean, covariance = np.zeros((n, 2)), np.zeros((2, n, n))
+    for j in range(2):
+        start, first = (3, 0.0) if j == 0 else (0, jump)
+        for k in range(n):
+            mean[k, j] = place[3, 0] if j == 0 and k >= 3 else place[0, j]
+            for m in range(n):
+                if (k >= 3) == (m >= 3) or j == 1:
+                    since = min(k, m) - (start if j == 1 or min(k, m) >= 3 else 0)
+                    covariance[j, k, m] = (jump if j == 0 and min(k, m) < 3 else first) + 1e-6 * since
+    lever = levers.reshape(-1, 2)
+    sample, constant = np.repeat(np.arange(n), 4), np.tile([0, 1, 3, 2], n)
+    whole = sum(np.outer(lever[:, j], lever[:, j]) * covariance[j][np.ix_(sample, sample)] for j in range(2))
+    same = (constant[:, None] == constant) & (constant != 3)
+    whole = whole + ANYWHERE**2 * same + sd**2 * np.eye(4 * n)
+    expected = (lever * mean[sample]).sum(1)
+    told = ~((sample == 0) & (constant != 3))  # constants of which nothing is known at first
+    full = multivariate_normal(expected, whole).logpdf(values.ravel())
+    known = multivariate_normal(expected[~told], whole[np.ix_(~told, ~told)]).logpdf(values.ravel()[~told])
+    z = out[0].ravel()[told] ** 2 / (sd**2 * factor[0].ravel()[told])
+    got = -0.5 * float((z + np.log(factor[0].ravel()[told]) + np.log(2 * np.pi * sd**2)).sum())
+    assert got == pytest.approx(full - known, rel=0.05)
+
+
+def test_a_joint_that_jumps_unseen_costs_one_choice_and_is_followed():
+    n, sd = 30, 0.01
+    place = np.where(np.arange(n) < 12, -1.0, 1.0)[:, None] * np.ones(2)
+    levers = np.zeros((n, 4, 2))
+    levers[:, 2] = 1.0
+    rng = np.random.default_rng(0)
+    values = (levers * place[:, None]).sum(-1) + sd * rng.standard_normal((n, 4))
+    start = np.full((n, 2), -1.0)
+    out, factor, cost = _tracked(
+        values, sd, levers, np.zeros((n, 2), bool), start, 4 / 3, [0.0, 1.0], [0.9, 0.1]
+    )
+    assert cost == pytest.approx(-(n - 1) * np.log(0.9) - np.log(0.1), abs=2.5)  # at the start it may as well
+    jumped = np.flatnonzero(factor[0, :, 2] > 1e3)
+    assert 12 in jumped and jumped.size <= 2
+    others = np.setdiff1d(np.arange(2, n), jumped)
+    assert np.sqrt(np.mean(out[0, others, 2] ** 2 / factor[0, others, 2])) < 1.5 * sd
 
 
 def _ringing(frequency=6.0, damping=0.05, drive=0.3):
