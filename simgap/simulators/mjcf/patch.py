@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from simgap.robots.model import Composed, Point
 from simgap.simulators.mjcf.engine import mujoco
@@ -22,7 +23,8 @@ def patched(model: Path, composed: Composed, point: Point, changed: Sequence[str
     Returns:
         The corrected model as MJCF, and a line for everything that no attribute of it holds.
     """
-    simulator, parameters = composed.simulator, composed.parameters(point)
+    simulator: Any = composed.simulator
+    parameters = composed.parameters(point)
     compiled = mujoco.MjModel.from_xml_path(str(model))
     mine, lacking = dict[str, str](), []
     for one in changed:
