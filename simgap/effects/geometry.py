@@ -61,7 +61,7 @@ def moved_joints(p: Performance, values, change) -> Performance:
 
 def _patched_link_length(document, found):
     """Links longer by `scale`, all of them, or each by its own: link11 is finger 1's first."""
-    from simgap.patch.write import interval_comment, number
+    from simgap.patch import interval_comment, number
 
     if "fingers" not in document:
         return None

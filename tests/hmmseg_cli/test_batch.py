@@ -128,15 +128,15 @@ class Deadly(Executor):
     def __init__(self, name, deaths, error):
         self.name, self.deaths, self.error, self.broken = name, deaths, error, False
 
-    def submit(self, function, paths, *lab):
+    def submit(self, function, path, *lab):
         future = Future()
-        if self.deaths and any(self.name == p.stem for p in paths):
+        if self.deaths and self.name == path.stem:
             self.deaths.pop()
             self.broken = True
         if self.broken:
             future.set_exception(self.error)
         else:
-            future.set_result([SimpleNamespace(segmentation=str(p)) for p in paths])
+            future.set_result(SimpleNamespace(segmentation=str(path)))
         return future
 
 

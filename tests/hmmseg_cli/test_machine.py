@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 
 from hmmseg.example import example_folder
-from hmmseg_cli import console
 from hmmseg_cli.main import heard, main
 
 STACK = Path(__file__).parents[1] / "data/stack"
@@ -206,32 +205,6 @@ def test_names_may_hold_what_a_file_system_allows(lab, capsys):
     for name in ("a" * 251 + ".json", "\0.json"):
         assert main(["decompose", "task.toml", "--json", name]) == 2
     assert main(["segment", "b" * 252 + ".csv", *HAND]) == 2
-
-
-def test_what_a_killed_run_left_is_swept_by_the_next(lab, monkeypatch, tmp_path):
-    where = tmp_path / "tmp"
-    where.mkdir()
-    environment = {**os.environ, "TMPDIR": str(where)}
-    program = "from hmmseg_cli.console import scratch\nwith scratch() as f: print(f, flush=True); input()"
-    alive, dead = (
-        subprocess.Popen([sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE,
-                         stdout=subprocess.PIPE, text=True) for _ in range(2)
-    )  # fmt: skip
-    folders = [Path(p.stdout.readline().strip()) for p in (alive, dead)]
-    dead.kill()
-    dead.communicate()
-    (where / "hmmseg-notes").mkdir()
-    (where / "hmmseg-theirs").mkdir()
-    (where / "hmmseg-theirs" / "thesis.txt").touch()
-    for path in where.iterdir():
-        os.utime(path, (time.time() - 3600,) * 2)
-    monkeypatch.setattr(tempfile, "tempdir", str(where))
-    alive2 = folders[0].exists()
-    with console.scratch() as mine:
-        assert mine.exists() and not folders[1].exists()
-    assert alive2 and folders[0].exists()
-    alive.communicate("\n", timeout=60)
-    assert sorted(p.name for p in where.iterdir()) == ["hmmseg-theirs"]
 
 
 def test_without_a_temporary_folder_a_line_says_so(lab, monkeypatch, capsys):
