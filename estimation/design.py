@@ -501,13 +501,13 @@ def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
 def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
     """Extra prior sd (4,) of force biases that free motion shows and the rig does not admit [N].
 
-    Forces in free motion should vanish; where their pooled mean is beyond 4 standard errors of
+    Forces in free motion should vanish; where their pooled mean is beyond SURE standard errors of
     what noise and the rig's own [systematic] allow, the bias gets a prior as wide as itself.
     """
     precision = 1.0 / variance
     pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
     allowed = np.hypot(1.0 / np.sqrt(precision.sum(axis=0)), np.asarray(rig.systematic.force_bias))
-    return np.where(np.abs(pooled) > 4 * allowed, np.abs(pooled), 0.0)
+    return np.where(np.abs(pooled) > SURE * allowed, np.abs(pooled), 0.0)
 
 
 @dataclass(frozen=True)

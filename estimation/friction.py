@@ -24,7 +24,6 @@ from hmmseg.levels import SURE
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
-MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
 FEWEST = 4  # numerics: samples of sliding
 WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little
 COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
@@ -71,7 +70,7 @@ def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
         return np.zeros((0, 3))
     direction = np.sign(np.median(s.vx[sliding]))
     sd = np.where(np.isfinite(s.sd_vx), s.sd_vx, 0.0) / np.sqrt(2.0)
-    sliding &= direction * np.nan_to_num(s.vx) > MOVING * sd
+    sliding &= direction * np.nan_to_num(s.vx) > SURE * sd
     bias_x, bias_y = (float(free @ np.nan_to_num(f)) for f in (s.fx, s.fy))
     lag = direction * np.nan_to_num(acceleration(s.t, s.vx)) / rig.gravity
     return np.stack([direction * (s.fx - bias_x), lag, s.fy - bias_y], axis=1)[sliding]

@@ -26,7 +26,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.levels import TAIL
+from hmmseg.levels import SURE, TAIL
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
@@ -337,7 +337,6 @@ def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: st
     return max(robust_sd(np.concatenate(residuals)), 1e-9)
 
 
-SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide
 WITNESSES = ("rise", "landing")
 
 
@@ -381,4 +380,4 @@ def _doubted(a: WeighedTrial, reading: np.ndarray, common: float, variance: floa
 def _slid(found: Slope, share: float, common: float) -> float:
     """How far [m] a landing went beyond what its pads gave; 0 where it need not have."""
     doubt = float(np.sqrt(found.variance + (SLOPE_SD * max(abs(common), 1.0)) ** 2))
-    return (share - common) * found.change if abs(share - common) > SEEN * doubt else 0.0
+    return (share - common) * found.change if abs(share - common) > SURE * doubt else 0.0

@@ -42,7 +42,6 @@ TAIL, NODES, GRID = (
     1e-4,
 )  # numerics: degrees of freedom of the prior; its grid, and least extent [m]
 LEAST_CLOSING = 1e-3  # chosen: m; a smaller swing of the opening is no grip
-CLEAR = 6.0  # chosen: noise sds of a third difference: a kink
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def closings(opening: np.ndarray) -> list[tuple[int, int, int]]:
     A swing counts where it is a tenth of the whole way and beyond the noise.
     """
     noise = white_sd(opening)
-    swing = max(0.1 * float(np.ptp(opening)), 10 * noise, LEAST_CLOSING)
+    swing = max(0.1 * float(np.ptp(opening)), 2 * SURE * noise, LEAST_CLOSING)
     turning, last = [0], 0
     rising: bool | None = None
     for i, value in enumerate(opening):
@@ -126,7 +125,7 @@ def _kink(way: np.ndarray, noise: float) -> tuple[float, float] | None:
         return None
     third = way[3:] - 3 * way[2:-1] + 3 * way[1:-2] - way[:-3]
     at = int(np.argmax(third))
-    if third[at] < CLEAR * np.sqrt(20) * noise:
+    if third[at] < SURE * np.sqrt(20) * noise:
         return None
     return float(way[at + 2]), max(float(way[at + 3] - way[at + 1]) / 4, noise)
 
@@ -313,7 +312,6 @@ def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
     return InputError(where, problem, f"position = {{{text}}} under [gripper]")
 
 
-ACTIVE = 8.0  # chosen: noise scales above which the wrist feels something
 TOGETHER = 5  # chosen: samples within one smoothing window
 LEAST = 3  # numerics: samples; of fewer there is no scatter
 
@@ -340,7 +338,7 @@ def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: n
     free = _surely_free(opening, held)
     tool = free_tool(trial, rig, pose, free)
     force = applied_force(trial, rig, pose, tool)
-    active = np.linalg.norm(np.nan_to_num(force), axis=1) > ACTIVE * tool.noise
+    active = np.linalg.norm(np.nan_to_num(force), axis=1) > SURE * tool.noise
     each = [grip_of(trial.t, opening, active, c, give_of(rig, pressing, opening, c)) for c in held]
     grips = [grip for grip in each if grip is not None]
     loads = [_load(grip, pose, force, tool) for grip in grips]
@@ -619,7 +617,7 @@ def _around(t: np.ndarray, pose: Pose) -> int:
 def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:
     """Where the wrist feels something for a while though the opening says that nothing is held."""
     t, out = trial.t, []
-    active = free & (np.nan_to_num(felt) > max(2 * ACTIVE * tool.noise, STRAY))
+    active = free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
     for start, stop in edges.reshape(-1, 2):
         if t[stop - 1] - t[start] > STRAY_TIME:

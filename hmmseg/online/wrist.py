@@ -292,7 +292,6 @@ STILL = 0.1  # chosen: share of a closing's top speed that is next to none
 SAMPLES = 4  # numerics: of a stand at least, and steps: what the touch is read from
 PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
 NOISE = 200  # numerics: samples that determine the opening's noise
-CLEAR = 10.0  # chosen: noise scales of a motion, as off line
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
 OPENING = 0.1  # chosen: share of the way back at which a gripper has surely let go, as off line
 
@@ -331,7 +330,7 @@ class Closings:
     @property
     def swing(self) -> float:
         """Least motion of the opening that counts [m]."""
-        return max(0.1 * (self._high - self._low), CLEAR * self._noise, LEAST_CLOSING)
+        return max(0.1 * (self._high - self._low), 2 * SURE * self._noise, LEAST_CLOSING)
 
     def free(self, t: float, opening: float) -> bool:
         """Whether a sample is surely of free motion: outside of every grip, more open than halfway."""

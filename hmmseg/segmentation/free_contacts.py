@@ -121,7 +121,7 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
     from where the grip begins and from where it ends. A block that falls is where its grip ends, so that the
     guess is what is far from where it begins.
     """
-    moving = np.abs(f.vy[span]) > 6 * f.sd_vy[span]
+    moving = np.abs(f.vy[span]) > SURE * f.sd_vy[span]
     height = filled(f.y)[span]
     least = np.maximum(4 * f.sd_y[span], RAISED)
     ends = np.median(height[:ENDS]), np.median(height[-ENDS:])

@@ -33,13 +33,12 @@ from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import CONTRADICTS, TAIL
+from hmmseg.levels import SURE, TAIL
 from hmmseg.robust import NORMAL, weighted_median
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
     NONE,
-    SIGNIFICANT,
     Stretch,
     Toe,
     evidence,
@@ -86,7 +85,7 @@ def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | No
     """The squeeze between `start` and `end` [s]; None without samples enough."""
     sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
     one, two = s.fx1 - p.bias[0], -(s.fx2 - p.bias[2])
-    alone = (np.maximum(one, two) > SIGNIFICANT * sd) & (np.minimum(one, two) <= SIGNIFICANT * sd)
+    alone = (np.maximum(one, two) > SURE * sd) & (np.minimum(one, two) <= SURE * sd)
     rate = np.gradient(s.distance, s.t) if s.derived else s.vx2 - s.vx1
     use = (s.t >= start) & (s.t <= end) & np.isfinite(one + two + s.distance + rate)
     if use.sum() < 6 or not (~alone & use).any():
@@ -264,7 +263,7 @@ class Sensing:
             how = "are filtered with a time constant of" if self.filter else "come late by"
             out.append(f"forces {how} {1e3 * self.delay:.0f} ms against positions; boundaries allow for it")
         nominal, found = pads_of(rig).normal1, self.normal
-        if abs(found.value - nominal) > max(CONTRADICTS * found.sd, STIFFNESS_SD * nominal):
+        if abs(found.value - nominal) > max(SURE * found.sd, STIFFNESS_SD * nominal):
             stated = f"rig.toml says {1e6 * nominal:.0f}" if nominal > 0 else "rig.toml says they are rigid"
             out.append(f"the pads give {1e6 * found.value:.0f} um/N along the grip, where {stated}; "
                        "boundaries allow for it")  # fmt: skip

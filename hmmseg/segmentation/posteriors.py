@@ -19,7 +19,6 @@ from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span
 
-PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
 STIFFEST = 1e-7  # numerics: m/N
 
 
@@ -109,7 +108,7 @@ class Contacts:
         face = median_of_known(self.inward[i, held] - pressed[held])
         moved = self.inward[i] - pressed - face
         doubt = np.hypot(self.sd["inward"], self.sensing.normal.form * pressed)
-        pushes = (pressed > SURE * self.sd["compression"]) & (np.abs(moved) > PUSHED * doubt)
+        pushes = (pressed > SURE * self.sd["compression"]) & (np.abs(moved) > SURE * doubt)
         moving = self.inward_rate[:, i] - np.gradient(pressed, self.signals.t)
         return np.where(pushes, moved, 0.0), np.where(pushes & np.isfinite(moving), moving, 0.0)
 

@@ -20,8 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.levels import MOVED, TAIL
-from hmmseg.levels import SURE as SIGNIFICANT
+from hmmseg.levels import MOVED, SURE, TAIL
 from hmmseg.robust import NORMAL, robust_sd
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 
@@ -174,10 +173,10 @@ def stretches(
     fy = s.fy1 + s.fy2 - p.bias[1] - p.bias[3]
     noise = np.sqrt(2.0) * sd_force
     resting = fy < min(SUPPORTED * weight, weight - 3 * noise)
-    pressing = inside & (fx1 > SIGNIFICANT * sd_force) & (-fx2 > SIGNIFICANT * sd_force)
+    pressing = inside & (fx1 > SURE * sd_force) & (-fx2 > SURE * sd_force)
     out = []
     for load, value, stated, within, sure in (
-        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True, 2 * SIGNIFICANT * sd_force),
+        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True, 2 * SURE * sd_force),
         (-fy / 2, s.y, s.sd_y / np.sqrt(2), resting, -np.inf),
     ):
         use = pressing & within & np.isfinite(load)
@@ -202,7 +201,7 @@ def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]
     sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
     out = []
     for grip, shear in ((s.fx1 - p.bias[0], s.fy1 - p.bias[1]), (-(s.fx2 - p.bias[2]), s.fy2 - p.bias[3])):
-        use = inside & (grip > SIGNIFICANT * sd) & np.isfinite(shear)
+        use = inside & (grip > SURE * sd) & np.isfinite(shear)
         if use.any():
             out.append(max(float(np.max((np.abs(shear[use]) - sd) / (grip[use] + sd))), 0.0))
     return out
