@@ -352,28 +352,6 @@ def test_a_grip_that_does_not_slide_ends_when_it_did():
         assert found.sd < 1.5 * plain.sd
 
 
-def test_a_finger_that_pushes_the_block_moves_the_face_that_the_other_meets():
-    folder = example_folder()
-    rig = Rig.read(folder / "rig.toml")
-    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
-    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
-    parameters = aligned.fit.parameters
-    stiff = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(4e-4, 1e-6, 0.0), 0.0, 1e-3)
-    n, step = signals.t.size, 1.5e-3
-    still = np.full(n, 0.01)
-    pushed = np.where(np.arange(n) < n // 2, 0.0, step)  # finger 2 has pushed the block to the left
-    made = replace(
-        signals, x1=-still - pushed, x2=still - pushed, vx1=0 * still, vx2=0 * still,
-        fx1=0 * still, fx2=np.full(n, -1.0),
-    )  # fmt: skip
-    table = contacts(made, stiff, replace(parameters, bias=np.zeros(4)))
-    held = np.zeros(n, bool)
-    held[n // 4 : n // 2] = True
-    moved, _ = table._pushed(1, held)
-    np.testing.assert_allclose(moved[: n // 2], 0.0, atol=1e-9)
-    np.testing.assert_allclose(moved[n // 2 :], step, atol=1e-9)
-
-
 def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():
     folder = example_folder()
     rig = Rig.read(folder / "rig.toml")
