@@ -20,11 +20,12 @@ from estimation.design import Design
 from estimation.observations import CHANNELS
 from estimation.pads import unit_pads
 from estimation.posterior import NUM_CHANNELS, Posterior
-from estimation.sampler import CERTAIN, Draws
+from estimation.sampler import Draws
 from hmmseg.hand.plausibility import Finding, all_changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS
+from hmmseg.levels import CERTAIN
 from hmmseg.segmentation.align import AlignedTrials
 
 NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.0035

@@ -38,13 +38,13 @@ import numpy as np
 from estimation.design import RISE, Design, PadDoubt
 from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
 from estimation.pads import MISSTATED, SLOPE_SD
-from estimation.sampler import CERTAIN
 from hmmseg.contact.decompose import ON_GROUND, stack
 from hmmseg.hand.plausibility import scale_to_velocity
 from hmmseg.hand.sensing import WHITE
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND
 from hmmseg.io.trial import position_pairs
+from hmmseg.levels import CERTAIN
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 

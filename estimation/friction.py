@@ -20,7 +20,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.levels import SURE
+from hmmseg.levels import CERTAIN, SURE
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
@@ -121,7 +121,6 @@ def _log_posterior(table: np.ndarray, noise: float, carried: tuple[float, float]
 
 
 PRIOR = 0.05  # prior: probability of slip before the anchors are seen
-SLIPPED = 0.99  # chosen: probability from which slip is said to be seen
 STRAY = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
 STRAY_DRIFT = 2e-3  # prior: m per root second
 SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s of a slipping pad
@@ -196,7 +195,7 @@ def slip_evidence(
     factor = float(logsumexp(joint) - np.log(len(moved)) - logsumexp(log_drift[:, 0] + still.sum(axis=1)))
     odds = factor + np.log(PRIOR / (1 - PRIOR))
     probability = float(1 / (1 + np.exp(-np.clip(odds, -700, 700))))
-    return SlipEvidence(probability, factor, probability > SLIPPED)
+    return SlipEvidence(probability, factor, probability > CERTAIN)
 
 
 def _rescaled(stretches: list[Stretch]) -> list[Stretch]:

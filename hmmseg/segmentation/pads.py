@@ -33,7 +33,7 @@ from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import SURE, TAIL
+from hmmseg.levels import SURE, TAIL, decisive
 from hmmseg.robust import NORMAL, weighted_median
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 from hmmseg.segmentation.stretches import (
@@ -207,7 +207,7 @@ REACH = 0.4  # numerics: s; free motion before and after a hold that is used: th
 FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays below what counts as one
 LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
 LATE = 0.01  # chosen: s; a longer delay is the sensor's
-DECISIVE = 15.0  # chosen: nats for a longer delay against none; its prior probability is about exp(-5)
+LATE_HANDS = 0.007  # prior: share of hands whose forces come late
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
@@ -406,7 +406,7 @@ def _delay(
         return 0.0, LEAD_SD, False, False
     there = [s for s in squeezes if s is not None]
     found = lateness(there[:: max(1, len(there) // ENOUGH)], priors[0], LATE)
-    if found is not None and found.delay > LATE and found.gain > DECISIVE:
+    if found is not None and found.delay > LATE and found.gain > decisive(LATE_HANDS):
         # A delay is common to all forces; what the grip alone favours is a fault of its pads.
         delays = np.array([0.0, found.delay])
         none, late = evidence(kinds[1:], priors[1:], delays, found.filter)[0]

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.levels import MOVED, SURE, TAIL
+from hmmseg.levels import MOVED, SURE, TAIL, decisive
 from hmmseg.robust import NORMAL, robust_sd
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 
@@ -43,7 +43,7 @@ def lagging(values: np.ndarray, kept: np.ndarray, place: np.ndarray, share: np.n
 SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; loads at which the toe may end, a factor of two apart
 DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own
 DEPTH = 5e-4  # prior: m; sd of how deep a toe is
-DECISIVE = 7.0  # chosen: nats for a toe against none: odds of a thousand to one
+ROUNDED = 0.5  # prior: share of contacts whose tips are rounded or soft enough for a toe
 ROUNDS = 6  # numerics: of reweighting
 LEVEL = 1e-28  # numerics: of the squares of loads that do not differ, what rounding leaves about their mean
 Reading = tuple[np.ndarray, np.ndarray, float]
@@ -85,7 +85,9 @@ def find(readings: Sequence[Reading]) -> Toe:
     depth, residual = _depths(load, value, toes, there, scale)
     gain = _evidence(residual, there, scale) - _evidence(straight, there, scale) - (depth / DEPTH) ** 2 / 2
     best = int(gain.argmax())
-    return Toe(float(depth[best]), SOFTS[best]) if gain[best] > DECISIVE and depth[best] > 0 else NONE
+    return (
+        Toe(float(depth[best]), SOFTS[best]) if gain[best] > decisive(ROUNDED) and depth[best] > 0 else NONE
+    )
 
 
 def _padded(readings: Sequence[Reading]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
