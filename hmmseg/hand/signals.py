@@ -18,6 +18,7 @@ import numpy as np
 from hmmseg.hand.kinematics import forward, jacobian
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial, position_pairs
+from hmmseg.robust import bridged
 from hmmseg.tables import Brief
 
 
@@ -242,3 +243,18 @@ def _residual(velocity: np.ndarray, difference: np.ndarray) -> float:
     apart = np.abs(velocity - difference)
     apart = apart[np.isfinite(apart)]
     return float(apart.mean()) if apart.size else np.inf
+
+
+def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
+    """The signals with heights wherever coordinates can be interpolated over time.
+
+    A height takes four link angles. Where two readings in five are missing, all four are there in one sample
+    of eight. Only for what a fraction of a hand's way decides: an interpolated height has its own error.
+    """
+    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("y1", "y2")
+    known = {name: np.isfinite(trial.channels[name]) for name in names}
+    if all(k.all() for k in known.values()) or not all(k.any() for k in known.values()):
+        return signals
+    filled = {name: bridged(trial.channels[name], trial.t) for name in names}
+    whole = task_space(replace(trial, channels=trial.channels | filled), rig)
+    return replace(signals, y1=whole.y1, y2=whole.y2, sd_y=whole.sd_y)

@@ -15,7 +15,7 @@ import numpy as np
 
 from hmmseg.contact.decompose import FREE, Subtask, subtasks
 from hmmseg.hand.read import LongRecording
-from hmmseg.hand.signals import Signals, task_space, timely
+from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
@@ -364,7 +364,8 @@ def align(
     """
     if signals is None:
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
-    coarse = [features(thin(s, MAX_RATE), rig) for s in signals]
+    whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
+    coarse = [features(thin(s, MAX_RATE), rig) for s in whole]
     pool, pieces = aligned_rounds([InMemory(s) for s in signals], coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)

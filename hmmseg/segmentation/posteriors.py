@@ -56,8 +56,7 @@ class Contacts:
         timing = self.sensing.delay_sd
         if FREE in (before.state, after.state):
             making = before.state == FREE
-            rests = not making and before.state == ON_GROUND
-            fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
+            fingers = tuple(self._finger(i, stretch, making) for i in (0, 1))
             if making:
                 return cut(Change(fingers, prior, making, "impact", timing))
             slips = tuple(self._slip(i, stretch) for i in (0, 1))
@@ -72,11 +71,9 @@ class Contacts:
             return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
         return None
 
-    def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
-        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
-        inward, rate = self.inward[i], self.inward_rate[:, i]
-        if not rests:
-            inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
+    def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:
+        """Finger i in its pad, against the face of the block, which is halfway to the other finger's."""
+        inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
         face = median_of_known(inward[held] - self.compression[i, held])
         # A pad of another stiffness would put the face elsewhere.
         pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
