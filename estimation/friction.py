@@ -20,7 +20,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.levels import CERTAIN, SURE
+from hmmseg.levels import CERTAIN, FIRM, SURE
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
@@ -345,9 +345,6 @@ def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generato
     return np.bincount(places, weights=sizes, minlength=log_likelihood.shape[1])
 
 
-# chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
-# ratio of two small forces says little: samples below this share of the grip's median are left out.
-FIRM = 0.5
 DRAWS = 2000  # numerics: of each coefficient
 
 
@@ -458,7 +455,11 @@ def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
 
 
 def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment."""
+    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment.
+
+    While a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of
+    two small forces says little.
+    """
     recorded = np.isfinite(forces.normal + forces.shear)
     core = (holding.mean(axis=0) > 0.5) & recorded
     if not core.any():

@@ -8,6 +8,7 @@ from math import log
 # goes so far once in two million readings, an hour at 500 Hz
 SURE = 5.0
 CERTAIN = 0.99  # chosen: probability from which something is taken for true, and reported
+FIRM = 0.5  # chosen: share of a grip's usual force from which the fingers hold
 MOVED = 3e-3  # chosen: m by which a hand or a block has gone somewhere; blocks are taller, slips shorter
 GAP = 3.0  # chosen: usual sample periods that make a gap
 DRIFTS = 0.15  # chosen: s in which a hand at rest stays where it is; it drifts over more

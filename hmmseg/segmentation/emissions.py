@@ -27,14 +27,13 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
-from hmmseg.densities import log_between, log_student
+from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
 from hmmseg.robust import white_sd
 from hmmseg.tables import Brief
 
-SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's (foam giving late)
 STILL = 0.1  # prior: share of a carry's samples at which the block is held still
@@ -227,7 +226,7 @@ def _log_held(f: Features, p: Parameters, force: np.ndarray) -> np.ndarray:
     grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
     out = log_between(grip, 0.0, f.span["force"], p.scale["force"])
     if f.free is not None:
-        out += SHUT * (f.free == 1)
+        out += EDGE * (f.free == 1)
     shear = (force[:, 1] - force[:, 3]) / 2
     return out + (log_student(net_x, p.scale["net_x"]) + log_student(shear, p.scale["shear"]))
 
