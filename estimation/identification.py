@@ -22,7 +22,7 @@ from estimation.checks import (
 from estimation.consistency import contradictions, force_scale
 from estimation.design import Design, Unknown
 from estimation.friction import FrictionPosterior, friction_posteriors
-from estimation.observations import Noise, WeighedTrial, aligned_weights, with_slides
+from estimation.observations import Noise, WeighedTrial, aligned_weights
 from estimation.report import Actual, inference_data, properties_table, summary
 from estimation.sampler import Draws, designs, sample_either
 from hmmseg.contact.decompose import (
@@ -37,7 +37,6 @@ from hmmseg.contact.decompose import (
 from hmmseg.errors import nearest
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
@@ -171,7 +170,6 @@ class Identification(Tabled):
         return inference_data({name: chain[..., i] for i, name in enumerate(names)})
 
 
-@double_precision
 def identify_aligned(
     aligned: AlignedTrials, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Identification:
@@ -179,7 +177,6 @@ def identify_aligned(
     rng, rig = np.random.default_rng(seed), aligned.rig
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)
-    weighed = with_slides(weighed, noise, aligned.rig)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design, other = designs(aligned, weighed, noise)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)

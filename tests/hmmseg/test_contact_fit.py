@@ -17,7 +17,6 @@ from hmmseg.io.task import BlockTask, Move
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import (
-    LOST,
     RUNG,
     Features,
     Parameters,
@@ -227,12 +226,6 @@ def test_what_strays_on_its_support_stays_near_it():
     near, far = score(moving, ON_GROUND)
     assert near - far == pytest.approx(np.diff(stats.t.logpdf(off[::-1], TAIL, scale=MOVED))[0], rel=1e-4)
     assert near - far > 6
-
-
-def test_a_carry_may_lose_its_block_for_a_moment():
-    """Open hands without force: nothing but a lost grip explains them, at LOST times the density of none."""
-    empty = features(3, force=PARAMETERS.bias, d=0.05, vx=0.05, vy=0.05, y=0.05)
-    np.testing.assert_allclose(score(empty, ABOVE_GROUND) - score(empty, FREE), np.log(LOST), atol=1e-3)
 
 
 def test_otsu_against_trying_every_split():
