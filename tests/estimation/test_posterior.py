@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from estimation_scene import TRUE, UNIT, drawn, make_design
 
 from estimation import priors
 from estimation.pads import SLOPE_SD
-from estimation.posterior import REACH, STEP, find_mode, log_prior, posterior
+from estimation.posterior import REACH, STEP, find_mode, log_density, log_prior, posterior
 
 FLAT = 1e3  # sd of a prior that is flat against a width of micrometres, but not so flat that digits go
 
@@ -231,6 +233,24 @@ def test_the_mode_is_stationary_and_its_covariance_the_inverse_curvature():
     np.testing.assert_allclose(slope, 0.0, atol=2e-2)
     curvature = [[(at(a, b) - at(a, -b) - at(-a, b) + at(-a, -b)) / (4 * h * h) for b in eye] for a in eye]
     np.testing.assert_allclose(-np.array(curvature) @ mode.covariance, np.eye(6), atol=0.02)
+
+
+def test_jax_and_numpy_agree_on_the_density():
+    post = posterior(drawn(make_design(deviations=2), 7)[0])
+    theta = 3 * np.random.default_rng(0).normal(size=(200, 6))
+    found = log_density(jnp.asarray(theta), jax.tree.map(jnp.asarray, post.tables), jnp)
+    np.testing.assert_allclose(found, post.log_prob(theta), rtol=1e-10)
+    assert 0 < np.isinf(found).sum() < 20  # beyond the farthest as well
+
+
+def test_the_mode_is_found_in_a_process_of_single_precision():
+    post = posterior(drawn(make_design(deviations=2), 8)[0])
+    double = find_mode(post)
+    with jax.enable_x64(False):
+        single = find_mode(post)
+        assert jnp.zeros(1).dtype == np.float32  # as it was
+    np.testing.assert_array_equal(single.scales, double.scales)
+    assert single.converged
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2])
