@@ -22,8 +22,7 @@ ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
 SOFT = 0.5  # chosen: of the p-value's logarithm, logistic: so sharply an alarm turns into a gap
 MOST = 0.5  # cited: share of the gap left from which on it is unknown (the interface's definition)
 WIDTH = 0.25  # chosen: of that share's logarithm, logistic
-# chosen: share of the explained gap below which an effect is a cause only if its own size says so: an error
-# of a tenth in the form of the largest leaves half of that
+# chosen: share of the gap that is nothing next to the rest: an error of a tenth in a form leaves half of that
 LEAST = 0.02
 RULED_OUT = 20.0  # chosen: odds against a set from which on it is no alternative
 LISTED = 1e-4  # look: probability below which a set is one of the others
