@@ -37,6 +37,7 @@ from hmmseg.contact.decompose import (
 from hmmseg.errors import nearest
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
+from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
@@ -170,6 +171,7 @@ class Identification(Tabled):
         return inference_data({name: chain[..., i] for i, name in enumerate(names)})
 
 
+@double_precision
 def identify_aligned(
     aligned: AlignedTrials, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Identification:

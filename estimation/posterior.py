@@ -15,6 +15,8 @@ does not follow its equation is no reliable witness of it.) The density of the s
 `estimation.density`. Unknowns have a flat prior in here; their own is put in when they are drawn
 (`estimation.sampler`).
 
+The density of the scales, written once for NumPy, which samples it, and JAX, which seeks its mode.
+
 An unknown belongs to one channel and is eliminated there. What remains of a channel is a small quadratic
 form in the shares e, f of all channels and the hand's deviations z, which depends on r_c = (k_c / s_c)^2
 alone once 1 / s_c^2 is taken out. It is tabulated over log r_c, so that a density takes the same time
@@ -23,15 +25,18 @@ whatever the number of blocks, grips and trials.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimation import priors
 from estimation.design import Design
 from estimation.observations import CHANNELS
+from hmmseg.jaxconfig import double_precision
 
 NUM_CHANNELS = len(CHANNELS)
 NUM_SHARES = 2 * NUM_CHANNELS  # numerics: a normal and a shear give of each, by their definition
@@ -41,7 +46,7 @@ REACH = (-18.0, 26.0)  # numerics: of the table about the prior median of log r;
 
 
 class Tables(NamedTuple):
-    """What the density of the scales is worked out from.
+    """What the density of the scales is worked out from; NumPy arrays or JAX's.
 
     Quadratic forms are matrices over (1, e, f, z), S = 1 + 6 + N: the corner holds the sum of squares,
     the first row the linear terms. `forms` (3, G, S, S) and `log_det` (3, G) of each channel on the grid of
@@ -49,56 +54,81 @@ class Tables(NamedTuple):
     motion; `least` (6,): variances that e and f have whatever k is; `scale_sd` (3,): prior sds of log s.
     """
 
-    forms: np.ndarray
-    log_det: np.ndarray
-    count: np.ndarray
-    hand: np.ndarray
-    least: np.ndarray
-    scale_sd: np.ndarray
+    forms: Any
+    log_det: Any
+    count: Any
+    hand: Any
+    least: Any
+    scale_sd: Any
 
 
-def log_density(theta: np.ndarray, tables: Tables) -> np.ndarray:
+def log_density(theta: Any, tables: Tables, xp: ModuleType = np) -> Any:
     """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant.
 
-    -inf beyond FARTHEST, where priors leave nothing and digits would run out.
+    `xp`: numpy, or jax.numpy where theta and tables are JAX's. -inf beyond FARTHEST, where priors leave
+    nothing and digits would run out.
     """
-    near = np.all(np.abs(theta) <= FARTHEST, axis=1)
-    theta = np.clip(theta, -FARTHEST, FARTHEST)
+    near = xp.all(xp.abs(theta) <= FARTHEST, axis=1)
+    theta = xp.clip(theta, -FARTHEST, FARTHEST)
     log_s, log_k = theta[:, :NUM_CHANNELS], theta[:, NUM_CHANNELS:]
-    own = (priors.SCATTER_MEDIAN * np.exp(log_k)) ** 2
-    common = tables.least + np.concatenate([own, own], axis=1)
-    place = np.clip((2 * (log_k - log_s) - REACH[0]) / STEP, 1.0, tables.log_det.shape[1] - 3.001)
-    index = np.floor(place)
+    own = (priors.SCATTER_MEDIAN[None] * xp.exp(log_k)) ** 2
+    common = tables.least[None] + xp.concatenate([own, own], axis=1)
+    place = xp.clip((2 * (log_k - log_s) - REACH[0]) / STEP, 1.0, tables.log_det.shape[1] - 3.001)
+    index = xp.floor(place)
     weights = _cubic(place - index)
     rows = [(np.arange(NUM_CHANNELS)[None], index.astype(int) + k) for k in (-1, 0, 1, 2)]
     log_det = sum(w * tables.log_det[at] for w, at in zip(weights, rows, strict=True))
-    precision = np.exp(-2 * log_s)
-    form = tables.hand + sum(
-        np.sum((precision * w)[..., None, None] * tables.forms[at], axis=1)
+    precision = xp.exp(-2 * log_s)
+    form = sum(
+        xp.sum((precision * w)[..., None, None] * tables.forms[at], axis=1)
         for w, at in zip(weights, rows, strict=True)
     )
+    form = form + tables.hand[None]
     size = tables.hand.shape[0] - 1
-    prior = np.pad(1 / common, ((0, 0), (0, size - NUM_SHARES)))
-    chol = np.linalg.cholesky(form[:, 1:, 1:] + prior[:, :, None] * np.eye(size))
-    white = np.linalg.solve(chol, form[:, 1:, :1])[..., 0]
-    out = log_prior(theta, tables.scale_sd) - 0.5 * np.sum(2 * tables.count * log_s + log_det, axis=1)
-    out -= 0.5 * (np.log(common).sum(axis=1) + form[:, 0, 0] - np.sum(white**2, axis=1))
-    out -= np.sum(np.log(np.diagonal(chol, axis1=1, axis2=2)), axis=1)
-    return np.where(near, out, -np.inf)
+    prior = xp.concatenate([1 / common, xp.zeros((len(theta), size - NUM_SHARES))], axis=1)
+    chol = xp.linalg.cholesky(form[:, 1:, 1:] + prior[:, :, None] * np.eye(size)[None])
+    white = _solve(chol, form[:, 1:, :1], xp)[..., 0]
+    of_channels = 2 * tables.count[None] * log_s + log_det
+    out = log_prior(theta, tables.scale_sd, xp) - 0.5 * xp.sum(of_channels + _paired(xp.log(common)), axis=1)
+    out = out - 0.5 * (form[:, 0, 0] - xp.sum(white**2, axis=1))
+    out = out - xp.sum(xp.log(xp.diagonal(chol, axis1=1, axis2=2)), axis=1)
+    return xp.where(near, out, -np.inf)
 
 
-def log_prior(theta: np.ndarray, scale_sd: np.ndarray) -> np.ndarray:
+def log_prior(theta: Any, scale_sd: Any, xp: ModuleType = np) -> Any:
     """Log prior (W,) of scales (W, 6), up to a constant."""
-    noise, scatter = theta[:, :NUM_CHANNELS] / scale_sd, theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD
-    return -0.5 * np.sum(noise**2 + scatter**2, axis=1)
+    noise, scatter = theta[:, :NUM_CHANNELS] / scale_sd[None], theta[:, NUM_CHANNELS:] / priors.SCATTER_LOG_SD
+    return -0.5 * xp.sum(noise**2 + scatter**2, axis=1)
 
 
-def _cubic(t: np.ndarray) -> tuple[np.ndarray, ...]:
+def padded(tables: Tables, multiple: int) -> Tables:
+    """The same density with deviations that nothing shows, so that their number is a multiple."""
+    more = -(tables.hand.shape[0] - 1 - NUM_SHARES) % multiple
+    hand, added = np.pad(tables.hand, (0, more)), np.arange(more) + len(tables.hand)
+    hand[added, added] = 1.0
+    return tables._replace(hand=hand, forms=np.pad(tables.forms, ((0, 0), (0, 0), (0, more), (0, more))))
+
+
+def _paired(of_shares: Any) -> Any:
+    """Sums (W, 3) of what is said of e and of f (W, 6), by channel."""
+    return of_shares[:, :NUM_CHANNELS] + of_shares[:, NUM_CHANNELS:]
+
+
+def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
     """Weights of the four neighbours at a share t of the way between the middle two (Catmull and Rom)."""
     return (
         0.5 * t * (t * (2 - t) - 1), 0.5 * (t**2 * (3 * t - 5) + 2),
         0.5 * t * (t * (4 - 3 * t) + 1), 0.5 * t**2 * (t - 1),
     )  # fmt: skip
+
+
+def _solve(chol: Any, right: Any, xp: ModuleType) -> Any:
+    """chol^-1 right, (W, S, S) and (W, S, 1)."""
+    if xp is np:
+        return np.linalg.solve(chol, right)
+    from jax.lax.linalg import triangular_solve
+
+    return triangular_solve(chol, right, left_side=True, lower=True)
 
 
 BATCH = 256  # numerics: densities at once, to keep memory small
@@ -274,6 +304,8 @@ def _eliminated(
     return left, np.log(variance).sum(axis=1) + 2 * halved
 
 
+TOLERANCE, MAX_STEPS = 1e-6, 256  # numerics: relative and absolute, of scales and density
+PADDING = 8  # numerics: of deviations, rounded up to a multiple of it so that few programs are compiled
 DIFFERENCE = 1e-3  # numerics: of the scales, all logarithms, for derivatives by central differences
 STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a large share is a mode of its own
 
@@ -292,20 +324,16 @@ class Mode:
     converged: bool
 
 
+@double_precision
 def find_mode(post: Posterior) -> Mode:
-    """Mode by SciPy's BFGS from the best of a few shares a channel; derivatives by central differences."""
-    from scipy.optimize import minimize  # slow to import
-
+    """Mode by optimistix's BFGS from the best of a few shares a channel; curvature by central differences."""
     steps = DIFFERENCE * np.eye(2 * NUM_CHANNELS)
 
     def gradient(x: np.ndarray) -> np.ndarray:
         up, down = np.split(post.log_prob(np.concatenate([x + steps, x - steps])), 2)
         return -(up - down) / (2 * DIFFERENCE)
 
-    def loss(x: np.ndarray) -> float:
-        return -float(post.log_prob(x[None])[0])
-
-    found = minimize(loss, start_of(post), jac=gradient, method="BFGS").x
+    found = np.array(_climb()(start_of(post), padded(post.tables, PADDING)))
     hessian = np.array([(gradient(found + h) - gradient(found - h)) / (2 * DIFFERENCE) for h in steps])
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     covariance = (vectors / np.maximum(values, 0.1)) @ vectors.T
@@ -314,6 +342,35 @@ def find_mode(post: Posterior) -> Mode:
     factor = np.linalg.inv(chol[0])[:, :num]
     slope = float(np.abs(gradient(found)).max())
     return Mode(found, covariance, post.reference + mean[0, :num], factor.T @ factor, slope < 1e-2)
+
+
+@lru_cache
+def _climb() -> Callable[[np.ndarray, Tables], Any]:
+    """From a start (6,) to the density's next maximum (6,); one compiled program for each padded size.
+
+    On the processor, whatever accelerator there is: six scales are not worth the way there.
+    """
+    import jax  # these are slow to import
+    import jax.numpy as jnp
+    import optimistix
+
+    solver = optimistix.BFGS(rtol=TOLERANCE, atol=TOLERANCE)
+
+    def loss(theta: Any, tables: Tables) -> Any:
+        return -log_density(theta[None], tables, jnp)[0]
+
+    def climb(start: Any, tables: Tables) -> Any:
+        return optimistix.minimise(loss, solver, start, tables, max_steps=MAX_STEPS, throw=False).value
+
+    # It runs for milliseconds: what optimising the program takes is more than what that could save.
+    quickly_compiled = {"xla_backend_optimization_level": 0}
+    program, processor = jax.jit(climb, compiler_options=quickly_compiled), jax.devices("cpu")[0]
+
+    def on_processor(start: np.ndarray, tables: Tables) -> Any:
+        with jax.default_device(processor):
+            return program(start, tables)
+
+    return on_processor
 
 
 def start_of(post: Posterior) -> np.ndarray:
