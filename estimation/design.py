@@ -498,7 +498,7 @@ def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
     return out
 
 
-BIASED = 0.01  # prior: share of forces whose zero is off by more than the rig admits
+BIASED = 0.0025  # prior: share of forces whose zero the rig has wrong: those of one recording in a hundred
 
 
 def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
