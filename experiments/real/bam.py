@@ -46,7 +46,7 @@ M6 = {  # start, least, most, usual size
     "external_quad": (0.001, 0, 0.05, 0.01), "speed": (0.2, 0.05, 1, 0.2), "alpha": (1.35, 1, 10, 1),
     "armature": (0.02, 1e-4, 0.2, 0.02), "zero": (0.0, -0.1, 0.1, 0.03), "unit": (UNIT, 0.01, 1, 0.1),
     "delay": (0.02, 0, 0.05, 0.01), "age": (0.004, -0.03, 0.03, 0.005), "start": (0.012, 0, 0.1, 0.02),
-    "pace": (5.0, 0.5, 50, 2),
+    "pace": (5.0, 0.5, 50, 2), "switch": (0.02, 0, 0.05, 0.01),
 }  # fmt: skip
 DRIVE = ("start", "pace")  # what BAM's drive has not
 
@@ -55,10 +55,10 @@ DRIVE = ("start", "pace")  # what BAM's drive has not
 def turn_m6(p, t, goal, volts, on, mass, length, register, q, w):
     """Angles (num_timesteps,) of the model M6, by the step of `servo.turn`."""
     (stall, emf, viscous, base, stribeck, motor_load, external_load, motor_extra, external_extra, motor_quad,
-     external_quad, speed, alpha, armature, zero, unit, delay, _, start, pace) = p  # fmt: skip
+     external_quad, speed, alpha, armature, zero, unit, delay, _, start, pace, switch) = p  # fmt: skip
     inertia = mass * length**2 + armature
     out = np.empty(t.size)
-    follow, sent = goal[0], 0
+    follow, sent, switched = goal[0], 0, 0
     for i in range(t.size):
         out[i] = q
         if i == t.size - 1:
@@ -66,7 +66,8 @@ def turn_m6(p, t, goal, volts, on, mass, length, register, q, w):
         steps = max(1, int(np.ceil((t[i + 1] - t[i]) / STEP - 1e-9)))
         h = (t[i + 1] - t[i]) / steps
         for k in range(steps):
-            target, drive, sent = sent_in(t, goal, on, sent, t[i] + k * h, h, delay)
+            target, sent = sent_in(t, goal, sent, t[i] + k * h, h, delay)
+            drive, switched = sent_in(t, on, switched, t[i] + k * h, h, switch)
             follow += min(max(target - follow, -pace * h), pace * h)
             duty = asked(unit * register, start, follow - q, DEAD if start > 0 else 0.0)
             weight = -mass * G * length * np.sin(q - zero)

@@ -1,7 +1,8 @@
 """A hobby servo that turns a weight on a rod, as a plain Python simulator of your own.
 
 Torques at the shaft, q the angle from hanging down, w its rate, V the supply, g the goal that the drive
-follows, which is the command, `delay` late, at `pace` at most; `on` is 1 while the drive is on, as late:
+follows, which is the command, `delay` late, at `pace` at most; `on` is 1 while the drive is on, `switch`
+late, for it is another register, written at another time of the cycle:
 
     duty = on clip(sign(g - q) (gain max(|g - q| - DEAD, 0) + start), -1, 1), 0 within DEAD
     J w' = stall duty V / 12 - on emf w - viscous w - friction(w, load) - W sin(q - zero)
@@ -72,6 +73,7 @@ class Servo:
             "zero": _wide(0.0, 0.03, "rad", -0.5),
             "start": _wide(0.016, 0.001, "1"),  # data sheet: a starting force of 16 of 1000
             "delay": _wide(0.02, 0.01, "s"),
+            "switch": _wide(0.02, 0.01, "s"),
             "pace": _wide(5.0, 2.0, "rad/s", 0.5),
             "age": _wide(0.004, 0.005, "s", -0.03),
         }  # fmt: skip
@@ -104,18 +106,16 @@ def asked(gain, start, error, dead=DEAD):
 
 
 @njit(cache=True)
-def sent_in(t, goal, on, sent, begin, h, delay):
-    """Goal and whether the drive is on in a step from `begin` [s], and the number of the last command before
-    it. A command that comes within the step acts for its part of it, so that angles have a derivative by the
-    delay."""
+def sent_in(t, command, sent, begin, h, delay):
+    """A command in a step from `begin` [s], and the number of the last one sent before it. One that comes
+    within the step acts for its part of it, so that angles have a derivative by the delay."""
     while sent + 1 < t.size and t[sent + 1] + delay <= begin:
         sent += 1
-    target, drive = goal[sent], on[sent]
+    value = command[sent]
     if sent + 1 < t.size and t[sent + 1] + delay < begin + h:
         part = (begin + h - t[sent + 1] - delay) / h
-        target += part * (goal[sent + 1] - target)
-        drive += part * (on[sent + 1] - drive)
-    return target, drive, sent
+        value += part * (command[sent + 1] - value)
+    return value, sent
 
 
 @njit(cache=True)
@@ -131,11 +131,11 @@ def turn(p, t, goal, volts, on, angle, q, w):
     """Angles, and duties at the recorded `angle`, (num_timesteps,) at times t; parameters in the order of
     `Servo.parameters`."""
     (mass, length, gain, stall, emf, viscous, coulomb, load, load_extra, extra, speed, armature, arm, zero,
-     start, delay, pace, _) = p  # fmt: skip
+     start, delay, switch, pace, _) = p  # fmt: skip
     inertia = mass * length**2 + arm * length**3 / 3 + armature
     heavy = G * (mass * length + arm * length**2 / 2)
     position, duties = np.empty(t.size), np.empty(t.size)
-    follow, sent = goal[0], 0
+    follow, sent, switched = goal[0], 0, 0
     for i in range(t.size):
         position[i] = q
         duties[i] = asked(gain, start, follow - angle[i]) if on[i] > 0.5 else 0.0
@@ -144,7 +144,8 @@ def turn(p, t, goal, volts, on, angle, q, w):
         steps = max(1, int(np.ceil((t[i + 1] - t[i]) / STEP - 1e-9)))
         h = (t[i + 1] - t[i]) / steps
         for k in range(steps):
-            target, drive, sent = sent_in(t, goal, on, sent, t[i] + k * h, h, delay)
+            target, sent = sent_in(t, goal, sent, t[i] + k * h, h, delay)
+            drive, switched = sent_in(t, on, switched, t[i] + k * h, h, switch)
             follow += min(max(target - follow, -pace * h), pace * h)
             weight = -heavy * np.sin(q - zero)
             slow = np.exp(-((w / speed) ** 2))

@@ -31,7 +31,7 @@ from simgap.attribution.verdict import (
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.heldout import Shrinkage
 from simgap.robots.phases import Phases
-from simgap.robots.search import BORNE_OUT, Search, Settled, chance
+from simgap.robots.search import Search, Settled, predicts_better
 from simgap.robots.whiten import ALONE, Whitener
 
 OPEN = 0.1  # chosen: share of what is left without a small cause that may be left with it
@@ -144,7 +144,7 @@ def _alternatives(search: Search, best: Settled) -> list[Settled]:
             continue
         alike = one.score > best.score - np.log(RULED_OUT)
         if best.discrepancy and one.names and one.squares.sum() < most:
-            alike = alike or chance(search.gains(best, one, best)) >= BORNE_OUT
+            alike = alike or not predicts_better(search.gains(best, one, best))
         if alike:
             out.append(one)
     return out

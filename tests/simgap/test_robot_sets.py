@@ -10,6 +10,7 @@ from scipy.integrate import quad
 
 from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
+from simgap.robots.search import predicts_better
 from simgap.robots.sets import Sets, cancelling, neighbours, pairs
 from simgap.robots.verdict import _absurd
 from simgap.robots.whiten import Block, Covariances, Discrepancy, Source
@@ -127,3 +128,19 @@ def test_a_value_at_a_bound_is_doubted_but_for_nothing_at_all():
     best = SimpleNamespace(point={"rubs": {"loss": 0.0}, "weighs": {"mass": 0.3}})
     assert _absurd(known, best, ["rubs"]) == ()  # type: ignore[arg-type]
     assert _absurd(known, best, ["rubs", "weighs"]) == ("weighs mass 0.3 kg is no value of a robot's",)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("folds", [2, 3, 6])
+@pytest.mark.parametrize("sd", [0.3, 1.0, 3.0])
+def test_a_set_predicts_better_by_chance_as_rarely_as_it_says(folds: int, sd: float):
+    # of two normal densities that are sd apart, the log ratio where the rival is right
+    gains = np.random.default_rng(0).normal(-0.5 * sd**2, sd, (4000, folds))
+    assert np.mean([predicts_better(g) for g in gains]) < 0.06
+
+
+def test_a_log_that_hardly_shows_a_cause_does_not_speak_against_it():
+    assert stats.ttest_1samp(np.arcsinh([0.3, 37.0, 8.7]), 0, alternative="greater").pvalue > 0.05
+    assert predicts_better(np.array([0.3, 37.0, 8.7]))
+    assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
+    assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
+    assert predicts_better(np.array([0.5, 0.6, 0.5, 0.4, 0.5, 0.6]))  # little, but in every log
