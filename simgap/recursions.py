@@ -69,39 +69,37 @@ def _update(
 @compiled
 def tracked(
     values: np.ndarray, weight: np.ndarray, sd: np.ndarray, levers: np.ndarray, walk: np.ndarray,
-    new: np.ndarray, anywhere: float, slide: float, may: np.ndarray, pinned: np.ndarray, place: np.ndarray,
-    drift: np.ndarray, wander: np.ndarray, jump: np.ndarray, shares: np.ndarray, chance: np.ndarray,
+    new: np.ndarray, anywhere: float, pinned: np.ndarray, place: np.ndarray, drift: np.ndarray,
+    wander: np.ndarray, jump: np.ndarray, shares: np.ndarray, chance: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
-    """What a Kalman filter did not expect of four values (T, N, 4), where joints or pads move unseen.
+    """What a Kalman filter did not expect of four values (T, N, 4), where joints move unseen.
 
     Values are `levers` (T, N, 4, J) times where the J joints are in their dead bands, and noise `sd`; values
-    of less `weight` (0 to 1) tell less. The first, second and last also have a constant each, which is
-    another one, with variance `anywhere`, where it is `new` (T, N, 3): the first value of weight sets it and
-    tells nothing. The first's constant walks with variances `walk` (T, N). A joint is at its `place` (T, N,
-    J) where it is `pinned`; elsewhere it goes on by `drift`, with variance `wander`. Unless all are pinned
-    and pads hold, which they do not with the chance `may` (T, N), there also are moves of variances `shares`
-    (R, 3), in units of `jump` (T, J) of joints that are not pinned and of `slide` of the second's and the
-    last's constants, with prior probabilities `chance` (R,). The likeliest is taken, sample by sample (a
-    multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
+    of less `weight` (0 to 1) tell less. The first, second and last also have a constant each, which walks
+    with variances `walk` (T, N, 3) and is another one, with variance `anywhere`, where it is `new` (T, N,
+    3): the first value of weight sets it and tells nothing. A joint is at its `place` (T, N, J) where it is
+    `pinned`; elsewhere it goes on by `drift`, with variance `wander`, and by one of `shares` (R,) of the
+    variance `jump` (T, J), of which `chance` (R,) are the prior probabilities. Of these the likeliest is
+    taken, sample by sample (a multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
 
     Returns:
         innovations (T, N, 4), their variances over the noise's, and what the choices cost [nats].
     """
     joints, size = pinned.shape[2], pinned.shape[2] + 3
     out, factor, cost = np.zeros_like(values), np.ones_like(values), 0.0
-    constant, moved = np.array([joints, joints + 1, -1, joints + 2]), np.array([joints + 1, joints + 2])
+    constant = np.array([joints, joints + 1, -1, joints + 2])
     lever = np.zeros(size)
     for t in range(values.shape[0]):
         mean, cov, fresh = np.zeros(size), np.zeros((size, size)), np.ones(size)
         for k in range(values.shape[1]):
-            cov[joints, joints] += walk[t, k]
             for c in range(3):
                 i = joints + c
+                cov[i, i] += walk[t, k, c]
                 if k == 0 or new[t, k, c]:
                     cov[i, :] = 0.0
                     cov[:, i] = 0.0
                     cov[i, i], fresh[i] = anywhere, 1.0
-            odds = may[t, k]
+            loose = False
             for j in range(joints):
                 if k == 0 or pinned[t, k, j]:
                     cov[j, :] = 0.0
@@ -111,17 +109,15 @@ def tracked(
                 else:
                     mean[j] += drift[t, k, j]
                     cov[j, j] += wander[t, k, j]
-                odds = odds if pinned[t, k, j] else 1.0
-            choices = chance.size if odds > 0 and weight[t, k].sum() > 0 else 1
+                loose = loose or not pinned[t, k, j]
+            choices = chance.size if loose and weight[t, k].sum() > 0 else 1
             best, chosen_mean, chosen_cov, paid = -np.inf, mean, cov, 0.0
             for r in range(choices):
                 m, p = mean.copy(), cov.copy()
                 for j in range(joints):
                     if not pinned[t, k, j]:
-                        p[j, j] += shares[r, 0] * jump[t, j]
-                for c in range(2 if may[t, k] > 0 else 0):
-                    p[moved[c], moved[c]] += shares[r, 1 + c] * slide
-                score = np.log(odds * chance[r] + (1 - odds) * (r == 0)) if choices > 1 else 0.0
+                        p[j, j] += shares[r] * jump[t, j]
+                score = np.log(chance[r]) if choices > 1 else 0.0
                 prior = score
                 misses, factors = np.zeros(4), np.ones(4)
                 for c in range(4):

@@ -364,9 +364,12 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _needed(f: Forms, model: Model, effect: int) -> bool:
-    """Whether doing without an effect is ruled out by the evidence of its set."""
-    rest = fitted(f, tuple(j for j in model.effects if j != effect))
-    return model.score - rest.score > np.log(RULED_OUT)
+    """Whether doing without an effect is ruled out by the evidence of its set, and by more of it than errors in
+    the forms of the set's others may feign."""
+    others = tuple(j for j in model.effects if j != effect)
+    form = max((f.gap.candidates[j].form for j in others), default=0.0)
+    feigned = form * (model.score - fitted(f, ()).score)
+    return model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned)
 
 
 def _there(f: Forms, model: Model, effect: int) -> bool:

@@ -233,9 +233,9 @@ def recorded(arrays: Arrays, channel: str) -> np.ndarray:
     return arrays.there[..., CHANNELS.index(channel)]
 
 
-# prior: shares of the variances of anywhere in a dead band, of a slide of both pads and of one pad alone, by
-# which joints and pads move unseen between two samples, and their chances: as a rule they do not
-SHARES, CHANCES = np.array([[0, 0, 0], [0.01, 0.01, 0], [1, 1, 1]]), np.array([0.8, 0.1, 0.1])
+# prior: shares of the variance of anywhere in a dead band, by which joints move unseen between two samples,
+# and their chances: as a rule they do not
+SHARES, CHANCES = np.array([0.0, 0.01, 1.0]), np.array([0.8, 0.1, 0.1])
 
 
 def in_grip(
@@ -255,13 +255,15 @@ def in_grip(
     place = arrays.phase[..., Phase.PLACE]
     parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
     grip, part = _others(arrays.onehot), _others(parts.reshape(*place.shape, -1))
+    slide = SLIDE * world.slip
+    walk = np.square(np.stack([_wider(each) for each in (arrays.pushed, slide, slide)], -1))
     band = world.dead_band or DeadBand(*np.zeros((4, *place.shape, 0)), np.zeros((len(place), 0)))
     (x, y), apart = swung(world), np.array([-1.0, -1.0, 1.0, 1.0])
     levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)[..., : band.place.shape[-1]]
     return tracked(
         values - (levers @ band.place[..., None])[..., 0], weight, noise, -levers,
-        np.square(_wider(arrays.pushed)), np.stack([part, grip, grip], -1), ANYWHERE**2, SLIDE**2,
-        _wider(world.slip), band.pinned > 0, *band[:1], *band[2:], SHARES, CHANCES,
+        walk, np.stack([part, grip, grip], -1), ANYWHERE**2, band.pinned > 0, *band[:1], *band[2:],
+        SHARES, CHANCES,
     )  # fmt: skip
 
 

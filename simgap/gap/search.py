@@ -77,9 +77,12 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     """The best fit of one form of an effect, properties refitted; not refined where that promises nothing.
 
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
-    what swings with it has no size.
+    what swings with it has no size. Properties start as they were measured: without the effect they may have
+    been drawn far off.
     """
-    every, usual = starts(given, key, neutral(given)), healthy.push
+    base = healthy.u.copy()
+    base[: given.num_properties][given.measured.ravel()] = 0.0
+    every, usual = starts(given, key, base), healthy.push
     ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < PROMISING:
         return fit(given, ranked[0][2], 0, usual)

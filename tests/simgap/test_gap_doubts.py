@@ -7,23 +7,21 @@ from scipy.stats import multivariate_normal
 
 from simgap.channels import play
 from simgap.effects.geometry import within
-from simgap.gap.residuals import ANYWHERE, SLIDE, driven, sensed
+from simgap.gap.residuals import ANYWHERE, driven, sensed
 from simgap.recursions import tracked
 from tests.simgap.test_gap_effects import performance, world_of
 
 
-def _tracked(
-    values, sd, *, weight=1.0, walk=0.0, new=False, may=0.0, joints=None, shares=(0.0,), chance=(1.0,)
-):
+def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares=(0.0,), chance=(1.0,)):
     """What the filter makes of one trial's values (N, 4). `joints`: levers, pinned, place and jump of two."""
     n = len(values)
     levers, pinned, place, jump = joints or (np.zeros((n, 4, 0)), np.zeros((n, 0)) > 0, np.zeros((n, 0)), 0.0)
     still = np.zeros((1, *place.shape))
     return tracked(
         values[None], np.broadcast_to(weight, (1, n, 4)) * 1.0, np.full((1, n, 4), sd), levers[None],
-        np.broadcast_to(walk, (1, n)) * 1.0, np.broadcast_to(new, (1, n, 3)) > 0, ANYWHERE**2, SLIDE**2,
-        np.broadcast_to(may, (1, n)) * 1.0, pinned[None], place[None], still, still + 1e-6,
-        np.full((1, place.shape[1]), jump), np.asarray(shares)[:, None] * np.ones(3), np.asarray(chance),
+        np.broadcast_to(np.reshape(walk, (-1, 1)), (1, n, 3)) * 1.0, np.broadcast_to(new, (1, n, 3)) > 0,
+        ANYWHERE**2, pinned[None], place[None], still, still + 1e-6,
+        np.full((1, place.shape[1]), jump), np.asarray(shares), np.asarray(chance),
     )  # fmt: skip
 
 
@@ -37,7 +35,7 @@ def _alone(values, channel):
     return np.outer(values, np.eye(4)[channel]), np.eye(4)[channel]
 
 
-def test_a_block_that_is_taken_along_is_a_random_walk_marginalised_exactly():
+def test_a_constant_that_walks_is_marginalised_exactly():
     rng = np.random.default_rng(0)
     n, sd = 12, 2e-5
     walk = np.where(np.isin(np.arange(n), (4, 5, 6)), 2e-3, 0.0)
@@ -48,23 +46,10 @@ def test_a_block_that_is_taken_along_is_a_random_walk_marginalised_exactly():
         whole = multivariate_normal(np.full(n, values[0]), covariance).logpdf(values)
         first = multivariate_normal(values[0], ANYWHERE**2 + sd**2).logpdf(values[0])
         plain = -0.5 * (n - 1) * np.log(2 * np.pi * sd**2)
-        of, weight = _alone(values, 0)
-        cost = _cost(_tracked(of, sd, weight=weight, walk=walk**2), sd, 0)
-        assert cost == pytest.approx(-(whole - first - plain), abs=2e-3)
-
-
-def test_a_slide_is_the_likeliest_of_all_moves_and_pays_for_being_one():
-    values, sd = np.where(np.arange(12) > 5, 1e-3, 0.0), 2e-5
-    for channel in (1, 3):
-        of, weight = _alone(values, channel)
-        holding, may = (
-            _tracked(of, sd, weight=weight, may=chance, shares=(0.0, 1.0), chance=(0.8, 0.2))
-            for chance in (0.0, 0.5)
-        )
-        assert holding[2] == 0.0 and _cost(holding, sd, channel) > 100
-        # Eleven times it held, which the first sample cannot tell, and once it slid.
-        assert may[2] == pytest.approx(-11 * np.log(0.9) - np.log(0.1))
-        assert _cost(may, sd, channel) < 12
+        for channel in (0, 1, 3):  # a block that is taken along, pads that slide
+            of, weight = _alone(values, channel)
+            cost = _cost(_tracked(of, sd, weight=weight, walk=walk**2), sd, channel)
+            assert cost == pytest.approx(-(whole - first - plain), abs=2e-3)
 
 
 def test_a_new_grip_and_unknown_samples_tell_nothing():
