@@ -10,7 +10,7 @@ from estimation_scene import TRUE, UNIT, drawn, make_design
 
 from estimation import priors
 from estimation.pads import SLOPE_SD
-from estimation.posterior import REACH, STEP, find_mode, log_density, log_prior, posterior
+from estimation.posterior import find_mode, log_density, log_prior, posterior
 
 FLAT = 1e3  # sd of a prior that is flat against a width of micrometres, but not so flat that digits go
 
@@ -82,29 +82,6 @@ def test_the_conditional_gaussian_is_that_of_the_joint_one(deviations):
         np.testing.assert_allclose(
             found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-2
         )
-
-
-def test_the_table_stands_for_the_sums_over_observations():
-    """Each channel's form and determinant at the grid's points, against elimination done directly."""
-    design, *_ = drawn(make_design(deviations=2), 3)
-    post = posterior(design)
-    for c in range(3):
-        rows, shared, residual, _ = post.channel_rows(c)
-        mine = design.channel == c
-        unit2 = (priors.SCATTER_MEDIAN[c] * design.unit[mine]) ** 2
-        place = np.array([7, 8, 1 + c, 4 + c, 0])  # of deviations, shares and the residual among (1, e, f, z)
-        for index in (4, 60, 81):
-            weight = 1 / (design.variance[mine] + np.exp(REACH[0] + index * STEP) * unit2)
-            normal = (rows.T * weight) @ rows
-            every = np.column_stack([shared, residual])
-            cross = (rows.T * weight) @ every
-            left = (every.T * weight) @ every - cross.T @ np.linalg.solve(normal, cross)
-            expected = np.zeros((9, 9))
-            expected[place[:, None], place] = left
-            found = post.tables.forms[c, index]
-            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(left).max())
-            log_det = np.linalg.slogdet(normal)[1] - np.log(weight).sum()
-            assert post.tables.log_det[c, index] == pytest.approx(log_det, rel=1e-9)
 
 
 def test_a_channel_without_observations_keeps_its_prior():
