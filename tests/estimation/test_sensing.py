@@ -87,7 +87,7 @@ ALTERED = {
     "one vertical": (scaled(2.0, "fy1"), "what fy1 takes of a carried weight fy2 gives up 0.5.*-fold"),
     "angles": (scaled(1.1, "q11", "q12", "q21", "q22"), "distance changes by 2. cm a metre .* vertically"),
     "one angle": (later(0.0, 0.05, "q11"), "distance changes by 1.* cm a metre"),
-    "velocities": (scaled(2.0, *RATES), "0.5 times as far as their velocities"),
+    "velocities": (scaled(2.0, *RATES), "0.5.* times as far as their velocities"),
     "every other row": (lambda c: {n: np.where(PLACE % 2, c[n], np.nan) for n in NAMES},
                          "every channel lacks 50% of its readings"),
     "holes": (lacking(len(NAMES)), "every row without some reading"),
