@@ -20,11 +20,12 @@ from estimation.design import Design
 from estimation.observations import CHANNELS
 from estimation.pads import unit_pads
 from estimation.posterior import NUM_CHANNELS, Posterior
-from estimation.sampler import CERTAIN, Draws
+from estimation.sampler import Draws
 from hmmseg.hand.plausibility import Finding, all_changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS
+from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.segmentation.align import AlignedTrials
 
 NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.0035
@@ -91,7 +92,6 @@ def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> Predictive
 STEEL = 7850.0  # physics: [kg/m^3]
 DEEPEST = 10.0  # limit: depths of a block in widths; none is held by two pads that is deeper
 LIGHT = 1500.0  # limit: [kg/m^3]: plastics and stone, of which the unit that makes it is the likeliest
-NOT_LEVEL = 2e-3  # chosen: m; more than a tilted table or a slip in the grip make of a move on a level
 
 
 def soft_pads(design: Design, rig: Rig) -> list[str]:
@@ -134,7 +134,7 @@ def unnamed(task: BlockTask, design: Design) -> list[str]:
         f"{task.performed[move].object} was {'raised' if rise > 0 else 'lowered'} by {abs(rise) * 1e3:.1f} "
         "mm, though the task moves it on a level: an object that the task does not name may lie beneath"
         for move, rise in design.level_rises.items()
-        if abs(rise) > NOT_LEVEL
+        if abs(rise) > MOVED
     ]
 
 

@@ -38,13 +38,13 @@ import numpy as np
 from estimation.design import RISE, Design, PadDoubt
 from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
 from estimation.pads import MISSTATED, SLOPE_SD
-from estimation.sampler import CERTAIN
 from hmmseg.contact.decompose import ON_GROUND, stack
 from hmmseg.hand.plausibility import scale_to_velocity
 from hmmseg.hand.sensing import WHITE
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import GROUND
 from hmmseg.io.trial import position_pairs
+from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 
@@ -58,7 +58,6 @@ WELL_MADE = {
 SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
 BRIEF = 5  # numerics: samples that are no glitch
 FEWEST = 8  # numerics: samples of a carry that determine a slope
-BESIDE = 3e-3  # chosen: m below a grip in which a block that stands on another surely is itself
 
 
 @dataclass(frozen=True)
@@ -290,7 +289,7 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
                 since, until = end, spans[min(after)][0] if after else s.t[-1] + 1
                 under = support[grip.object] = task.performed[grip.move].to
             at = (s.t > since + APART) & (s.t < until - APART)
-            floor = -np.inf if under == GROUND else grip.y - BESIDE
+            floor = -np.inf if under == GROUND else grip.y - MOVED
             for x, y in ((s.x1, s.y1), (s.x2, s.y2)):
                 within = at & (y < grip.y) & (y > floor)
                 depth = np.minimum(x - grip.x1, grip.x2 - x)[within]

@@ -498,16 +498,21 @@ def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
     return out
 
 
+BIASED = 0.0025  # prior: share of forces whose zero the rig has wrong: those of one recording in a hundred
+
+
 def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
     """Extra prior sd (4,) of force biases that free motion shows and the rig does not admit [N].
 
-    Forces in free motion should vanish; where their pooled mean is beyond 4 standard errors of
-    what noise and the rig's own [systematic] allow, the bias gets a prior as wide as itself.
+    Forces in free motion should vanish, but for noise and the rig's own [systematic]. A bias as wide as their
+    pooled mean explains that better by (z^2 - 1) / 2 - log z nats; it is allowed where that makes it likelier
+    than not.
     """
     precision = 1.0 / variance
     pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
     allowed = np.hypot(1.0 / np.sqrt(precision.sum(axis=0)), np.asarray(rig.systematic.force_bias))
-    return np.where(np.abs(pooled) > 4 * allowed, np.abs(pooled), 0.0)
+    z = np.maximum(np.abs(pooled) / allowed, 1.0)
+    return np.where((z**2 - 1) / 2 - np.log(z) > np.log(1 / BIASED - 1), np.abs(pooled), 0.0)
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,10 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.levels import SURE
+from hmmseg.levels import CERTAIN, FIRM, SURE
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
-MOVING = 3.0  # chosen: noise sds of the velocity beyond which the block surely slides
 FEWEST = 4  # numerics: samples of sliding
 WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little
 COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
@@ -71,7 +70,7 @@ def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
         return np.zeros((0, 3))
     direction = np.sign(np.median(s.vx[sliding]))
     sd = np.where(np.isfinite(s.sd_vx), s.sd_vx, 0.0) / np.sqrt(2.0)
-    sliding &= direction * np.nan_to_num(s.vx) > MOVING * sd
+    sliding &= direction * np.nan_to_num(s.vx) > SURE * sd
     bias_x, bias_y = (float(free @ np.nan_to_num(f)) for f in (s.fx, s.fy))
     lag = direction * np.nan_to_num(acceleration(s.t, s.vx)) / rig.gravity
     return np.stack([direction * (s.fx - bias_x), lag, s.fy - bias_y], axis=1)[sliding]
@@ -122,7 +121,6 @@ def _log_posterior(table: np.ndarray, noise: float, carried: tuple[float, float]
 
 
 PRIOR = 0.05  # prior: probability of slip before the anchors are seen
-SLIPPED = 0.99  # chosen: probability from which slip is said to be seen
 STRAY = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
 STRAY_DRIFT = 2e-3  # prior: m per root second
 SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s of a slipping pad
@@ -197,7 +195,7 @@ def slip_evidence(
     factor = float(logsumexp(joint) - np.log(len(moved)) - logsumexp(log_drift[:, 0] + still.sum(axis=1)))
     odds = factor + np.log(PRIOR / (1 - PRIOR))
     probability = float(1 / (1 + np.exp(-np.clip(odds, -700, 700))))
-    return SlipEvidence(probability, factor, probability > SLIPPED)
+    return SlipEvidence(probability, factor, probability > CERTAIN)
 
 
 def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
@@ -347,9 +345,6 @@ def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generato
     return np.bincount(places, weights=sizes, minlength=log_likelihood.shape[1])
 
 
-# chosen: while a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the
-# ratio of two small forces says little: samples below this share of the grip's median are left out.
-FIRM = 0.5
 DRAWS = 2000  # numerics: of each coefficient
 
 
@@ -460,7 +455,11 @@ def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
 
 
 def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment."""
+    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment.
+
+    While a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of
+    two small forces says little.
+    """
     recorded = np.isfinite(forces.normal + forces.shear)
     core = (holding.mean(axis=0) > 0.5) & recorded
     if not core.any():

@@ -22,7 +22,7 @@ from estimation.checks import (
 from estimation.consistency import contradictions, force_scale
 from estimation.design import Design, Unknown
 from estimation.friction import FrictionPosterior, friction_posteriors
-from estimation.observations import Noise, WeighedTrial, aligned_weights, with_slides
+from estimation.observations import Noise, WeighedTrial, aligned_weights
 from estimation.report import Actual, inference_data, properties_table, summary
 from estimation.sampler import Draws, designs, sample_either
 from hmmseg.contact.decompose import (
@@ -179,7 +179,6 @@ def identify_aligned(
     rng, rig = np.random.default_rng(seed), aligned.rig
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)
-    weighed = with_slides(weighed, noise, aligned.rig)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design, other = designs(aligned, weighed, noise)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)

@@ -9,19 +9,18 @@ Three observations a grip (the span from pickup to place of one move):
 
 Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2
 pooled over grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal
-1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask. Places of blocks
-that slid in the grip count for less.
+1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
-from estimation.pads import SLOPE_SD, UNSTATED, Slope, landing, middle_share, shear_give, slopes_within
+from estimation.pads import Slope, landing, shear_give, slopes_within
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
@@ -335,50 +334,3 @@ def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: st
     if not residuals:
         return 1.0
     return max(robust_sd(np.concatenate(residuals)), 1e-9)
-
-
-SEEN = 3.0  # chosen: standard errors beyond which a landing is a slide
-WITNESSES = ("rise", "landing")
-
-
-def with_slides(weighed: Sequence[WeighedTrial], noise: Noise, rig: Rig) -> list[WeighedTrial]:
-    """The trials with places counting for less where their blocks slid; others as they are.
-
-    A landing in which a block slid is no witness of the pads any more.
-    """
-    readings = [np.nan_to_num(channel_values(a.signals, rig)["place"]) for a in weighed]
-    slopes = [
-        (float(found.weights @ reading), found.variance)
-        for a, reading in zip(weighed, readings, strict=True)
-        for of_move in a.weights.slopes.values()
-        for name, found in of_move.items()
-        if name in WITNESSES
-    ]
-    if not slopes:
-        return list(weighed)
-    stated = np.isfinite(rig.fingertip.shear_stiffness)
-    believed = max(rig.systematic.pad_stiffness) if stated else UNSTATED
-    shares, variances = np.array([(0.0, believed**2), *slopes]).T
-    common, _ = middle_share(shares, variances, SLOPE_SD)
-    return [
-        _doubted(a, reading, common, noise.variance["place"])
-        for a, reading in zip(weighed, readings, strict=True)
-    ]
-
-
-def _doubted(a: WeighedTrial, reading: np.ndarray, common: float, variance: float) -> WeighedTrial:
-    counts, slopes = dict(a.weights.counts), dict(a.weights.slopes)
-    for move, of_move in a.weights.slopes.items():
-        found = of_move.get("landing")
-        slid = 0.0 if found is None else _slid(found, float(found.weights @ reading), common)
-        if slid:
-            usual = counts[move]["place"]
-            counts[move] = counts[move] | {"place": usual / (1 + usual * slid**2 / variance)}
-            slopes[move] = {name: s for name, s in of_move.items() if name != "landing"}
-    return replace(a, weights=replace(a.weights, counts=counts, slopes=slopes))
-
-
-def _slid(found: Slope, share: float, common: float) -> float:
-    """How far [m] a landing went beyond what its pads gave; 0 where it need not have."""
-    doubt = float(np.sqrt(found.variance + (SLOPE_SD * max(abs(common), 1.0)) ** 2))
-    return (share - common) * found.change if abs(share - common) > SEEN * doubt else 0.0

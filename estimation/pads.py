@@ -41,13 +41,11 @@ class Slope(Brief):
     """Weights (num_timesteps,) whose sum with readings is their slope over the give, and its variance.
 
     `alike`: what all slopes of a hand may be off by together, for one reason (part of `variance`).
-    `change` [m]: what a landing's give changed by; 0 of a slope within a grip.
     """
 
     weights: np.ndarray
     variance: float
     alike: float = 0.0
-    change: float = 0.0
 
 
 def unit_pads(rig: Rig) -> Pads:
@@ -222,7 +220,7 @@ def landing(
     bend = max(abs(float((parabola - line) @ y)), float(np.abs(np.diff(y, 2)).max()))
     speed = float(np.polyfit(t[before] - moment, y, 1)[0])
     variance = (speed * moment_sd) ** 2 + bend**2 + noise**2 * (float((parabola**2).sum()) + 1 / count)
-    return Slope(weights / change, variance / change**2, change=change)
+    return Slope(weights / change, variance / change**2)
 
 
 def _extrapolation(t: np.ndarray, degree: int) -> np.ndarray:

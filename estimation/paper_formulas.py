@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -77,13 +78,15 @@ class PluginEstimates:
         return {"properties": shown, "reasons": dict(self.reasons)}
 
 
-@dataclass(frozen=True)
-class _Mean:
-    """A mean over samples with their standard deviation and its standard error."""
+class _Mean(NamedTuple):
+    """A mean over samples, their standard deviation and the mean's standard error."""
 
     mean: float
     sd: float
     error: float
+
+
+Found = tuple[_Mean, list[str]]  # with the labels of the subtasks that it is of
 
 
 @dataclass(frozen=True)
@@ -94,14 +97,22 @@ class _Trial:
     held: np.ndarray
     spans: dict[int, tuple[float, float]]  # index of the subtask: start and end [s]
 
-    def samples(self, subtask: int, trim: float = 0.0) -> np.ndarray:
-        """Whether each sample is of the subtask and held, bool (num_timesteps,)."""
-        if subtask not in self.spans:
+    def samples(self, step: Subtask, trim: float = 0.0) -> np.ndarray:
+        """Whether each sample is of the subtask and held (num_timesteps,), `trim` of it left off each end."""
+        if step.index not in self.spans:
             return np.zeros(self.held.size, dtype=bool)
-        start, end = self.spans[subtask]
+        (start, end), t = self.spans[step.index], self.signals.t
         cut = trim * (end - start)
-        t = self.signals.t
         return self.held & (t >= start + cut) & (t < end - cut)
+
+    def mean(self, name: str, step: Subtask, trim: float = 0.0) -> _Mean | None:
+        """Mean of a signal over these; None of fewer than two that are there, whose scatter is unknown."""
+        values = getattr(self.signals, name)[self.samples(step, trim)]
+        values = values[np.isfinite(values)]
+        if values.size < 2:
+            return None
+        sd = float(np.std(values, ddof=1))
+        return _Mean(float(np.mean(values)), sd, sd / math.sqrt(values.size))
 
 
 def estimate_plugin(
@@ -124,32 +135,30 @@ def estimate_plugin(
     Raises:
         ValueError: the sequences differ in length.
     """
-    labels = [label_states(s) for s in trials_signals] if states is None else list(states)
+    labels = [label_states(s) for s in trials_signals] if states is None else states
     task = _as_performed(task, segmentations)
     steps = subtasks(task)
     trials = [
         _Trial(signals, label.state > 1, _matched(segmentation, steps))
         for signals, segmentation, label in zip(trials_signals, segmentations, labels, strict=True)
     ]
-    heights = _heights(trials, task, steps)
-    known = decompose(task).properties
+    heights, known = _heights(trials, task, steps), decompose(task).properties
     properties: dict[str, dict[str, Estimate | FrictionBound | None]] = {}
     reasons: dict[str, str] = {}
     for name in task.objects:
-        found = {
-            "weight": _over_carries(trials, steps, name, "weight", "fy", TRIM),
-            "width": _over_carries(trials, steps, name, "width", "distance", 0.0),
-            "height": heights.get(name),
-            "friction": _friction(trials, steps, name),
+        grips = [s for s in steps if s.state != FREE and s.object == name]
+        carries = [s for s in grips if s.state == ABOVE_GROUND]
+        properties[name] = {
+            "weight": _pooled("weight", _means(trials, carries, "fy", TRIM)),
+            "width": _pooled("width", _means(trials, carries, "distance", 0.0)),
+            "height": _pooled("height", heights[name]),
+            "friction": _friction(trials, grips),
         }
-        properties[name] = found
-        for key, value in found.items():
-            if value is None:
-                shown = "no trial shows enough identified samples of the subtasks it needs"
-                carried = any(s.state == ABOVE_GROUND and s.object == name for s in steps)
-                if key in ("weight", "width") and not carried:
-                    shown = f"no move carries {name}, and the formula averages over a carry"
-                reasons[f"{name}.{key}"] = known[name][key].reason or shown
+        for key in [key for key, value in properties[name].items() if value is None]:
+            shown = "no trial shows enough identified samples of the subtasks it needs"
+            if key in ("weight", "width") and not carries:
+                shown = f"no move carries {name}, and the formula averages over a carry"
+            reasons[f"{name}.{key}"] = known[name][key].reason or shown
     return PluginEstimates(properties, reasons)
 
 
@@ -175,88 +184,65 @@ def _matched(segmentation: Segmentation, steps: tuple[Subtask, ...]) -> dict[int
     return matched
 
 
-def _mean(values: np.ndarray) -> _Mean | None:
-    """Mean of the samples that are there; None of fewer than two, whose scatter is unknown."""
-    values = values[np.isfinite(values)]
-    if values.size < 2:
-        return None
-    sd = float(np.std(values, ddof=1))
-    return _Mean(float(np.mean(values)), sd, sd / math.sqrt(values.size))
+def _means(trials: Sequence[_Trial], steps: Sequence[Subtask], name: str, trim: float) -> list[Found]:
+    found = [(trial.mean(name, step, trim), [step.label]) for trial in trials for step in steps]
+    return [(mean, labels) for mean, labels in found if mean is not None]
 
 
-def _pooled(means: Sequence[_Mean], unit: str, names: Sequence[str]) -> Estimate | None:
+def _pooled(key: str, found: Sequence[Found]) -> Estimate | None:
     """Mean over the means, each with the same weight."""
-    if not means:
+    if not found:
         return None
-    sd = math.sqrt(np.mean([m.sd**2 for m in means]))
-    error = math.sqrt(sum(m.error**2 for m in means)) / len(means)
-    return Estimate(unit, float(np.mean([m.mean for m in means])), sd, error, tuple(dict.fromkeys(names)))
+    mean, sd, error = np.array([each for each, _ in found]).T
+    names = dict.fromkeys(label for _, labels in found for label in labels)
+    return Estimate(UNITS[key], float(mean.mean()), math.sqrt(np.mean(sd**2)),
+                    math.sqrt(np.sum(error**2)) / len(found), tuple(names))  # fmt: skip
 
 
-def _over_carries(
-    trials: Sequence[_Trial], steps: tuple[Subtask, ...], name: str, key: str, signal: str, trim: float
-) -> Estimate | None:
-    carries = [s for s in steps if s.state == ABOVE_GROUND and s.object == name]
-    found = [(_mean(getattr(trial.signals, signal)[trial.samples(s.index, trim)]), s.label)
-             for trial in trials for s in carries]  # fmt: skip
-    return _pooled([mean for mean, _ in found if mean], UNITS[key], [label for mean, label in found if mean])
+def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]) -> dict[str, list[Found]]:
+    """Height of every object in each trial that determines it, by least squares.
 
-
-def _heights(
-    trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]
-) -> dict[str, Estimate | None]:
-    """Height of every object that some trial determines."""
-    equations = [(move, rise) for move, rise in height_equations(task) if rise]
-    by_name: dict[str, list[_Mean]] = {name: [] for name in task.objects}
-    used: dict[str, list[str]] = {name: [] for name in task.objects}
+    Means are taken as independent; a height is its absolute value, as Table 3 has it.
+    """
+    found: dict[str, list[Found]] = {name: [] for name in task.objects}
     for trial in trials:
-        rows, rises, measured = [], [], []
-        for move, rise in equations:
-            difference = _rise(trial, steps, move)
-            if difference is not None:
-                rows.append([rise.get(name, 0) for name in task.objects])
-                rises.append(difference)
-                measured.append(move)
+        rows, rises, labels = [], [], []
+        for move, rise in height_equations(task):
+            ends = [s for s in steps if s.move == move and s.name in ("pickup", "place")]
+            means = [trial.mean("y2", s) for s in ends]
+            if rise and all(means):
+                (low, sd, error), (high, high_sd, high_error) = means
+                rows.append([float(rise.get(name, 0)) for name in task.objects])
+                rises.append((high - low, math.hypot(sd, high_sd), math.hypot(error, high_error)))
+                labels.append([s.label for s in ends])
         if not rows:
             continue
-        matrix = np.array(rows, dtype=float)
-        inverse = np.linalg.pinv(matrix)
-        determined = np.isclose(inverse @ matrix, np.eye(len(task.objects)), atol=1e-9).all(axis=1)
+        inverse = np.linalg.pinv(rows)
+        determined = np.isclose(inverse @ rows, np.eye(len(task.objects)), atol=1e-9).all(axis=1)
+        mean, sd, error = np.array(rises).T
         for name, weights in zip(np.array(task.objects)[determined], inverse[determined], strict=True):
-            by_name[name].append(_combined(weights, rises))
-            moves = {move for move, weight in zip(measured, weights, strict=True) if abs(weight) > 1e-9}
-            used[name] += [s.label for s in _ends(steps, moves)]
-    return {name: _pooled(by_name[name], UNITS["height"], used[name]) for name in task.objects}
+            combined = _Mean(
+                abs(float(weights @ mean)), *(float(np.hypot.reduce(weights * v)) for v in (sd, error))
+            )
+            used = [
+                label
+                for own, weight in zip(labels, weights, strict=True)
+                if abs(weight) > 1e-9
+                for label in own
+            ]
+            found[name].append((combined, used))
+    return found
 
 
-def _combined(weights: np.ndarray, rises: Sequence[_Mean]) -> _Mean:
-    """Weighted sum of independent means; its absolute value, as Table 3 has it."""
-    mean, sd, error = np.array([(m.mean, m.sd, m.error) for m in rises]).T
-    return _Mean(abs(float(weights @ mean)), float(np.hypot.reduce(weights * sd)),
-                 float(np.hypot.reduce(weights * error)))  # fmt: skip
-
-
-def _ends(steps: tuple[Subtask, ...], moves: set[int]) -> list[Subtask]:
-    return [s for s in steps if s.move in moves and s.name in ("pickup", "place")]
-
-
-def _rise(trial: _Trial, steps: tuple[Subtask, ...], move: int) -> _Mean | None:
-    """Mean y2 over a move's place less that over its pickup."""
-    pickup, place = (_mean(trial.signals.y2[trial.samples(s.index)]) for s in _ends(steps, {move}))
-    if pickup is None or place is None:
-        return None
-    sd, error = math.hypot(place.sd, pickup.sd), math.hypot(place.error, pickup.error)
-    return _Mean(place.mean - pickup.mean, sd, error)
-
-
-def _friction(trials: Sequence[_Trial], steps: tuple[Subtask, ...], name: str) -> FrictionBound | None:
-    grips = [s for s in steps if s.state != FREE and s.object == name]
-    best, names = -math.inf, []
+def _friction(trials: Sequence[_Trial], grips: Sequence[Subtask]) -> FrictionBound | None:
+    """The largest ratio that any grip shows."""
+    shown = []
     for trial in trials:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(trial.signals.fx1 > 0, np.abs(trial.signals.fy1 / trial.signals.fx1), np.nan)
         for step in grips:
-            chosen = trial.samples(step.index) & (trial.signals.fx1 > 0)
-            ratio = np.abs(trial.signals.fy1[chosen] / trial.signals.fx1[chosen])
-            if np.isfinite(ratio).any():
-                best = max(best, float(np.nanmax(ratio)))
-                names.append(f"{step.name} {name}")
-    return FrictionBound(best, tuple(dict.fromkeys(names))) if names else None
+            inside = ratio[trial.samples(step) & np.isfinite(ratio)]
+            shown += [(float(inside.max()), step.label)] if inside.size else []
+    if not shown:
+        return None
+    return FrictionBound(max(ratio for ratio, _ in shown), tuple(dict.fromkeys(label for _, label in shown)))

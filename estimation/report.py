@@ -13,7 +13,7 @@ from rich.table import Table
 from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
-from hmmseg.levels import CONTRADICTS
+from hmmseg.levels import SURE
 from hmmseg.numbers import SHOWN, estimate, interval, plain
 
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
@@ -77,7 +77,7 @@ def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0)
 
     Returns:
         By object and property: `value`, `sd`, and where the property was identified `relative_deviation`, `z`
-        (in sds of both together), `inside_95` and `disagrees`, which is beyond CONTRADICTS sds and beyond
+        (in sds of both together), `inside_95` and `disagrees`, which is beyond SURE sds and beyond
         `smallest`. Of a friction with a lower bound alone it can only be said that the measured one lies
         below.
     """
@@ -92,10 +92,10 @@ def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0)
                 row["relative_deviation"] = share
                 row["z"] = (found["mean"] - value) / math.hypot(found["sd"], sd)
                 row["inside_95"] = bool(low - 2 * sd <= value <= high + 2 * sd)
-                row["disagrees"] = bool(abs(row["z"]) > CONTRADICTS and abs(share) > smallest)
+                row["disagrees"] = bool(abs(row["z"]) > SURE and abs(share) > smallest)
             elif found is not None and found.get("lower_bound") is not None:
                 short = 1 - value / found["lower_bound"]
-                row["disagrees"] = bool(short > smallest and value + CONTRADICTS * sd < found["lower_bound"])
+                row["disagrees"] = bool(short > smallest and value + SURE * sd < found["lower_bound"])
             out.setdefault(obj, {})[prop] = row
     return out
 

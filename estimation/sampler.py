@@ -25,6 +25,7 @@ from estimation import priors
 from estimation.design import DISTANCE, RISE, Design, PadDoubt, build
 from estimation.observations import Noise, WeighedTrial
 from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode, posterior
+from hmmseg.levels import CERTAIN
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Brief
 
@@ -264,9 +265,6 @@ def split_rhat(chain: np.ndarray) -> float:
     within = parts.var(axis=1, ddof=1).mean(axis=0)
     between = parts.mean(axis=1).var(axis=0, ddof=1)
     return float(np.sqrt(np.max(1 + between / within)))
-
-
-CERTAIN = 0.99  # chosen: probability from which it is said, and taken for true, that the rig's pads are wrong
 
 
 def designs(

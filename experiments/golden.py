@@ -75,10 +75,10 @@ def diagnosed(name: str) -> Json:
 def ensembles(effect: str) -> Json:
     """What the diagnosis of given trials finds where one effect is planted in six made-up ones."""
     from experiments.generic_ensembles import PLANTED, made
-    from simgap.generic.diagnose import diagnosed as diagnose_ensembles
+    from simgap.generic.diagnose import diagnose as diagnose_ensembles
 
     effects = None if effect == "none" else {effect: PLANTED[effect]}
-    return summary(diagnose_ensembles(made(7, effects, False), (), 0, lambda text: None).body)
+    return summary(diagnose_ensembles(made(7, effects, False)).body)
 
 
 def summary(body: Json) -> Json:

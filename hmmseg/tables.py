@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 import io
 from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:  # rich is loaded when something is shown
     from rich.table import Table
@@ -49,6 +50,36 @@ class Tabled(ABC):
     def _repr_html_(self) -> str:
         said = f"<p>{html.escape(self.words())}</p>" if self.words() else ""
         return said + "".join(map(as_html, self.tables()))
+
+
+def listed(
+    title: str,
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    right: Collection[str] = (),
+    wraps: bool = False,
+) -> Table:
+    """A table for the terminal.
+
+    Args:
+        title: Above it.
+        heads: Of the columns; none, and there is no line of heads.
+        rows: Cells, one for each column.
+        right: Heads of the columns whose cells end on a line.
+        wraps: Whether cells may go on in a further line.
+
+    Returns:
+        The table.
+    """
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=bool(heads))
+    for head in heads:
+        side: Literal["left", "right"] = "right" if head in right else "left"
+        table.add_column(head, justify=side, no_wrap=not wraps, overflow="fold" if wraps else "ellipsis")
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def as_text(table: Table) -> str:

@@ -32,7 +32,6 @@ SchedulerOption = Annotated[str | None, typer.Option(
     "--scheduler", metavar="ADDRESS",
     help="The same on a Dask cluster, as tcp://host:8786; local: one of this machine.")]  # fmt: skip
 LOCAL = "local"
-CHUNK = 4  # numerics: recordings that a process is handed at once
 PATIENCE = 10.0  # limit: s; how long a cluster is waited for
 
 
@@ -79,46 +78,44 @@ def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
     return description, read_rig(rig)
 
 
-def segment_each(paths: Sequence[Path], task: Path, rig: Path) -> list[Segmented]:
-    """Segmentations of recordings that have nothing to do with each other; runs in a worker."""
+def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
+    """Segmentation of one recording by itself; runs in a worker."""
     from hmmseg.hand.read import read_trial
     from hmmseg.segmentation.align import segment
 
     description, hand = _lab(task, rig)
-    found = []
-    for path in paths:
-        trial = read_trial(path, hand)
-        segmentation = replace(segment([trial], description, hand)[0], recorded=None)
-        found.append(Segmented(segmentation, tuple(trial.warnings), tuple(trial.notes)))
-    return found
+    trial = read_trial(path, hand)
+    segmentation = replace(segment([trial], description, hand)[0], recorded=None)
+    return Segmented(segmentation, tuple(trial.warnings), tuple(trial.notes))
 
 
 def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
     advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
-    """What `segment_each` finds, in the order of the paths; `advance` gets how many more are done.
+    """What `segment_one` finds, in the order of the paths; `advance` gets how many more are done.
 
     A recording whose worker is lost is segmented again by itself; if that worker is lost too it is left out,
     and `tell` says so. InputError where a recording or the cluster is at fault; what has not begun then is
     not begun.
     """
-    left = [paths[i : i + CHUNK] for i in range(0, len(paths), CHUNK)]
-    lab = task.absolute(), rig.absolute()
+    left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
         with _executor(workers, scheduler) as executor:
-            futures = [executor.submit(segment_each, [p.absolute() for p in part], *lab) for part in left]
+            futures = [executor.submit(segment_one, path.absolute(), *lab) for path in left]
             try:
-                while left:
-                    found: Sequence[Segmented | None] | None = _unless_lost(futures[-len(left)])
-                    part, lost = left.pop(0), found is None
+                for future in futures:
+                    path, found = left.pop(0), _unless_lost(future)
+                    lost = found is None
+                    if lost:
+                        tell(f"{path}: its worker, or that of a recording near it, was lost; once more")
+                        with _executor(1, None) as alone:
+                            found = _unless_lost(alone.submit(segment_one, path.absolute(), *lab))
+                    advance(1)
                     if found is None:
-                        tell(f"{part[0]}: its worker, or that of a recording near it, was lost; once more")
-                        found = [_alone(path, lab, tell) for path in part]
-                    advance(len(part))
-                    for path, each in zip(part, found, strict=True):
-                        if each is not None:
-                            yield replace(each, segmentation=replace(each.segmentation, file=str(path)))
+                        tell(f"{path}: the process that segmented it was killed, twice; it is left out")
+                    else:
+                        yield replace(found, segmentation=replace(found.segmentation, file=str(path)))
                     if lost:  # all of a pool is lost with one of its processes; a cluster may be gone
                         scheduler = None
                         break
@@ -127,16 +124,7 @@ def segment_apart(
                     future.cancel()
 
 
-def _alone(path: Path, lab: tuple[Path, Path], tell: Callable[[str], None]) -> Segmented | None:
-    """A recording segmented in a process of its own; None, which `tell` reports, where that is lost too."""
-    with _executor(1, None) as executor:
-        found = _unless_lost(executor.submit(segment_each, [path.absolute()], *lab))
-    if found is None:
-        tell(f"{path}: the process that segmented it was killed, twice; it is left out")
-    return None if found is None else found[0]
-
-
-def _unless_lost(future: Future) -> list[Segmented] | None:
+def _unless_lost(future: Future[Segmented]) -> Segmented | None:
     """What a worker found; None where it was killed, or its cluster is gone."""
     try:
         return future.result()

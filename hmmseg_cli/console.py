@@ -16,7 +16,6 @@ import os
 import shutil
 import sys
 import tempfile
-import time
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -57,8 +56,6 @@ QuietOption = Annotated[bool, typer.Option(
     "--quiet", help="Print nothing but errors; warnings are in the JSON.")]  # fmt: skip
 
 STANDARD_OUTPUT = "-"
-SCRATCH = "hmmseg-"  # how folders for temporary files begin
-YOUNG = 60.0  # numerics: s; a run that begins locks its folder long before
 INPUT_SUFFIXES = (*KINDS, ".toml")
 
 
@@ -268,8 +265,8 @@ def _digest(path: Path) -> str:
 
 
 TASK_KEYS = {"objects", "moves", "sequence"}  # without any of which there is no task
-MAPS, NO_HAND = {"columns", "topics"}, {"columns", "topics", "rate", "gravity"}  # keys of a rig that tells
-# how files are read, as `inspect --write` makes it, and those beside which it describes no hand
+MAPS = {"columns", "topics"}  # keys of a rig that describe how files are read, as `inspect --write` makes it
+NO_HAND = MAPS | {"rate", "gravity"}  # keys that describe no hand
 
 
 def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
@@ -422,43 +419,14 @@ def _put(temporaries: dict[Path, Path]) -> None:
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """A folder for this run alone. What a run that was killed left behind is taken away by the next one."""
+    """A folder of temporary files for this run."""
     try:
-        _sweep(Path(tempfile.gettempdir()))
-        folder = tempfile.TemporaryDirectory(prefix=SCRATCH, ignore_cleanup_errors=True)
+        folder = tempfile.TemporaryDirectory(prefix="hmmseg_", ignore_cleanup_errors=True)
     except OSError as error:
         raise InputError("the folder for temporary files", f"cannot be used ({error.strerror})",
                          "TMPDIR to name one that can be written to") from None  # fmt: skip
     with folder as name:
-        path = Path(name)
-        with (path / "lock").open("w") as lock:
-            _locked(lock)
-            yield path
-
-
-def _sweep(where: Path) -> None:
-    """Take away folders of ours whose run is over: their lock is free. Young ones may not have theirs yet."""
-    for folder in where.glob(f"{SCRATCH}*"):
-        with contextlib.suppress(OSError):
-            if folder.is_symlink() or time.time() - folder.stat().st_mtime < YOUNG:
-                continue
-            if not (lock := folder / "lock").exists():
-                folder.rmdir()  # where it is empty; what holds something without a lock is somebody else's
-                continue
-            with lock.open("r+") as file:
-                if _locked(file):
-                    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _locked(file: Any) -> bool:
-    """Whether the file is locked by us now; the lock is gone with its process. Without locks: never."""
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return True
-    except (ImportError, OSError):
-        return False
+        yield Path(name)
 
 
 class _Screen(Console):

@@ -222,8 +222,8 @@ def _against(
 ) -> None:
     """The generic diagnosis, against given simulated trials."""
     from simgap.generic.diagnose import diagnose as compare
-    from simgap.generic.diagnose import diagnose_blocks
     from simgap.generic.effects import effects
+    from simgap.generic.trials import align, align_block_trials
 
     every = distinct_trials([*paths, *against])
     with out.progress("diagnosing", total=4) as advance:
@@ -234,14 +234,16 @@ def _against(
             refuse("goes only with a plain ordered task", {"--model": model_file})
             hand = read_rig(needed(rig_file, paths))
             read = read_trials(out, every, hand)
-            real, sim = read[: len(paths)], read[len(paths) :]
-            found = diagnose_blocks(real, sim, task, hand, effect, out.seed, tell)
+            tell("aligning trials")
+            ensembles = align_block_trials(read[: len(paths)], read[len(paths) :], task, hand)
         else:
             from hmmseg.sequence.model import load_model
 
             read = read_trials(out, every, task=task)
             learned = None if model_file is None else load_model(model_file, task)
-            found = compare(read[: len(paths)], read[len(paths) :], task, learned, effect, out.seed, tell)
+            tell("aligning trials")
+            ensembles = align(read[: len(paths)], read[len(paths) :], task, learned)
+        found = compare(ensembles, effect, out.seed, tell)
     for warning in found.warnings:
         out.warn(warning)
     out.print(sentence(found.body), *tables(found.body))
@@ -257,9 +259,8 @@ def _draw(
     if out.figures is None and out.report is None:
         return
     from hmmseg.contact.decompose import subtasks
-    from hmmseg_cli.gap_figures import draw_generic, draw_signal
     from hmmseg_cli.pages import Setting, page
-    from simgap.report.figures import draw_all, draw_how_far
+    from simgap.report.figures import draw_all, draw_generic, draw_how_far, draw_signal
 
     body, names = found.body, list(dict.fromkeys(s.label for s in subtasks(task)))
     signal = draw_generic if pads is None else draw_signal

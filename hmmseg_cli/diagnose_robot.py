@@ -296,7 +296,7 @@ def _deliver(
         robot.write_rerun(out.stage(own.rerun), robot.courses(found, units))
     if out.figures is None and out.report is None:
         return
-    from hmmseg_cli.gap_figures import draw_robot, draw_robot_page
+    from simgap.report.figures import draw_robot, draw_robot_page
 
     if out.figures is not None:
         draw_robot(found, document, units, out.figure)

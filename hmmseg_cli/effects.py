@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
+from hmmseg.tables import listed
 from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed
+
+if TYPE_CHECKING:
+    from simgap.effects.base import HandEffect
 
 
 def effects(json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False) -> None:
@@ -15,48 +18,28 @@ def effects(json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = 
         from simgap.effects import catalogue
 
         rows = [description(effect) for effect in catalogue().values()]
-        out.print(table(rows))
+        heads = ("effect", "acts on", "says", "shows in", "parameters (prior sd)")
+        keys = ("name", "acts_on", "says", "signature")
+        cells = [[*(row[k] for k in keys), ", ".join(map(prior, row["parameters"]))] for row in rows]
+        out.print(listed("candidate effects", heads, cells, wraps=True))
         out.finish({"effects": rows})
 
 
-def description(effect) -> dict[str, Any]:
+def description(effect: HandEffect) -> dict[str, Any]:
     """An effect as JSON: priors are normal in the parameter, or in its logarithm."""
     parameters = [
-        {
-            "name": p.name,
-            "unit": p.unit,
-            "starts": list(p.starts) or [p.nominal],
-            "prior": {
-                "kind": "log-normal" if p.log else "normal",
-                "centre": p.nominal,
-                "sd": p.sd,
-                "low": p.low,
-                "high": p.high,
-            },
-        }
-        for p in effect.parameters.values()
-        if not p.hidden
-    ]
+        {"name": p.name, "unit": p.unit, "starts": list(p.starts) or [p.nominal],
+         "prior": {"kind": "log-normal" if p.log else "normal", "centre": p.nominal, "sd": p.sd,
+                   "low": p.low, "high": p.high}}
+        for p in effect.parameters.values() if not p.hidden
+    ]  # fmt: skip
     return {
-        "name": effect.name,
-        "acts_on": effect.acts_on,
-        "says": effect.says,
-        "signature": effect.shows,
-        "mistaken_for": list(effect.mistaken_for),
-        "chosen": effect.chosen,
-        "parameters": parameters,
-    }
+        "name": effect.name, "acts_on": effect.acts_on, "says": effect.says, "signature": effect.shows,
+        "mistaken_for": list(effect.mistaken_for), "chosen": effect.chosen, "parameters": parameters,
+    }  # fmt: skip
 
 
-def table(rows: list[dict[str, Any]]) -> Table:
-    """The effects for people to read."""
-    out = Table(title="candidate effects", title_justify="left", show_lines=False)
-    for head in ("effect", "acts on", "says", "shows in", "parameters (prior sd)"):
-        out.add_column(head, no_wrap=head == "effect")
-    for row in rows:
-        shown = ", ".join(
-            f"{p['name']} ({p['prior']['sd']:g} {p['unit'] if p['prior']['kind'] == 'normal' else 'in ln'})"
-            for p in row["parameters"]
-        )
-        out.add_row(row["name"], row["acts_on"], row["says"], row["signature"], shown)
-    return out
+def prior(parameter: Mapping[str, Any]) -> str:
+    """A parameter with its prior's standard deviation."""
+    kind, sd = parameter["prior"]["kind"], parameter["prior"]["sd"]
+    return f"{parameter['name']} ({sd:g} {parameter['unit'] if kind == 'normal' else 'in ln'})"

@@ -1,8 +1,7 @@
 """`hmmseg fit`: learn the emissions and durations of a plain ordered task from trials.
 
 `--labels`, what is known of some boundaries of some trials, is a folder with NAME.json for trials,
-{"boundaries": [times in s, null where unknown]}; one JSON file, {NAME: {subtask: its start in s}}; or a CSV
-file with the columns trial, subtask and start.
+{"boundaries": [times in s, null where unknown]}, or a CSV file with the columns trial, subtask and start [s].
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from hmmseg_cli.console import (
 
 LabelsOption = Annotated[Path | None, typer.Option(
     "--labels", metavar="FILE|DIR",
-    help="What is known of some boundaries: a folder with NAME.json, or a .csv or .json file.")]  # fmt: skip
+    help="What is known of some boundaries: a folder with NAME.json, or a .csv file.")]  # fmt: skip
 ModelOption = Annotated[Path, typer.Option("--model", metavar="M.npz", help="Where the model is written.")]
 
 
@@ -82,32 +81,35 @@ COLUMNS = ("trial", "subtask", "start")
 
 
 def read_labels_given(where: Path, names: list[str]) -> dict[str, Any]:
-    """Labels by the names of trials, as hmmseg.sequence.fit takes them; InputError for what is amiss."""
-    if where.is_dir():
-        return _folder(where, names)
-    if not where.is_file():
-        raise InputError(f"--labels {where}", "no such file or folder", "a folder, a .json or a .csv file")
-    if where.suffix.lower() not in (".csv", ".json"):
-        raise InputError(f"--labels {where}", f"ends in {where.suffix!r}", ".csv, .json or a folder")
-    found = _csv(where) if where.suffix.lower() == ".csv" else _json(where)
+    """Labels of trials.
+
+    Args:
+        where: A folder with NAME.json, or a CSV file.
+        names: Of the trials.
+
+    Returns:
+        By a trial's name its labels, as `hmmseg.sequence.fit` takes them; trials without any are left out.
+
+    Raises:
+        InputError: There are no labels, they cannot be read, or are of none of the trials.
+    """
     stems = {Path(name).stem: name for name in names}
-    out: dict[str, Any] = {}
-    for given, known in found.items():
-        name = stems.get(given) or stems.get(Path(given).stem)
-        if name is None:
+    if where.is_dir():
+        files = {name: where / f"{stem}.json" for stem, name in stems.items()}
+        out = {name: _boundaries(path) for name, path in files.items() if path.exists()}
+        if not out:
+            few = ", ".join(path.name for path in [*files.values()][:3])
+            raise InputError(f"--labels {where}", "has labels for none of the trials", f"files like {few}")
+        return out
+    if not where.is_file() or where.suffix.lower() != ".csv":
+        problem = f"ends in {where.suffix!r}" if where.is_file() else "no such file or folder"
+        raise InputError(f"--labels {where}", problem, "a folder or a .csv file")
+    found = _csv(where)
+    for given in found:
+        if Path(given).stem not in stems and given not in stems:
             raise InputError(str(where), f"labels {given!r}, which is none of the trials",
                              f"one of {', '.join(stems)}")  # fmt: skip
-        out[name] = known
-    return out
-
-
-def _folder(folder: Path, names: list[str]) -> dict[str, Any]:
-    paths = {name: folder / f"{Path(name).stem}.json" for name in names}
-    out = {name: _boundaries(path) for name, path in paths.items() if path.exists()}
-    if not out:
-        expected = ", ".join(path.name for path in list(paths.values())[:3])
-        raise InputError(f"--labels {folder}", "has labels for none of the trials", f"files like {expected}")
-    return out
+    return {stems.get(given) or stems[Path(given).stem]: known for given, known in found.items()}
 
 
 def _boundaries(path: Path) -> list[float | None]:
@@ -116,21 +118,6 @@ def _boundaries(path: Path) -> list[float | None]:
         return [None if each is None else float(each) for each in given]
     except (OSError, ValueError, TypeError, KeyError):
         raise InputError(str(path), "cannot be read", '{"boundaries": [times in s]}') from None
-
-
-def _json(path: Path) -> dict[str, Any]:
-    expected = '{"trial": {"subtask": start in s}}'
-    try:
-        given = jsonlib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise InputError(str(path), "cannot be read", expected) from None
-    if (
-        not isinstance(given, dict)
-        or not given
-        or not all(isinstance(v, dict | list) for v in given.values())
-    ):
-        raise InputError(str(path), "is no table of trials", expected)
-    return given
 
 
 def _csv(path: Path) -> dict[str, dict[str, float]]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.schema import parse_toml
+from hmmseg.tables import listed
 from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed, check_file
 
 FilesArgument = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of any kind.")]
@@ -54,46 +53,22 @@ def extended(rig_file: Path, found: list[Any]) -> str:
         raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
     text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""
     now = parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
-    for table, said in (("[columns]", now.columns), ("[topics]", now.topics)):
-        if said and table in proposed[0].split("\n"):
-            raise InputError(f"--write {rig_file}", f"already has {table}", "a rig without it")
-    gripper, rest = split_gripper(proposed[0])
-    if now.gripper is not None and gripper:
-        if not set(now.gripper.channels) <= LAID_OUT:
-            raise InputError(f"--write {rig_file}", "already has [gripper]", "a rig without it")
-        text, gripper = with_gripper(text, gripper), []
-    text = "\n".join([text.rstrip(), "", *gripper, rest]).lstrip()
+    laid_out = now.gripper is not None and set(now.gripper.channels) <= LAID_OUT
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    for name, table in tomlkit.parse(proposed[0]).items():
+        there = document.get(name)
+        if there and not (name == "gripper" and laid_out):
+            raise InputError(f"--write {rig_file}", f"already has [{name}]", "a rig without it")
+        if there is None:
+            document.add(tomlkit.nl())
+            document.add(name, table)
+        else:
+            there.update(table)
+    text = tomlkit.dumps(document).lstrip()
     parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
     return text
-
-
-def split_gripper(proposed: str) -> tuple[list[str], str]:
-    """Lines of a proposal's [gripper], and the rest of its text."""
-    lines = proposed.split("\n")
-    if lines[0] != "[gripper]":
-        return [], proposed
-    end = next((i for i, line in enumerate(lines[1:], 1) if line.startswith("[")), len(lines))
-    return [line for line in lines[:end] if line], "\n".join(lines[end:])
-
-
-def with_gripper(text: str, gripper: list[str]) -> str:
-    """A rig's text whose [gripper] has these lines in the place of its own of the same keys."""
-    lines = text.split("\n")
-    start = next(i for i, line in enumerate(lines) if line.strip().startswith("[gripper]"))
-    end = next(
-        (i for i, line in enumerate(lines[start + 1 :], start + 1) if line.startswith("[")), len(lines)
-    )
-    for line in gripper[1:]:
-        key = re.escape(line.split(" = ", 1)[0])
-        for pattern in (rf"\s*{key}\s*=", rf"\s*#\s*{key}\s*="):
-            at = next((i for i in range(start + 1, end) if re.match(pattern, lines[i])), None)
-            if at is not None:
-                lines[at] = line
-                break
-        else:
-            lines.insert(start + 1, line)
-            end += 1
-    return "\n".join(lines)
 
 
 def _show(out: Output, found: Any) -> None:
@@ -105,16 +80,12 @@ def _show(out: Output, found: Any) -> None:
     if found.gaps:
         longest = max(end - start for start, end in found.gaps)
         head += f"; {len(found.gaps)} gaps, the longest {longest:.3g} s"
-    table = Table(title=head, title_justify="left")
-    for name, justify in (("column", "left"), ("unit", "left"), ("rate [Hz]", "right"), ("missing", "right"),
-                          ("least", "right"), ("most", "right"), ("course", "left")):  # fmt: skip
-        table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
-    for channel in found.channels:
-        unit = "text" if channel.text else channel.unit or ""
-        rate = "" if channel.rate is None else f"{channel.rate:.4g}"
-        table.add_row(channel.name, unit, rate, str(channel.missing or ""), _number(channel.minimum),
-                      _number(channel.maximum), sparkline(channel.course))  # fmt: skip
-    out.print(table)
+    heads = ("column", "unit", "rate [Hz]", "missing", "least", "most", "course")
+    rows = [
+        (c.name, "text" if c.text else c.unit or "", _number(c.rate), str(c.missing or ""),
+         _number(c.minimum), _number(c.maximum), sparkline(c.course)) for c in found.channels
+    ]  # fmt: skip
+    out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
     for line in found.said:
         out.warn(line)
     if found.toml:

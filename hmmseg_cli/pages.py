@@ -78,7 +78,7 @@ def identification_page(
 
 def picture(draw: Callable[[Path], Any], caption: str) -> dict[str, str]:
     """A figure as base64 PNG with its caption."""
-    with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
+    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
         path = Path(folder) / "figure.png"
         draw(path)
         return {"data": embedded(path), "caption": caption}
@@ -165,7 +165,7 @@ SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a page shows besides the body: recordings, subtasks in order, the rig's pads, what was measured,
+    """What a page shows apart from the body: recordings, subtasks in order, the rig's pads, measured values,
     how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
     and where the motion to run next is.
     """
@@ -182,7 +182,7 @@ class Setting:
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
     """The page as text; `draw(path)` draws figures at path(name.png), which are embedded."""
-    with tempfile.TemporaryDirectory(prefix="hmmseg-") as folder:
+    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
         draw(lambda name: Path(folder) / name)
         images = {p.stem: embedded(p) for p in sorted(Path(folder).iterdir())}
     effect = body["effects"].get("+".join(body["causes"]))
@@ -281,16 +281,16 @@ def _values(
     if own is not None and own.si == p["unit"] and (own.offset == 0 or last == "bias"):
         both.insert(0, (1 / own.factor, own.unit))
 
-    def told(write: Callable[[tuple[float, str]], str]) -> str:
+    def in_both(write: Callable[[tuple[float, str]], str]) -> str:
         first, *rest = map(write, both)
         return first + "".join(f" ({text})" for text in rest)
 
-    model = "" if p.get("nominal") is None else told(lambda u: estimate(p["nominal"], 0.0, u))
+    model = "" if p.get("nominal") is None else in_both(lambda u: estimate(p["nominal"], 0.0, u))
     if p["mean"] is None:
         return model, "not determined by these logs", ""
     low, high = p["interval_90"] or (None, None)
-    ends = "" if low is None or high is None else told(lambda u: interval(low, high, u))
-    return model, told(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
+    ends = "" if low is None or high is None else in_both(lambda u: interval(low, high, u))
+    return model, in_both(lambda u: estimate(p["mean"], p["sd"] or 0.0, u)), ends
 
 
 def _numerics(body: Body) -> str:

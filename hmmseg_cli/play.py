@@ -44,7 +44,7 @@ def play(
             raise InputError(
                 "hmmseg play", "needs the package websockets", "pip install 'hmmseg[play]'"
             ) from None
-        from simgap.play.felt import effect_values
+        from simgap.play.world import effect_values
 
         effects = {} if properties is None else diagnosed(properties)
         chosen = blocks if effects is not None and effects != {} else properties
@@ -53,7 +53,7 @@ def play(
         session.check_folder(output)
         out.print("preparing the blocks ...")
         if effects:
-            session.beside(session.world_with(effects))
+            session.compare_with(session.world_with(effects))
         server = PlayServer(session, output)
         with contextlib.suppress(KeyboardInterrupt):
             asyncio.run(_serve(out, server, port, open_page))
@@ -79,7 +79,7 @@ def diagnosed(path: Path) -> dict[str, dict[str, float]]:
 
     InputError where it names no cause, or only causes that cannot be felt.
     """
-    from simgap.play.felt import effect_values, felt_effects
+    from simgap.play.world import effect_values, felt_effects
 
     if path.suffix.lower() != ".json":
         return {}

@@ -57,9 +57,8 @@ class Rows:
                     continue
                 raise InputError(f"{WHERE}: column {theirs}", "missing", nearest(theirs, names))
             entry = columns.get(ours, Column())
-            unit = 1.0 if entry.unit is None else si_factor(entry.unit)
             self._picked.append(names.index(theirs))
-            self._scales.append((entry.sign * unit, entry.offset))
+            self._scales.append((entry.sign * entry.size, entry.offset))
             if entry.unit is None:
                 self._unstated.append(len(self._picked) - 1)
         self._plain = self._is_plain()

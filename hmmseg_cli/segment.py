@@ -97,8 +97,8 @@ def segment(
         question = ask(out, found)
         if write is not None:
             write_labels(out, write, paths, recordings, found)
-        asked = {} if question is None else {"question": asdict(question)}
-        out.finish({"method": method.value, "trials": [s.to_json() for s in found]} | asked)
+        open_ones = {} if question is None else {"question": asdict(question)}
+        out.finish({"method": method.value, "trials": [s.to_json() for s in found]} | open_ones)
 
 
 def _segment_blocks(

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from hmmseg.errors import InputError
+from hmmseg.tables import listed
 from hmmseg_cli.console import (
     FiguresOption,
     JsonOption,
@@ -62,7 +62,7 @@ def simulate(
             require_encoder(f".{animation_format.value}")
         description, hand = read_task(task), read_rig(rig)
         if hand.effects:
-            from simgap.patch.write import checked
+            from simgap.patch import checked
 
             checked(hand.effects, str(rig))
         if not isinstance(description, BlockTask):
@@ -161,7 +161,9 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     summary = {}
     if rig.noise.force is not None:
         summary = residual_summary(result, boundaries, [s.state for s in subtasks(task)])
-        out.print(_residual_table(summary))
+        rows = [(state, f"{value:.2f}") for state, value in summary.items()]
+        heads = ("state", "rms over sensor noise")
+        out.print(listed("Net force, measured minus predicted", heads, rows, right=heads[1:]))
     if out.figures is not None:
         _draw_replay(result, segmentation, out.figure(f"{path.stem}_replay.png"))
     signals, model = result.signals, result.predicted
@@ -173,15 +175,6 @@ def _replay(out: Output, path: Path, task, rig, blocks, seed: int, films: list):
     document = {"replay": {"file": str(path), "boundaries": boundaries, "complete": segmentation.complete,
                            "net_force_residual_over_noise": summary}}  # fmt: skip
     return trial_files(1, predicted, boundaries, seed), document
-
-
-def _residual_table(summary: dict[str, float]) -> Table:
-    table = Table(title="Net force, measured minus predicted", title_justify="left")
-    table.add_column("state")
-    table.add_column("rms over sensor noise", justify="right")
-    for state, value in summary.items():
-        table.add_row(state, f"{value:.2f}")
-    return table
 
 
 def _spare_inputs(folder: Path, names, inputs) -> None:

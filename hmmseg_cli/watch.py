@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import gc
+import math
 import sys
-from typing import TYPE_CHECKING, Annotated, Any
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.columns import Columns
+from rich.console import Console, Group
+from rich.live import Live as RichLive
+from rich.table import Table
+from rich.text import Text
 
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, TaskOption, UnusedSeed
+from hmmseg_cli.inspect import sparkline
 
 if TYPE_CHECKING:
+    from hmmseg.online.answer import Answer
     from hmmseg.online.watcher import Watcher
     from hmmseg_cli.rows import Rows
 
@@ -44,11 +55,7 @@ def watch(
         watcher = Watcher(task, rig, lag)
         rows = Rows(sys.stdin.buffer, watcher)
         _warm_up(watcher)
-        show = None
-        if plot:
-            from hmmseg_cli.live import Live
-
-            show = Live(watcher, lines=not sys.stdout.isatty())
+        show = Live(watcher, lines=not sys.stdout.isatty()) if plot else None
         write = out.write if show is None or show.lines else None
         try:
             _follow(watcher, rows, write, show, skip_bad_rows, out)
@@ -71,7 +78,14 @@ def watch(
             out.finish(jsonlib.loads(line))
 
 
-def _follow(watcher: Watcher, rows: Rows, write: Any, show: Any, skip: bool, out: Output) -> None:
+def _follow(
+    watcher: Watcher,
+    rows: Rows,
+    write: Callable[[str], None] | None,
+    show: Live | None,
+    skip: bool,
+    out: Output,
+) -> None:
     gc.collect()
     gc.freeze()
     gc.disable()  # nothing here makes cycles, and a collection would hold up a row
@@ -115,3 +129,76 @@ def _warm_up(watcher: Watcher) -> None:
         scratch.take(0.02 * i, np.full(size, 1e-4 * (i % 3)))
         scratch.answer().line()
     scratch.finish().line()
+
+
+REFRESH = 0.1  # look: s; a terminal shows no more
+WIDTH = 60  # numerics: points of a signal
+SECONDS = 10.0  # look: that it spans
+
+
+class Live:
+    """The display; `lines`: whether lines of JSON go to standard output as well."""
+
+    def __init__(self, watcher: Watcher, lines: bool) -> None:
+        self.lines = lines
+        self._watcher, self._shown = watcher, 0.0
+        self._kept: deque[tuple[float, float, float]] = deque(maxlen=WIDTH)
+        self._notes: deque[str] = deque(maxlen=3)
+        self._console = Console(stderr=True)
+        self._live = RichLive(console=self._console, auto_refresh=False, redirect_stdout=False)
+        self._live.start()
+        self._last: Answer | None = None
+
+    def update(self, answer: Answer) -> None:
+        """Take one answer; redraw if it is time to."""
+        if answer.note is not None:
+            self._notes.append(f"{answer.t:.2f} s  {answer.note}")
+        if not self._kept or answer.t >= self._kept[-1][0] + SECONDS / WIDTH:
+            self._kept.append((answer.t, *self._watcher.forces))
+        self._last = answer
+        now = time.monotonic()
+        if now - self._shown >= REFRESH:
+            self._shown = now
+            self._draw(answer)
+
+    def close(self) -> None:
+        """Leave the last picture on the screen."""
+        if self._last is not None:
+            self._draw(self._last)
+        self._live.stop()
+
+    def _draw(self, answer: Answer) -> None:
+        self._live.update(picture(self._watcher, answer, list(self._kept), list(self._notes)), refresh=True)
+
+
+def picture(
+    watcher: Watcher, answer: Answer, kept: Sequence[tuple[float, float, float]], notes: Sequence[str]
+) -> Group:
+    """What is known, drawn: bars of the subtasks, the grip and the net vertical force, properties, notes."""
+    step, then = answer.subtask, answer.next
+    failed = answer.failed
+    fits = Text("fits its task", "green")
+    if failed is not None:
+        fits = Text(f"does not fit its task at {failed['subtask']}: {failed['reason']}", "bold red")
+    after = "end" if then is None else then.label
+    head = Text.assemble((f"{answer.t:9.2f} s  ", "bold"), (step.label, "bold cyan"),
+                         f"  next: {after}  ", fits)  # fmt: skip
+    bars = Table.grid(padding=(0, 1))
+    for k, (s, p) in enumerate(zip(watcher.filter.steps, answer.probabilities.tolist(), strict=True)):
+        start = next((f"{c.t:.3f} ± {c.sd:.3f} s" for c in reversed(watcher.crossings) if c.step is s), "")
+        style = "cyan" if k == answer.index else "dim"
+        bars.add_row(Text(f"{s.name} {s.object}", style), Text("█" * round(20 * p), style),
+                     f"{p:.2f}" if p > 0.005 else "", Text(start, "dim"))  # fmt: skip
+    known = Table("", "mean", "sd", "unit", box=None, header_style="dim")
+    for name, prop, mean, sd in answer.properties:
+        scale, unit = (1.0, "N") if prop == "weight" else (100.0, "cm")
+        known.add_row(f"{name} {prop}", f"{mean * scale:.3f}", f"{sd * scale:.3f}", unit)
+    grip, lifting = spark([g for _, g, _ in kept]), spark([y for *_, y in kept])
+    signals = Group(Text("grip    " + grip), Text("lifting " + lifting))
+    return Group(head, Columns([bars, known]), signals, *[Text(note, "yellow") for note in notes])
+
+
+def spark(values: Sequence[float]) -> str:
+    """Forces [N] as a row of bars from 0 or less, a blank where nothing is, the greatest named."""
+    there = [v for v in values if math.isfinite(v)]
+    return f"{sparkline((0.0, *values))[1:]} {max(there):.2f} N at most" if there else ""

@@ -1,4 +1,4 @@
-"""What was worked out last, by what it was worked out from."""
+"""A small cache of the most recently used results."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ MOST = 8  # numerics: that are kept
 
 
 def latest(store: dict[Hashable, Any], key: Hashable, make: Callable[[], T], most: int = MOST) -> T:
-    """What `store` has by this key, or made now and kept there in the place of what was asked for longest
-    ago, where that makes more than so many."""
+    """The result under a key, made where it is missing; beyond `most` the least recently used is dropped."""
     found = store.pop(key) if key in store else make()
     store[key] = found
     while len(store) > most:

@@ -45,26 +45,105 @@ def recursion(keep: np.ndarray, drive: np.ndarray, start: np.ndarray) -> np.ndar
 
 
 @compiled
-def innovations(
-    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, walk: np.ndarray, new: np.ndarray, anywhere: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """What a Kalman filter did not expect of values (T, N), and its variance over that of their noise `sd`.
+def _update(
+    mean: np.ndarray, cov: np.ndarray, lever: np.ndarray, value: float, weight: float, noise: float
+) -> tuple[float, float]:
+    """Take one value, lever' state and noise of variance `noise` over `weight`, into `mean` (S,) and `cov`
+    (S, S) in place; the innovation, and its variance over the noise's, weighted."""
+    size = mean.size
+    spread, inside, miss = np.zeros(size), 0.0, value
+    for i in range(size):
+        for j in range(size):
+            spread[i] += cov[i, j] * lever[j]
+        inside += lever[i] * spread[i]
+        miss -= lever[i] * mean[i]
+    larger = 1 + weight * inside / noise
+    for i in range(size):
+        gain = weight / (noise * larger) * spread[i]
+        mean[i] += gain * miss
+        for j in range(size):
+            cov[i, j] -= gain * spread[j]
+    return miss, larger
 
-    Its state walks with variances `walk`; where it is `new` it has the variance `anywhere`, and the first
-    value that has weight sets it and tells nothing. Values of less `weight` (0 to 1) tell less.
+
+@compiled
+def tracked(
+    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, levers: np.ndarray, walk: np.ndarray,
+    new: np.ndarray, anywhere: float, slide: float, may: np.ndarray, pinned: np.ndarray, place: np.ndarray,
+    drift: np.ndarray, wander: np.ndarray, jump: np.ndarray, shares: np.ndarray, chance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
+    """What a Kalman filter did not expect of four values (T, N, 4), where joints or pads move unseen.
+
+    Values are `levers` (T, N, 4, J) times where the J joints are in their dead bands, and noise `sd`; values
+    of less `weight` (0 to 1) tell less. The first, second and last also have a constant each, which is
+    another one, with variance `anywhere`, where it is `new` (T, N, 3): the first value of weight sets it and
+    tells nothing. The first's constant walks with variances `walk` (T, N). A joint is at its `place` (T, N,
+    J) where it is `pinned`; elsewhere it goes on by `drift`, with variance `wander`. Unless all are pinned
+    and pads hold, which they do not with the chance `may` (T, N), there also are moves of variances `shares`
+    (R, 3), in units of `jump` (T, J) of joints that are not pinned and of `slide` of the second's and the
+    last's constants, with prior probabilities `chance` (R,). The likeliest is taken, sample by sample (a
+    multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
+
+    Returns:
+        innovations (T, N, 4), their variances over the noise's, and what the choices cost [nats].
     """
-    out, factor = np.empty_like(values), np.empty_like(values)
+    joints, size = pinned.shape[2], pinned.shape[2] + 3
+    out, factor, cost = np.zeros_like(values), np.ones_like(values), 0.0
+    constant, moved = np.array([joints, joints + 1, -1, joints + 2]), np.array([joints + 1, joints + 2])
+    lever = np.zeros(size)
     for t in range(values.shape[0]):
-        place, variance, fresh = values[t, 0], anywhere, 1.0
+        mean, cov, fresh = np.zeros(size), np.zeros((size, size)), np.ones(size)
         for k in range(values.shape[1]):
-            variance += walk[t, k]
-            if new[t, k]:
-                variance, fresh = anywhere, 1.0
-            w, noise = weight[t, k], sd[t, k] ** 2
-            larger = 1 + w * variance / noise
-            miss = values[t, k] - place
-            place += w * variance / (noise * larger) * miss
-            variance /= larger
-            out[t, k], factor[t, k] = (1 - fresh) * w * miss, 1 + (1 - fresh) * (larger - 1)
-            fresh *= 1 - w
-    return out, factor
+            cov[joints, joints] += walk[t, k]
+            for c in range(3):
+                i = joints + c
+                if k == 0 or new[t, k, c]:
+                    cov[i, :] = 0.0
+                    cov[:, i] = 0.0
+                    cov[i, i], fresh[i] = anywhere, 1.0
+            odds = may[t, k]
+            for j in range(joints):
+                if k == 0 or pinned[t, k, j]:
+                    cov[j, :] = 0.0
+                    cov[:, j] = 0.0
+                    mean[j] = place[t, k, j]
+                    cov[j, j] = 0.0 if pinned[t, k, j] else jump[t, j]
+                else:
+                    mean[j] += drift[t, k, j]
+                    cov[j, j] += wander[t, k, j]
+                odds = odds if pinned[t, k, j] else 1.0
+            choices = chance.size if odds > 0 and weight[t, k].sum() > 0 else 1
+            best, chosen_mean, chosen_cov, paid = -np.inf, mean, cov, 0.0
+            for r in range(choices):
+                m, p = mean.copy(), cov.copy()
+                for j in range(joints):
+                    if not pinned[t, k, j]:
+                        p[j, j] += shares[r, 0] * jump[t, j]
+                for c in range(2 if may[t, k] > 0 else 0):
+                    p[moved[c], moved[c]] += shares[r, 1 + c] * slide
+                score = np.log(odds * chance[r] + (1 - odds) * (r == 0)) if choices > 1 else 0.0
+                prior = score
+                misses, factors = np.zeros(4), np.ones(4)
+                for c in range(4):
+                    w, noise = weight[t, k, c], sd[t, k, c] ** 2
+                    if w <= 0:
+                        continue
+                    lever[:] = 0.0
+                    lever[:joints] = levers[t, k, c]
+                    known = 1.0
+                    if constant[c] >= 0:
+                        lever[constant[c]] = 1.0
+                        known = 1 - fresh[constant[c]]
+                    miss, larger = _update(m, p, lever, values[t, k, c], w, noise)
+                    factors[c] = larger**known
+                    misses[c] = np.sqrt(known * factors[c] / larger) * w * miss
+                    score -= 0.5 * (np.log(factors[c]) + misses[c] ** 2 / (noise * factors[c]))
+                if score > best:
+                    best, chosen_mean, chosen_cov, paid = score, m, p, -prior
+                    out[t, k], factor[t, k] = misses, factors
+            cost += paid
+            mean, cov = chosen_mean, chosen_cov
+            for c in range(4):
+                if constant[c] >= 0:
+                    fresh[constant[c]] *= 1 - weight[t, k, c]
+    return out, factor, cost

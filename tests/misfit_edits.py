@@ -5,11 +5,20 @@ and gives the edited trial with the index of the first subtask that it does not 
 joined with continuous time; positions jump where pieces meet, as they would under a cut.
 """
 
+import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from hmmseg.hand.read import read_trial
+from hmmseg.io.rig import read_rig
 from hmmseg.io.trial import Trial
+
+STACK = Path(__file__).parent / "data/stack"
+RIG = read_rig(STACK / "rig.toml")
+TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
+TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
 
 Edit = Callable[[Trial, Sequence[float]], tuple[Trial, int]]
 FORCES = ("fx1", "fy1", "fx2", "fy2")
@@ -34,96 +43,38 @@ def let_go(trial: Trial, boundaries: Sequence[float], start: float, end: float) 
     return Trial(trial.file, trial.t, channels)
 
 
-def drop_first(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 falls in mid-carry, and nothing is held from there on."""
-    return let_go(trial, b, (b[1] + b[2]) / 2, np.inf), 3
-
-
-def drop_first_go_on(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 falls in mid-carry; block 2 is moved all the same."""
-    return let_go(trial, b, (b[1] + b[2]) / 2, b[3] + 0.3), 3
-
-
-def drop_second(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 2 falls early in its carry."""
-    return let_go(trial, b, b[5] + 0.3 * (b[6] - b[5]), np.inf), 7
-
-
-def drop_and_retry(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 falls in mid-carry, is gripped again and moved."""
-    dropped = let_go(trial, b, b[2] - 0.5, b[2])
-    return _concatenate(dropped, (trial.t[0], b[2]), trial, (b[0] - 0.5, np.inf)), 3
-
-
-def regrasp(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 is moved twice before block 2."""
-    return join(trial, (-np.inf, b[3] + 0.5), (b[0] - 0.5, b[3] + 0.5), (b[3] + 0.5, np.inf)), 5
-
-
-def regrasp_on_ground(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 is let go and gripped again before it is lifted."""
-    return join(trial, (-np.inf, b[0] + 0.3), (b[3], b[3] + 0.4), (b[0] - 0.4, np.inf)), 2
-
-
-def regrasp_placed(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 is gripped again where it was put, and let go again."""
-    back = join(trial, (-np.inf, b[3] + 0.4), (b[0] - 0.4, b[0] + 0.3), (b[3], np.inf))
-    return back, 5
-
-
-def no_second_move(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """The recording is cut in the free motion between the moves."""
-    return join(trial, (-np.inf, (b[3] + b[4]) / 2)), 5
-
-
-def idle_second_half(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """The fingers move but never close on block 2."""
-    return let_go(trial, b, b[3] + 0.2, np.inf), 5
-
-
-def only_free_motion(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """No contact at all."""
-    return let_go(trial, b, -np.inf, np.inf), 1
-
-
-def extra_move(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 1 is moved once more at the end."""
-    return join(trial, (-np.inf, np.inf), (b[0] - 1.0, b[3] + 0.5)), 8
-
-
-def starts_in_carry(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """The recording begins with block 1 in the air."""
-    return join(trial, (b[1] + 0.4, np.inf)), 0
-
-
-def starts_in_grip(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """The recording begins with block 1 gripped on the ground."""
-    return join(trial, (b[0] + 0.15, np.inf)), 0
-
-
-def stops_in_carry(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """The recording stops with block 2 in the air."""
-    return join(trial, (-np.inf, (b[5] + b[6]) / 2)), 7
-
-
-def stops_in_first_pickup(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """The recording stops before block 1 is lifted."""
-    return join(trial, (-np.inf, b[0] + 0.3)), 2
-
-
-def swapped(trial: Trial, b: Sequence[float]) -> tuple[Trial, int]:
-    """Block 2 is moved before block 1."""
-    middle = (b[3] + b[4]) / 2
-    return join(trial, (middle, np.inf), (-np.inf, middle)), 1
-
-
+END = np.inf
 EDITS: dict[str, Edit] = {
-    edit.__name__: edit
-    for edit in (
-        drop_first, drop_first_go_on, drop_second, drop_and_retry, regrasp, regrasp_on_ground,
-        regrasp_placed, no_second_move, idle_second_half, only_free_motion, extra_move, starts_in_carry,
-        starts_in_grip, stops_in_carry, stops_in_first_pickup, swapped,
-    )
+    # Block 1 falls in mid-carry, and nothing is held from there on, or block 2 is moved all the same.
+    "drop_first": lambda t, b: (let_go(t, b, (b[1] + b[2]) / 2, END), 3),
+    "drop_first_go_on": lambda t, b: (let_go(t, b, (b[1] + b[2]) / 2, b[3] + 0.3), 3),
+    # Block 2 falls early in its carry.
+    "drop_second": lambda t, b: (let_go(t, b, b[5] + 0.3 * (b[6] - b[5]), END), 7),
+    # Block 1 falls in mid-carry, is gripped again and moved.
+    "drop_and_retry": lambda t, b: (
+        _concatenate(let_go(t, b, b[2] - 0.5, b[2]), (t.t[0], b[2]), t, (b[0] - 0.5, END)), 3),
+    # Block 1 is moved twice before block 2; let go and gripped again before it is lifted; or gripped again
+    # where it was put, and let go again.
+    "regrasp": lambda t, b: (
+        join(t, (-END, b[3] + 0.5), (b[0] - 0.5, b[3] + 0.5), (b[3] + 0.5, END)), 5),
+    "regrasp_on_ground": lambda t, b: (
+        join(t, (-END, b[0] + 0.3), (b[3], b[3] + 0.4), (b[0] - 0.4, END)), 2),
+    "regrasp_placed": lambda t, b: (
+        join(t, (-END, b[3] + 0.4), (b[0] - 0.4, b[0] + 0.3), (b[3], END)), 5),
+    # The recording is cut in free motion between the moves; the fingers never close on block 2, or at all.
+    "no_second_move": lambda t, b: (join(t, (-END, (b[3] + b[4]) / 2)), 5),
+    "idle_second_half": lambda t, b: (let_go(t, b, b[3] + 0.2, END), 5),
+    "only_free_motion": lambda t, b: (let_go(t, b, -END, END), 1),
+    # Block 1 is moved once more at the end.
+    "extra_move": lambda t, b: (join(t, (-END, END), (b[0] - 1.0, b[3] + 0.5)), 8),
+    # The recording begins with block 1 in the air, or gripped on the ground.
+    "starts_in_carry": lambda t, b: (join(t, (b[1] + 0.4, END)), 0),
+    "starts_in_grip": lambda t, b: (join(t, (b[0] + 0.15, END)), 0),
+    # The recording stops with block 2 in the air, or before block 1 is lifted.
+    "stops_in_carry": lambda t, b: (join(t, (-END, (b[5] + b[6]) / 2)), 7),
+    "stops_in_first_pickup": lambda t, b: (join(t, (-END, b[0] + 0.3)), 2),
+    # Block 2 is moved before block 1.
+    "swapped": lambda t, b: (join(t, ((b[3] + b[4]) / 2, END), (-END, (b[3] + b[4]) / 2)), 1),
 }  # fmt: skip
 
 

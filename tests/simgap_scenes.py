@@ -20,12 +20,6 @@ HAND = Rig(
     noise=Noise(angle=2e-4, velocity=0.03, force=0.012),
 )
 STACK = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
-FAR = Tips(
-    (jnp.asarray(-1.0), jnp.asarray(1.0)),
-    (jnp.asarray(1.0),) * 2,
-    (jnp.asarray(0.0),) * 2,
-    (jnp.asarray(0.0),) * 2,
-)
 
 
 def scene(blocks: list[Block] | None = None, **around: float) -> Physics:
@@ -45,6 +39,9 @@ def tips(x1: float, y1: float, x2: float, y2: float) -> Tips:
     return Tips(
         (jnp.asarray(x1), jnp.asarray(x2)), (jnp.asarray(y1), jnp.asarray(y2)), (zero, zero), (zero, zero)
     )
+
+
+FAR = tips(-1.0, 1.0, 1.0, 1.0)
 
 
 def evolve(constants: Physics, state: State, fingers: Tips, h: float, steps: int) -> State:

@@ -18,12 +18,7 @@ from hmmseg import example_folder
 from hmmseg_cli.main import main
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTED = (
-    "hmmseg.api",
-    "hmmseg.example",
-    "estimation.api",
-    "simgap.api",
-)
+DOCUMENTED = ("hmmseg.api", "hmmseg.example", "estimation.api", "simgap.api")
 SLOW = {"reading_a_diagnosis.md", "your_simulator.md"}
 BLOCK = re.compile(r"(<!-- not run[^>]*-->\s*)?^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 

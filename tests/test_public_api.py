@@ -47,6 +47,12 @@ def test_importing_loads_nothing_heavy_and_leaves_jax_alone():
     assert run(code).strip() == "True"
 
 
+@pytest.fixture(scope="module")
+def found():
+    aligned = align([STACK / "trial_01.csv", STACK / "trial_02.csv"], STACK / "task.toml", STACK / "rig.toml")
+    return estimation.identify(aligned)
+
+
 SINGLE = """
 import os
 os.environ.pop("JAX_ENABLE_X64", None)
@@ -55,7 +61,7 @@ from estimation import identify
 from hmmseg import Task, align
 from simgap import VirtualModel, simulate
 assert not jax.config.jax_enable_x64
-aligned = align({trial!r}, {task!r}, {rig!r})
+aligned = align({trials!r}, {task!r}, {rig!r})
 found = identify(aligned)
 made = simulate({task!r}, {rig!r}, found, seed=3)[0]
 model = VirtualModel(aligned.rig, aligned.task, made.blocks, {{"block1": 0.13, "block2": 0.13}})
@@ -66,11 +72,10 @@ print(aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean()
 """
 
 
-def test_a_process_whose_jax_is_single_precision_gets_the_same_answers():
-    trial, task, rig = (str(STACK / name) for name in ("trial_01.csv", "task.toml", "rig.toml"))
-    single = [float(word) for word in run(SINGLE.format(trial=trial, task=task, rig=rig)).split()]
-    aligned = align(trial, task, rig)
-    found = estimation.identify(aligned)
+def test_a_process_whose_jax_is_single_precision_gets_the_same_answers(found):
+    task, rig, *trials = (str(STACK / n) for n in ("task.toml", "rig.toml", "trial_01.csv", "trial_02.csv"))
+    single = [float(word) for word in run(SINGLE.format(trials=trials, task=task, rig=rig)).split()]
+    aligned = found.aligned
     made = simgap.simulate(task, rig, found, seed=3)[0]
     model = simgap.VirtualModel(aligned.rig, aligned.task, made.blocks, {"block1": 0.13, "block2": 0.13})
     force = model.step([[0.10, 0.02], [0.15, 0.02]], [[0.0, 0.0], [0.0, 0.0]], 0.001)
@@ -104,12 +109,6 @@ def test_mistakes_say_what_to_write():
         align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
     with pytest.raises(InputError, match="needs no fit"):
         hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
-
-
-@pytest.fixture(scope="module")
-def found():
-    aligned = align([STACK / "trial_01.csv", STACK / "trial_02.csv"], STACK / "task.toml", STACK / "rig.toml")
-    return estimation.identify(aligned)
 
 
 CELLS = (

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.golden import rounded
 from experiments.saving import save
-from hmmseg_cli.gap_figures import draw_before_after, draw_course
+from simgap.report.figures import draw_before_after, draw_course
 from simgap.report.robot import courses
 from simgap.robots.describe import body
 from simgap.robots.diagnose import RobotDiagnosis, diagnose

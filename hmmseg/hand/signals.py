@@ -7,11 +7,6 @@ Velocities that a drive makes of its own positions, and so come late.
 
 A drive without a tachometer gives v[k] = (x[k] - x[k-m]) / (t[k] - t[k-m]): the velocity of m / 2 samples
 ago, with the positions' own noise. At 20 Hz that is 25 ms, more than a contact change may be wrong by.
-
-Where a hand was while some of its coordinates are missing: interpolated, coordinate by coordinate.
-
-A height takes four link angles. Where two readings in five are missing, all four are there in one sample of
-eight, though each of them is known well enough from its neighbours.
 """
 
 from __future__ import annotations
@@ -253,7 +248,8 @@ def _residual(velocity: np.ndarray, difference: np.ndarray) -> float:
 def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
     """The signals with heights wherever coordinates can be interpolated over time.
 
-    Only for what a fraction of a hand's way decides: an interpolated height has an error of its own.
+    A height takes four link angles. Where two readings in five are missing, all four are there in one sample
+    of eight. Only for what a fraction of a hand's way decides: an interpolated height has its own error.
     """
     names = ("q11", "q12", "q21", "q22") if rig.jointed else ("y1", "y2")
     known = {name: np.isfinite(trial.channels[name]) for name in names}

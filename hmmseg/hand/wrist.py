@@ -41,8 +41,8 @@ TAIL, NODES, GRID = (
     400,
     1e-4,
 )  # numerics: degrees of freedom of the prior; its grid, and least extent [m]
-LEAST_CLOSING = 1e-3  # chosen: m; a smaller swing of the opening is no grip
-CLEAR = 6.0  # chosen: noise sds of a third difference: a kink
+REST = 0.1  # chosen: share of an opening's way, or of its top speed, that is next to none: the gripper stands
+LEAST_CLOSING = 1e-3  # limit: m; a smaller swing of the opening is no grip
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def closings(opening: np.ndarray) -> list[tuple[int, int, int]]:
     A swing counts where it is a tenth of the whole way and beyond the noise.
     """
     noise = white_sd(opening)
-    swing = max(0.1 * float(np.ptp(opening)), 10 * noise, LEAST_CLOSING)
+    swing = max(REST * float(np.ptp(opening)), 2 * SURE * noise, LEAST_CLOSING)
     turning, last = [0], 0
     rising: bool | None = None
     for i, value in enumerate(opening):
@@ -98,7 +98,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tup
     floor = float(opening[least])
     ceiling = min(float(opening[begun]), float(opening[opened])) if opened > least else float(opening[begun])
     inside = np.arange(begun, opened + 1)
-    low = inside[opening[inside] <= floor + 0.1 * (ceiling - floor)]
+    low = inside[opening[inside] <= floor + REST * (ceiling - floor)]
     held, first, last = float(np.median(opening[low])), int(low[0]), int(low[-1])
     if give is not None:
         width, sd = held + give, 0.0
@@ -126,7 +126,7 @@ def _kink(way: np.ndarray, noise: float) -> tuple[float, float] | None:
         return None
     third = way[3:] - 3 * way[2:-1] + 3 * way[1:-2] - way[:-3]
     at = int(np.argmax(third))
-    if third[at] < CLEAR * np.sqrt(20) * noise:
+    if third[at] < SURE * np.sqrt(20) * noise:
         return None
     return float(way[at + 2]), max(float(way[at + 3] - way[at + 1]) / 4, noise)
 
@@ -313,7 +313,6 @@ def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
     return InputError(where, problem, f"position = {{{text}}} under [gripper]")
 
 
-ACTIVE = 8.0  # chosen: noise scales above which the wrist feels something
 TOGETHER = 5  # chosen: samples within one smoothing window
 LEAST = 3  # numerics: samples; of fewer there is no scatter
 
@@ -340,7 +339,7 @@ def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: n
     free = _surely_free(opening, held)
     tool = free_tool(trial, rig, pose, free)
     force = applied_force(trial, rig, pose, tool)
-    active = np.linalg.norm(np.nan_to_num(force), axis=1) > ACTIVE * tool.noise
+    active = np.linalg.norm(np.nan_to_num(force), axis=1) > SURE * tool.noise
     each = [grip_of(trial.t, opening, active, c, give_of(rig, pressing, opening, c)) for c in held]
     grips = [grip for grip in each if grip is not None]
     loads = [_load(grip, pose, force, tool) for grip in grips]
@@ -406,7 +405,7 @@ def give_of(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, 
     else:
         begun, least, opened = closing
         inside = slice(begun, opened + 1)
-        low = opening[inside] <= opening[least] + 0.1 * (opening[begun] - opening[least])
+        low = opening[inside] <= opening[least] + REST * (opening[begun] - opening[least])
         force = float(np.nanmedian(pressing[inside][low]))
     return 2 * force / rig.fingertip.normal_stiffness if np.isfinite(force) else None
 
@@ -442,13 +441,13 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
     return found if lifted else abs(found)
 
 
-# chosen: s; pads touch and let go off the opening's width by this: they are no ideal springs
+# prior: s; sd by which pads touch and let go off the opening's width by this: they are no ideal springs
 LAG = 0.012
-TILT = 0.01  # chosen: rad; an arm whose orientation is not recorded holds its hand level by about as much
+TILT = 0.01  # prior: rad; an arm whose orientation is not recorded holds its hand level by about as much
 SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a touch is known to a fifth of it
 CLIPPED = 2.0  # chosen: noise scales
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
-NOMINAL = 1.0  # chosen: N; assumed for a grip of rigid pads whose force was not measured: any will do
+NOMINAL = 1.0  # numerics: N; assumed for a grip of rigid pads whose force was not measured: any will do
 HIDDEN_GRIP = (
     "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
     "[gripper] would tell"
@@ -619,7 +618,7 @@ def _around(t: np.ndarray, pose: Pose) -> int:
 def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:
     """Where the wrist feels something for a while though the opening says that nothing is held."""
     t, out = trial.t, []
-    active = free & (np.nan_to_num(felt) > max(2 * ACTIVE * tool.noise, STRAY))
+    active = free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
     for start, stop in edges.reshape(-1, 2):
         if t[stop - 1] - t[start] > STRAY_TIME:

@@ -106,13 +106,10 @@ def unwrapped(angles: Any) -> Any:
     return out
 
 
-class Column(StrictTable):
-    """Where one channel comes from: theirs, its unit (SI where none is said), sign and offset [SI]."""
+class Quantity(StrictTable):
+    """What has a unit: SI where none is said, or a number, SI per count."""
 
-    source: Name | None = Field(default=None, alias="from")
     unit: Name | FinitePositive | None = None
-    sign: Finite = 1.0
-    offset: Finite = 0.0
 
     @field_validator("unit")
     @classmethod
@@ -120,6 +117,19 @@ class Column(StrictTable):
         if unit is not None:
             si_factor(unit)
         return unit
+
+    @property
+    def size(self) -> float:
+        """The unit in SI."""
+        return 1.0 if self.unit is None else si_factor(self.unit)
+
+
+class Column(Quantity):
+    """Where one channel comes from: theirs, its unit, sign and offset [SI]."""
+
+    source: Name | None = Field(default=None, alias="from")
+    sign: Finite = 1.0
+    offset: Finite = 0.0
 
     @field_validator("sign")
     @classmethod

@@ -28,7 +28,6 @@ from hmmseg.online.hypothesis import (
     supported,
 )
 from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, RINGING, SETTLING, STAGES
-from hmmseg.segmentation.emissions import LOST
 
 LOG_DEPARTURE = math.log(DEPARTURE)
 PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
@@ -285,10 +284,7 @@ def _explained(h, known, x, chain, span, pads, gravity):
         else:
             other = lifted(h, known, block, blocks, x, span, gravity, settled)
         own = log_sum(math.log1p(-ringing) + own, math.log(ringing) + max(own, other))
-    own += held(h, known, block, blocks, x, span, pads)
-    if kind == ABOVE_KIND:  # a grip that slips has lost the block for a moment
-        own = log_sum(math.log1p(-LOST) + own, math.log(LOST) + free(h, x, span))
-    return own
+    return own + held(h, known, block, blocks, x, span, pads)
 
 
 @compiled

@@ -26,7 +26,7 @@ from hmmseg.contact.equations import block_width, block_y, inertia_factor
 from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.online.compiled import compiled
-from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, SHUT, STRAY, TOUCHING, WINDOW
+from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
 
 NUM_RING = 8  # numerics: boundaries that are remembered, the last ones; a move has four
 # numerics: which scale of residuals is which, as the emissions off line name them
@@ -306,7 +306,7 @@ def free(h, x, span):
     broad = _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy)
     broad += _log_broad(x.y, span.y) + _log_broad(x.d, span.d)
     out = _ungripped(h, x, span.force) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
-    return out + SHUT if x.gripped == 2.0 else out
+    return out + EDGE if x.gripped == 2.0 else out
 
 
 @compiled
@@ -315,7 +315,7 @@ def held(h, known, block, num_blocks, x, span, pads):
     fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
     out = log_between((fx1 - fx2) / 2, 0.0, span.force, math.sqrt(_square(h, FORCE)))
     if x.gripped == 0.0:
-        out += SHUT
+        out += EDGE
     out += log_student(fx1 + fx2, math.sqrt(_square(h, NET_X) + x.sd_fx * x.sd_fx))
     out += log_student((_force(h, x, 1) - _force(h, x, 3)) / 2, math.sqrt(_square(h, SHEAR)))
     spread = x.sd_d * x.sd_d + _square(h, WIDTH)

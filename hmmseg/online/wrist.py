@@ -23,6 +23,7 @@ from hmmseg.errors import InputError
 from hmmseg.hand.tool import WINDOW, FreeMotion, Pose, Tool, applied_force, free_motion, pose_of, tool_of
 from hmmseg.hand.wrist import (
     LEAST_CLOSING,
+    REST,
     SLOWED,
     STEP,
     TOGETHER,
@@ -288,13 +289,10 @@ def checked(rig: Rig, t: float, row: np.ndarray) -> None:
 
 
 STAND = 0.1  # chosen: s of next to no motion: the gripper stands
-STILL = 0.1  # chosen: share of a closing's top speed that is next to none
 SAMPLES = 4  # numerics: of a stand at least, and steps: what the touch is read from
 PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
 NOISE = 200  # numerics: samples that determine the opening's noise
-CLEAR = 10.0  # chosen: noise scales of a motion, as off line
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
-OPENING = 0.1  # chosen: share of the way back at which a gripper has surely let go, as off line
 
 
 class Held:
@@ -331,7 +329,7 @@ class Closings:
     @property
     def swing(self) -> float:
         """Least motion of the opening that counts [m]."""
-        return max(0.1 * (self._high - self._low), CLEAR * self._noise, LEAST_CLOSING)
+        return max(REST * (self._high - self._low), 2 * SURE * self._noise, LEAST_CLOSING)
 
     def free(self, t: float, opening: float) -> bool:
         """Whether a sample is surely of free motion: outside of every grip, more open than halfway."""
@@ -388,11 +386,11 @@ class Closings:
             self._slowed = t
         self._fastest = max(self._fastest, fast)
         self.known = max(self._slowed, t - PATIENCE)
-        if t - self._slowed < STAND or not self._speed(STAND) < STILL * self._fastest:
+        if t - self._slowed < STAND or not self._speed(STAND) < REST * self._fastest:
             return
         times, way = np.array(self._kept).T
         end = times.size - 1
-        stands = end - int(np.argmax(way <= way[end] + OPENING * (way[0] - way[end])))
+        stands = end - int(np.argmax(way <= way[end] + REST * (way[0] - way[end])))
         if stands < max(SAMPLES, int(SAMPLES * STEP / float(np.median(np.diff(times))))):
             return
         grip = grip_of(times, way, np.zeros(times.size, bool), (0, end, end), self._give(times, way))
@@ -418,7 +416,7 @@ class Closings:
         if math.isnan(self._wide):
             self._wide = t
         self.known = max(self.known, t - PATIENCE)
-        if opening > max(held.grip.width, self._floor + OPENING * (self._high - self._floor)):
+        if opening > max(held.grip.width, self._floor + REST * (self._high - self._floor)):
             held.stop = self._wide
             self._open(t, opening)
 

@@ -31,7 +31,6 @@ UNSEEN = 0.15  # prior: the same, as a share of the way that the velocities at b
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
 MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 24  # numerics: nodes over the time at which that motion started
-SEVERAL = 0.1  # prior: share of landings within whose sample interval one motion ends and another begins
 SHAPE = 0.05  # prior: how far its speed may be off the minimum-jerk profile, as a share of it
 STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
 
@@ -45,9 +44,7 @@ class Crossing:
     `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise.
     `kind`: "smooth" motion through the crossing; "impact": the crossing stops it (a touch, a
     touchdown); "launch": it sets in with the crossing (a block that was held down lifts off).
-    `earlier`: how long before the left end [s] another sample was, its value and its rate. `restless`
-    [m^2/s^3]: variance a second by which the rate wanders where another motion may begin within the
-    interval; 0: it is one.
+    `earlier`: how long before the left end [s] another sample was, its value and its rate.
     """
 
     left: float
@@ -59,7 +56,6 @@ class Crossing:
     sd_v: float
     kind: Kind = "smooth"
     earlier: tuple[float, float, float] | None = None
-    restless: float = 0.0
 
     @property
     def known(self) -> bool:
@@ -68,15 +64,14 @@ class Crossing:
         return bool(np.isfinite(numbers).all())
 
 
-def log_smooth(c: Crossing, h: float, u: np.ndarray, bend: float | None = None) -> np.ndarray:
-    """Rice's formula on the cubic that joins both ends, give or take a `bend` [m] amid them."""
+def log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
+    """Rice's formula on the cubic that joins both ends, give or take a bend [m] amid them."""
     h00, h10, h01, h11 = _hermite(u)
     d00, d10, d01, d11 = _hermite_slopes(u)
     value = h00 * c.left + h10 * h * c.v_left + h01 * c.right + h11 * h * c.v_right
     slope = (d00 * c.left + d01 * c.right) / h + d10 * c.v_left + d11 * c.v_right
-    if bend is None:
-        unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
-        bend = float(np.hypot(BEND * h * np.hypot(c.v_right - c.v_left, c.sd_v), UNSEEN * unseen))
+    unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
+    bend = float(np.hypot(BEND * h * np.hypot(c.v_right - c.v_left, c.sd_v), UNSEEN * unseen))
     variance = (h00 * c.sd_left) ** 2 + (h01 * c.sd_right) ** 2
     variance += (h * c.sd_v) ** 2 * (h10**2 + h11**2) + (4 * u * (1 - u) * bend) ** 2
     rise = np.hypot(slope, c.sd_v + bend / h)
@@ -97,46 +92,18 @@ def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
     log_prior = log_prior - np.logaddexp.reduce(log_prior, axis=None)
     together, every = log_prior, np.ones(1)
     for c in impacts:
-        log_motion, log_after = _log_impact(c, h, u, duration, age / duration)
-        log_density = log_motion + log_after
+        log_density = _log_impact(c, h, u, duration, age / duration)
         peak = log_density.max(axis=-1, keepdims=True)
         density = np.exp(log_density - peak)
         total = density.sum(axis=-1)
         together = together + peak[..., 0] + np.log(total)
         every = every * (np.cumsum(density, axis=-1) / total[..., None])
     weight = np.exp(together - together.max())
-    hit = (weight[..., None] * every).sum(axis=(0, 1)) / weight.sum()
-    if len(impacts) == 1:
-        return _or_several(impacts[0], h, u, log_prior[..., None] + log_motion, log_after, hit)
-    return hit
+    return (weight[..., None] * every).sum(axis=(0, 1)) / weight.sum()
 
 
-def _or_several(
-    c: Crossing, h: float, u: np.ndarray, log_motion: np.ndarray, log_after: np.ndarray, hit: np.ndarray
-) -> np.ndarray:
-    """Probability (POINTS,) of a hit by one motion, as in `hit`, or by several within the interval.
-
-    `log_motion` are weights of what one motion may be, `log_after` how well each explains the right end. Of
-    several the rate wanders: the way is normal about what the rates at both ends make of it, h^3 / 12 times
-    the variance a second, and amid the interval off the cubic by h^3 / 192 (integrated Brownian motion).
-    """
-    if c.restless <= 0:
-        return hit
-    both = float(np.logaddexp.reduce(log_motion + log_after, axis=None))
-    one = both - float(np.logaddexp.reduce(log_motion, axis=None)) - np.log(STOPS)
-    unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
-    variance = c.restless * h**3 / 12 + c.sd_left**2 + c.sd_right**2 + (h * c.sd_v) ** 2 / 2
-    several = -0.5 * (unseen**2 / variance + np.log(variance))
-    share = 1 / (1 + (1 - SEVERAL) / SEVERAL * np.exp(np.clip(one - several, -500, 500)))
-    log_density = log_smooth(c, h, u, float(np.sqrt(c.restless * h**3 / 192)))
-    density = np.exp(log_density - log_density.max())
-    return (1 - share) * hit + share * np.cumsum(density) / density.sum()
-
-
-def _log_impact(
-    c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Log likelihoods (..., POINTS) of what precedes and of what follows an impact at u, given its motion.
+def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Log likelihood (..., POINTS) of an impact at u, given its motion.
 
     A minimum-jerk motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample.
     Its distance is unknown (log-uniform); gap and velocity of the first sample determine it. The face
@@ -175,7 +142,7 @@ def _log_impact(
     variance = reach**2 * (2 * SHAPE * speed) ** 2
     variance += c.sd_right**2 + (c.sd_v * after) ** 2
     log_after = _log_sum_normal(apart, variance)
-    return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + np.log(speed), log_after
+    return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + np.log(speed) + log_after
 
 
 def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:

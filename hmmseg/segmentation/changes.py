@@ -42,7 +42,6 @@ from hmmseg.segmentation.boundaries import (
 # pushed)
 STRAY = 0.02
 SELDOM = 0.002  # prior: ... where that is the less likely of the two stories
-LOOKED_BACK = 3  # chosen: sample intervals whose changes of speed show how restless a hand is
 DEEP = 0.9  # numerics: quantile of the penetrations around a change that stands for the deepest
 ROOT_2PI = float(np.sqrt(2 * np.pi))  # numerics: width of a normal density that is as high as an even one
 
@@ -68,14 +67,6 @@ class Penetration:
     sd_rate: float
     form: float
     hidden: bool = False
-
-    def restless(self, n: int) -> float:
-        """How much the speed of what comes down wanders up to sample n: its variance a second [m^2/s^3]."""
-        last = slice(max(n - LOOKED_BACK, 0), n + 1)
-        change, step = np.diff(self.rate[0, last]), np.diff(self.t[last])
-        there = np.isfinite(change)
-        wandered = float(np.sum(change[there] ** 2)) - 2 * self.sd_rate**2 * there.sum()
-        return max(wandered, 0.0) / float(step[there].sum()) if there.any() else 0.0
 
 
 def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -360,9 +351,7 @@ def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Cr
     before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
         found = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-        if len(change.contacts) == 1:  # a block is set down in several motions
-            return replace(found, restless=c.restless(n))
-        if n == 0:
+        if n == 0 or len(change.contacts) == 1:  # a block is set down in several motions
             return found
         then = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
         return replace(found, earlier=then) if np.isfinite(then).all() else found

@@ -27,18 +27,16 @@ import numpy as np
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
-from hmmseg.densities import log_between, log_student
+from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
 from hmmseg.robust import white_sd
 from hmmseg.tables import Brief
 
-SHUT = -25.0  # chosen: nats of what the gripper's opening rules out, as of any edge in the emissions
 STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's (foam giving late)
 STILL = 0.1  # prior: share of a carry's samples at which the block is held still
-LOST = 1e-3  # chosen: share of a carry's samples at which a grip that slips has lost the block for a moment
 ONE_FINGER = 0.02  # prior: share of free samples at which one finger alone touches
 RUNG = 0.01  # prior: share of free samples at which forces still ring from a contact
 
@@ -205,7 +203,7 @@ def log_likelihoods(
     keys = [_alike(s, parameters, trial) for s in subtasks]
     found = {
         key: free if key[0] == FREE
-        else _log_gripped(features, parameters, grips[key[1]], free, force, *key, stray)
+        else _log_gripped(features, parameters, grips[key[1]], force, *key, stray)
         for key in dict.fromkeys(keys)
     }  # fmt: skip
     return np.stack([found[key] for key in keys], axis=1)
@@ -228,7 +226,7 @@ def _log_held(f: Features, p: Parameters, force: np.ndarray) -> np.ndarray:
     grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
     out = log_between(grip, 0.0, f.span["force"], p.scale["force"])
     if f.free is not None:
-        out += SHUT * (f.free == 1)
+        out += EDGE * (f.free == 1)
     shear = (force[:, 1] - force[:, 3]) / 2
     return out + (log_student(net_x, p.scale["net_x"]) + log_student(shear, p.scale["shear"]))
 
@@ -243,19 +241,18 @@ def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:
 
 
 def _log_gripped(
-    f: Features, p: Parameters, grip: np.ndarray, free: np.ndarray, force: np.ndarray,
+    f: Features, p: Parameters, grip: np.ndarray, force: np.ndarray,
     state: str, name: str, level: float | None, stray: float,
 ) -> np.ndarray:  # fmt: skip
     """Log-likelihoods (num_timesteps,) of one held object in one contact state, resting at this `level`.
 
-    `grip`: log density of what presses it, `free`: of no grip at all, `force`: without biases.
+    `grip`: log density of what presses it, `force`: without biases.
     """
     fy, weight, scale = force[:, 1] + force[:, 3], p.weight[name], p.scale
     if state == ABOVE_GROUND:
         carried = log_student(fy - weight * f.carrying, scale["carry"])
         out = grip + (carried + _broad(f, "vx", "vy") + _broad(f, "y"))
-        out += np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
-        return np.logaddexp(np.log1p(-LOST) + out, np.log(LOST) + free)
+        return out + np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(f, p))
     out = grip + log_between(fy, -f.span["press"], weight, scale["carry"])
     aside = None if state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
     upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), _broad(f, "vy")

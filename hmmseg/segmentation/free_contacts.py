@@ -19,7 +19,7 @@ from scipy.special import log_ndtr
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense
-from hmmseg.levels import SURE
+from hmmseg.levels import FIRM, MOVED, SURE
 from hmmseg.robust import NORMAL, median_of_known
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
@@ -27,8 +27,7 @@ from hmmseg.segmentation.fit import maximisation, otsu
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
 SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
 PRESSED = 30  # chosen: noise sds of a grip force that is there all the time, and so no bias
-# chosen: m from the heights at a grip's ends (medians of so many samples) to be lifted
-RAISED, ENDS = 3e-3, 3
+ENDS = 3  # numerics: samples of whose heights the median is a grip's height at either end
 
 
 @dataclass(frozen=True)
@@ -121,9 +120,9 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
     from where the grip begins and from where it ends. A block that falls is where its grip ends, so that the
     guess is what is far from where it begins.
     """
-    moving = np.abs(f.vy[span]) > 6 * f.sd_vy[span]
+    moving = np.abs(f.vy[span]) > SURE * f.sd_vy[span]
     height = filled(f.y)[span]
-    least = np.maximum(4 * f.sd_y[span], RAISED)
+    least = np.maximum(4 * f.sd_y[span], MOVED)
     ends = np.median(height[:ENDS]), np.median(height[-ENDS:])
     return moving | np.all([np.abs(height - end) > least for end in ends[: 1 if guessing else 2]], axis=0)
 
@@ -143,7 +142,6 @@ ROUNDS = 8  # numerics: of an iteration that settles sooner
 # cited: s; no touch that ends sooner can have been meant to lift: grip forces rise for about as long before a
 # lift as loads do in it, 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
 TAP = 0.2
-FIRM = 0.5  # chosen: of the force with which a block is gripped next: who presses less has not gripped it yet
 IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
 States = tuple[tuple[str, int | None], ...]

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 
 import numpy as np
 
@@ -33,16 +32,14 @@ from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import CONTRADICTS, TAIL
-from hmmseg.robust import NORMAL, weighted_median
+from hmmseg.levels import SURE, TAIL, decisive
+from hmmseg.robust import NORMAL, robust_sd, weighted_median
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
     NONE,
-    SIGNIFICANT,
     Stretch,
     Toe,
-    evidence,
     find,
     fitted,
     lagging,
@@ -53,8 +50,12 @@ from hmmseg.segmentation.stretches import (
 )
 
 STEP = 0.0025  # numerics: s; distances and filters are evaluated at such steps
-SHIFTS = np.arange(-0.01, 0.301, 0.005)  # prior: s; delays that are tried, alike; foams lead by some ms
-CONSTANTS = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1])  # prior: s; filters
+FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays of every hand: foams lead by some ms
+SHIFTS = np.arange(0.015, 0.301, 0.005)  # prior: s; delays of a sensor, alike
+CONSTANTS = np.array([0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1])  # prior: s; of its filter, alike
+LEAD_SD = 0.003  # prior: s; of a delay that is not the sensor's: foams lead by a few ms at most
+LATE_HANDS = 0.007  # prior: share of hands whose forces come late by more
+ENOUGH = 24  # numerics: squeezes that determine a delay
 COMPLIANCES = np.geomspace(0.33, 3.0, 17)  # numerics: times what the rig says
 UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; of pads that are said to be rigid
 LAW_SHARE, LAW_LEAD = (
@@ -86,7 +87,7 @@ def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | No
     """The squeeze between `start` and `end` [s]; None without samples enough."""
     sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
     one, two = s.fx1 - p.bias[0], -(s.fx2 - p.bias[2])
-    alone = (np.maximum(one, two) > SIGNIFICANT * sd) & (np.minimum(one, two) <= SIGNIFICANT * sd)
+    alone = (np.maximum(one, two) > SURE * sd) & (np.minimum(one, two) <= SURE * sd)
     rate = np.gradient(s.distance, s.t) if s.derived else s.vx2 - s.vx1
     use = (s.t >= start) & (s.t <= end) & np.isfinite(one + two + s.distance + rate)
     if use.sum() < 6 or not (~alone & use).any():
@@ -101,52 +102,57 @@ def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | No
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late forces are: `delay` [s], its standard deviation, and whether it is a filter's time constant.
+    """How late forces are: `delay` [s], its sd, and whether it is the sensor's, and its filter's."""
 
-    `gain`: nats by which that explains the recording better than a lead or a delay below `least`.
+    delay: float = 0.0
+    sd: float = LEAD_SD
+    late: bool = False
+    filter: bool = False
+
+
+def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Lateness:
+    """The delay that forces show; the sensor's where a long one, or a filter, explains them better for sure.
+
+    `prior`: mean and sd of the compliance of a pad [m/N], which is profiled.
     """
-
-    delay: float
-    sd: float
-    filter: bool
-    gain: float
-
-
-def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], least: float) -> Lateness | None:
-    """The delay, or filter, that explains the forces best; None where nothing determines it.
-
-    `prior`: mean and sd of the compliance of a pad [m/N]. `least` [s]: what is less is no delay.
-    """
+    squeezes = squeezes[:: max(1, len(squeezes) // ENOUGH)]
     if not squeezes:
-        return None
+        return Lateness()
     compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
-    cost = ((compliances - prior[0]) / prior[1]) ** 2 / 2
+    log_prior = -(((compliances - prior[0]) / prior[1]) ** 2) / 2
     loads = [_loads(s, compliances) for s in squeezes]
-    shifted = -cost[:, None] + sum(map(_log_shifted, squeezes, repeat(compliances), loads))
-    filtered = -cost[:, None] + sum(map(_log_filtered, squeezes, repeat(compliances), loads))
-    families = ((SHIFTS, shifted.max(axis=0)), (CONSTANTS, filtered.max(axis=0)))
-    none = families[0][1][least >= SHIFTS].max()
-    found = []
-    for which, (values, log_likelihood) in enumerate(families):
-        weight = np.exp(log_likelihood - log_likelihood.max())
-        weight /= weight.sum()
-        mean = float(weight @ values)
-        sd = float(np.sqrt(weight @ (values - mean) ** 2 + np.min(np.diff(values)) ** 2 / 12))
-        found.append(Lateness(mean, sd, bool(which), float(log_likelihood.max() - none)))
-    return max(found, key=lambda one: one.gain)
+
+    def profiled(values: np.ndarray, filtered: bool) -> np.ndarray:
+        log_likelihood = _log_filtered if filtered else _log_shifted
+        each = (log_likelihood(s, compliances, own, values) for s, own in zip(squeezes, loads, strict=True))
+        return (log_prior[:, None] + sum(each)).max(axis=0)
+
+    log_lead = -((FINE / LEAD_SD) ** 2) / 2
+    usual = profiled(FINE, False) + log_lead - np.logaddexp.reduce(log_lead)
+    families = [(values, profiled(values, filtered) - np.log(2 * values.size), filtered)
+                for values, filtered in ((SHIFTS, False), (CONSTANTS, True))]  # fmt: skip
+    evidence = [float(np.logaddexp.reduce(log_weight)) for _, log_weight, _ in families]
+    late = np.logaddexp(*evidence) - np.logaddexp.reduce(usual) > decisive(LATE_HANDS)
+    values, log_weight, filtered = families[int(np.argmax(evidence))] if late else (FINE, usual, False)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    mean = float(weight @ values)
+    sd = float(np.sqrt(weight @ (values - mean) ** 2 + np.min(np.diff(values)) ** 2 / 12))
+    return Lateness(mean, sd, bool(late), filtered)
 
 
-def _log_shifted(s: Squeeze, compliances: np.ndarray, loads: np.ndarray) -> np.ndarray:
+def _log_shifted(s: Squeeze, compliances: np.ndarray, loads: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_shifts) of one squeeze."""
-    clock = np.clip(s.t[:, None] - SHIFTS, s.t[0], s.t[-1])
+    clock = np.clip(s.t[:, None] - shifts, s.t[0], s.t[-1])
     load, pace = _at(loads, clock - s.t[0])
     return _log_likelihood(s, compliances, load, pace)
 
 
-def _log_filtered(s: Squeeze, compliances: np.ndarray, loads: np.ndarray) -> np.ndarray:
+def _log_filtered(
+    s: Squeeze, compliances: np.ndarray, loads: np.ndarray, constants: np.ndarray
+) -> np.ndarray:
     """Log-likelihoods (num_compliances, num_constants) of one squeeze."""
-    with np.errstate(divide="ignore"):
-        kept = np.exp(-STEP / CONSTANTS)
+    kept = np.exp(-STEP / constants)
     load, pace = lagging(loads, kept, *_steps(s.t - s.t[0], loads.shape[-1]))
     return _log_likelihood(s, compliances, load, pace)
 
@@ -205,16 +211,11 @@ SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
 BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
 REACH = 0.4  # numerics: s; free motion before and after a hold that is used: the longest delay, and a touch
-FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays below what counts as one
-LEAD_SD = 0.003  # prior: s; prior of a delay below what counts as one: foams lead by a few ms at most
-LATE = 0.01  # chosen: s; a longer delay is the sensor's
-DECISIVE = 15.0  # chosen: nats for a longer delay against none; its prior probability is about exp(-5)
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 SLIDING = 0.9  # chosen: quantile of the steepest ratios of forces of all contacts that is friction's
 LOUD = 0.9  # chosen: quantile of what forces show after releases that is how loud they ring
-ENOUGH = 24  # chosen: stretches that determine a delay
 
 
 @dataclass(frozen=True)
@@ -264,7 +265,7 @@ class Sensing:
             how = "are filtered with a time constant of" if self.filter else "come late by"
             out.append(f"forces {how} {1e3 * self.delay:.0f} ms against positions; boundaries allow for it")
         nominal, found = pads_of(rig).normal1, self.normal
-        if abs(found.value - nominal) > max(CONTRADICTS * found.sd, STIFFNESS_SD * nominal):
+        if abs(found.value - nominal) > max(SURE * found.sd, STIFFNESS_SD * nominal):
             stated = f"rig.toml says {1e6 * nominal:.0f}" if nominal > 0 else "rig.toml says they are rigid"
             out.append(f"the pads give {1e6 * found.value:.0f} um/N along the grip, where {stated}; "
                        "boundaries allow for it")  # fmt: skip
@@ -344,37 +345,52 @@ def sense(
                 if not again:
                     squeezes.append(squeeze(s, *_with_free_motion(t, path, steps, step.index), parameters))
     rung = np.quantile(rings, LOUD, axis=0) if rings else np.zeros(3)
-    squeezes = [q and replace(q, sd_load=float(np.hypot(q.sd_load, rung[2]))) for q in squeezes]
+    felt = [replace(q, sd_load=float(np.hypot(q.sd_load, rung[2]))) for q in squeezes if q is not None]
     nominal = pads_of(rig)
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
-    delay, sd, late, filtered = _delay((grips, loads), priors, squeezes)
-    toe = NONE
-    if not (late or again):  # forces that were late, or a wrist's, show no law so finely
-        toe = find([(*_read(s, delay, filtered), s.sd) for s in grips])
+    timing, toe = lateness(felt, priors[0]), NONE
+    if timing.late and not _common(loads, timing, priors[1]):
+        timing = Lateness()
+    if not (timing.late or again):  # forces that were late, or a wrist's, show no law so finely
+        toe = find([(*_read(s, timing), s.sd) for s in grips])
         if toe is not NONE:  # what bends looks like what is late
-            grips = [replace(s, toe=toe) for s in grips]
-            delay, sd, late, filtered = _delay((grips, loads), priors)
+            grips, timing = [replace(s, toe=toe) for s in grips], Lateness()
 
     def found() -> list[Compliance]:
-        return [_compliance([(*_read(s, delay, filtered), s.sd) for s in own], prior, float(r))
+        return [_compliance([(*_read(s, timing), s.sd) for s in own], prior, float(r))
                 for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)]  # fmt: skip
 
     normal, shear = found()
-    if late and normal.value < priors[0][0] / IMPLAUSIBLE:  # noise that a delay happens to smooth away
-        delay, sd, late, filtered = _delay((grips, loads), priors)
+    if timing.late and normal.value < priors[0][0] / IMPLAUSIBLE:  # noise that a delay happens to smooth away
+        timing = Lateness()
         normal, shear = found()
     normal = replace(normal, toe=toe)
-    between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if late else 0.0
-    doubt = float(np.sqrt(sd**2 + (LATE_SHARE * delay * late) ** 2 + between**2))
+    between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if timing.late else 0.0
+    doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
     friction = float(np.quantile(ratios, SLIDING)) if ratios else np.inf
-    return Sensing(normal, shear, delay, doubt, late, filtered, friction)
+    return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction)
 
 
-def _read(s: Stretch, delay: float, filtered: bool) -> tuple[np.ndarray, np.ndarray]:
+def _read(s: Stretch, timing: Lateness) -> tuple[np.ndarray, np.ndarray]:
     """Loads and values at a delay; of its two ends, which say most, less than a sample leaves neither out."""
-    reach = abs(delay) if abs(delay) < LATE else 0.0
-    return reading(s, **{"constant" if filtered else "shift": delay}, reach=reach)
+    reach = 0.0 if timing.late else abs(timing.delay)
+    return reading(s, **{"constant" if timing.filter else "shift": timing.delay}, reach=reach)
+
+
+def _common(loads: Sequence[Stretch], timing: Lateness, prior: tuple[float, float]) -> bool:
+    """Whether loads in shear go with heights no worse for the delay that the grip shows."""
+    left = []
+    for each in (timing, Lateness()):
+        readings = [(*_read(s, each), s.sd) for s in loads]
+        straight = _compliance(readings, prior).value
+        rests = [place + straight * load for load, place, _ in readings if load.size > 3]
+        left.append(np.concatenate([np.zeros(0), *(rest - np.median(rest) for rest in rests)]))
+    if not all(each.size for each in left):
+        return True
+    scale = max(min(map(robust_sd, left)), min(s.sd for s in loads))
+    late, none = (float(np.log1p((each / scale) ** 2 / TAIL).mean()) for each in left)
+    return late <= none
 
 
 def _prior(compliance: float, stated: float) -> tuple[float, float]:
@@ -392,34 +408,6 @@ def _with_free_motion(
         far = near + way * REACH
         ends.append(float(np.clip(far, free[0], free[-1])) if free.size else near)
     return ends[0], ends[1]
-
-
-def _delay(
-    kinds: Sequence[Sequence[Stretch]], priors: Sequence[tuple[float, float]],
-    squeezes: Sequence[Squeeze | None] = (),
-) -> tuple[float, float, bool, bool]:  # fmt: skip
-    """Delay [s], its sd, whether it is the sensor's, and whether a filter explains it better.
-
-    Without `squeezes` it is below what counts as the sensor's.
-    """
-    kinds = [own[:: max(1, len(own) // ENOUGH)] for own in kinds]
-    if not any(kinds):
-        return 0.0, LEAD_SD, False, False
-    there = [s for s in squeezes if s is not None]
-    found = lateness(there[:: max(1, len(there) // ENOUGH)], priors[0], LATE)
-    if found is not None and found.delay > LATE and found.gain > DECISIVE:
-        # A delay is common to all forces; what the grip alone favours is a fault of its pads.
-        delays = np.array([0.0, found.delay])
-        none, late = evidence(kinds[1:], priors[1:], delays, found.filter)[0]
-        if late >= none:
-            return found.delay, found.sd, True, found.filter
-    log_posterior = evidence(kinds, priors, FINE, False, inner=True).sum(axis=0) - (FINE / LEAD_SD) ** 2 / 2
-    if not np.isfinite(log_posterior).any():
-        return 0.0, LEAD_SD, False, False
-    weight = np.exp(log_posterior - log_posterior.max())
-    weight /= weight.sum()
-    mean = float(weight @ FINE)
-    return mean, float(np.sqrt(weight @ (FINE - mean) ** 2)), False, False
 
 
 def _compliance(
@@ -457,14 +445,14 @@ def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tu
     Loads that ring, by `ringing` [N] and maybe more, while nothing moves flatten the line of places over
     loads, to none at the worst (`slope_between`).
     """
-    slope, weight, _ = fitted(load, place, sd)
+    slope, weight = fitted(load, place, sd)
     if weight == 0:
-        return float(slope), 0.0, 0.0
+        return slope, 0.0, 0.0
     x, y = load - load.mean(), place.mean() - place
     square, free = float(x @ x), load.size - 2.0
     middle, apart = slope_between(square, float(x @ y), float(y @ y), free, (ringing, sd))
     if not np.isfinite(apart):
         return middle, 0.0, 0.0
-    value = middle if apart else float(slope)
+    value = middle if apart else slope
     sampling = float(((y - value * x) ** 2).sum()) / free * square / (square - free * ringing**2) ** 2
     return value, float(1.0 / (max(1.0 / weight, sampling) + apart**2)), apart

@@ -19,7 +19,6 @@ from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span
 
-PUSHED = 3.0  # chosen: sds of noise and pad beyond which a block that should rest has moved
 STIFFEST = 1e-7  # numerics: m/N
 
 
@@ -57,8 +56,7 @@ class Contacts:
         timing = self.sensing.delay_sd
         if FREE in (before.state, after.state):
             making = before.state == FREE
-            rests = not making and before.state == ON_GROUND
-            fingers = tuple(self._finger(i, stretch, making, rests) for i in (0, 1))
+            fingers = tuple(self._finger(i, stretch, making) for i in (0, 1))
             if making:
                 return cut(Change(fingers, prior, making, "impact", timing))
             slips = tuple(self._slip(i, stretch) for i in (0, 1))
@@ -73,18 +71,13 @@ class Contacts:
             return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
         return None
 
-    def _finger(self, i: int, held: np.ndarray, making: bool, rests: bool) -> Penetration:
-        """Finger i in its pad, against the face of the block: where it `rests`, or halfway to the other."""
-        inward, rate, sd_inward = self.inward[i], self.inward_rate[:, i], self.sd["inward"]
-        if rests:
-            moved, moving = self._pushed(1 - i, held)
-            inward, rate, sd_inward = inward + moved, rate + moving, np.sqrt(2.0) * sd_inward
-        else:
-            inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
+    def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:
+        """Finger i in its pad, against the face of the block, which is halfway to the other finger's."""
+        inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
         face = median_of_known(inward[held] - self.compression[i, held])
         # A pad of another stiffness would put the face elsewhere.
         pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
-        sd_inward = float(np.hypot(sd_inward, self.sensing.normal.doubt * pressed))
+        sd_inward = float(np.hypot(self.sd["inward"], self.sensing.normal.doubt * pressed))
         sd = self.sd["compression"]
         return self._timely(Penetration(
             self.signals.t, self.compression[i], inward - face, rate, sd, sd,
@@ -98,20 +91,6 @@ class Contacts:
             return 0.0
         needed = np.abs(median_of_known(self.tangential[i, held])) / self.sensing.friction
         return float(np.nan_to_num(_compression(np.array([needed]), self.sensing)[0]))
-
-    def _pushed(self, i: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far finger i has pushed the block from where it rested (T,) [m], and its speed (2, T) [m/s].
-
-        A finger that comes first, or stays longer, pushes the block: as long as it touches, its own
-        position less its pad's compression is where the block is.
-        """
-        pressed = self.compression[i]
-        face = median_of_known(self.inward[i, held] - pressed[held])
-        moved = self.inward[i] - pressed - face
-        doubt = np.hypot(self.sd["inward"], self.sensing.normal.form * pressed)
-        pushes = (pressed > SURE * self.sd["compression"]) & (np.abs(moved) > PUSHED * doubt)
-        moving = self.inward_rate[:, i] - np.gradient(pressed, self.signals.t)
-        return np.where(pushes, moved, 0.0), np.where(pushes & np.isfinite(moving), moving, 0.0)
 
     def _load(self, before: Subtask, held: np.ndarray, making: bool) -> Penetration:
         """The fingers below the height at which the pads' shear just carries the weight."""

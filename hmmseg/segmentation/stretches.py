@@ -20,9 +20,8 @@ from functools import cached_property
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.levels import MOVED, TAIL
-from hmmseg.levels import SURE as SIGNIFICANT
-from hmmseg.robust import NORMAL, robust_sd
+from hmmseg.levels import MOVED, SURE, TAIL, decisive
+from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 
 
@@ -44,7 +43,7 @@ def lagging(values: np.ndarray, kept: np.ndarray, place: np.ndarray, share: np.n
 SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; loads at which the toe may end, a factor of two apart
 DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own
 DEPTH = 5e-4  # prior: m; sd of how deep a toe is
-DECISIVE = 7.0  # chosen: nats for a toe against none: odds of a thousand to one
+ROUNDED = 0.5  # prior: share of contacts whose tips are rounded or soft enough for a toe
 ROUNDS = 6  # numerics: of reweighting
 LEVEL = 1e-28  # numerics: of the squares of loads that do not differ, what rounding leaves about their mean
 Reading = tuple[np.ndarray, np.ndarray, float]
@@ -83,10 +82,12 @@ def find(readings: Sequence[Reading]) -> Toe:
     straight = _depths(load, value, np.zeros((1, *load.shape)), there, usual)[1]
     scale = max(usual, robust_sd(straight[0][there]))
     toes = np.stack([Toe(1.0, soft).give(load) for soft in SOFTS])
-    depth, residual = _depths(load, value, toes, there, scale)
+    depth, residual, precision = _depths(load, value, toes, there, scale)
     gain = _evidence(residual, there, scale) - _evidence(straight, there, scale) - (depth / DEPTH) ** 2 / 2
+    gain -= np.log(DEPTH**2 * precision) / 2  # the depth integrated out (Laplace)
     best = int(gain.argmax())
-    return Toe(float(depth[best]), SOFTS[best]) if gain[best] > DECISIVE and depth[best] > 0 else NONE
+    sure = np.logaddexp.reduce(gain) - np.log(len(SOFTS)) > decisive(ROUNDED) and depth[best] > 0
+    return Toe(float(depth[best]), SOFTS[best]) if sure else NONE
 
 
 def _padded(readings: Sequence[Reading]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -107,8 +108,9 @@ def _evidence(residual: np.ndarray, there: np.ndarray, scale: float) -> np.ndarr
 
 def _depths(
     load: np.ndarray, value: np.ndarray, toes: np.ndarray, there: np.ndarray, scale: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Common depth [m] (K,) of a toe of each shape (K, num_stretches, N), and residuals of all samples.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Common depth [m] (K,) of a toe of each shape (K, num_stretches, N), residuals of all samples, and the
+    precision [1/m^2] (K,) of the depth.
 
     Each stretch has a line of its own. Student-t, reweighted.
     """
@@ -126,14 +128,13 @@ def _depths(
         depth = -(weight * bent * left).sum(axis=(1, 2)) / curved
         residual = left + depth[:, None, None] * bent
         weight = there * ((TAIL + 1) / (TAIL + (residual / scale) ** 2))
-    return depth, residual
+    return depth, residual, DEPENDENT * curved / scale**2 + (1 - DEPENDENT) / DEPTH**2
 
 
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
 FARTHEST = 0.5  # numerics: s; values further from a contact than any delay that is tried are not kept
 RINGS = 0.3  # chosen: s after a release in which a contact still rings
-KEPT = 0.6  # numerics: least share of a recording's samples in contact that a delay may leave there
 
 
 @dataclass(frozen=True)
@@ -174,10 +175,10 @@ def stretches(
     fy = s.fy1 + s.fy2 - p.bias[1] - p.bias[3]
     noise = np.sqrt(2.0) * sd_force
     resting = fy < min(SUPPORTED * weight, weight - 3 * noise)
-    pressing = inside & (fx1 > SIGNIFICANT * sd_force) & (-fx2 > SIGNIFICANT * sd_force)
+    pressing = inside & (fx1 > SURE * sd_force) & (-fx2 > SURE * sd_force)
     out = []
     for load, value, stated, within, sure in (
-        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True, 2 * SIGNIFICANT * sd_force),
+        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True, 2 * SURE * sd_force),
         (-fy / 2, s.y, s.sd_y / np.sqrt(2), resting, -np.inf),
     ):
         use = pressing & within & np.isfinite(load)
@@ -202,7 +203,7 @@ def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]
     sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
     out = []
     for grip, shear in ((s.fx1 - p.bias[0], s.fy1 - p.bias[1]), (-(s.fx2 - p.bias[2]), s.fy2 - p.bias[3])):
-        use = inside & (grip > SIGNIFICANT * sd) & np.isfinite(shear)
+        use = inside & (grip > SURE * sd) & np.isfinite(shear)
         if use.any():
             out.append(max(float(np.max((np.abs(shear[use]) - sd) / (grip[use] + sd))), 0.0))
     return out
@@ -242,133 +243,42 @@ def unfiltered(s: Stretch, constant: float) -> Stretch:
     return replace(s, t=(s.t - s.step / 2)[there], load=load[there])
 
 
-def shifted(s: Stretch, shifts: np.ndarray, reach: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Loads and values (num_shifts, M) that belong together for forces late by each shift [s].
-
-    Loads are interpolated to the times of the values, whose noise matters more; up to `reach` [s] beyond the
-    first and the last of them they are extrapolated (negative: so much at either end is left out). The last
-    of the three says which count, the others are 0.
-    """
-    t, load, late = s.t, s.load, shifts[:, None]
-    if t.size < 2:
-        return (none := np.zeros((shifts.size, 0))), none, none > 0
-    edge = reach + 1e-9
-    low, high = np.searchsorted(s.clock, [t[0] - shifts.max() - edge, t[-1] - shifts.min() + edge])
-    clock, place = s.clock[low : high + 1], s.place[low : high + 1]
-    first, last = t[0] - late, t[-1] - late
-    after = np.clip(np.searchsorted(t, clock + late), 1, t.size - 1)
-    step = np.diff(t)[after - 1]
-    within = (clock >= first - edge) & (clock <= last + edge) & (step < 1.5 * s.interval)
-    before = load[after - 1]
-    # A straight line between two loads, and beyond the first and the last.
-    loads = before + (load[after] - before) * ((clock + late - t[after - 1]) / step)
-    loads = np.where(within, loads, 0.0)
-    return loads, np.where(within, place + s.toe.give(loads), 0.0), within
-
-
 def reading(
     s: Stretch, shift: float = 0.0, constant: float = 0.0, reach: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Loads and values that belong together, as `shifted`, for forces `shift` s late or filtered."""
-    read = unfiltered(s, constant) if constant > 0 else s
-    loads, values, within = shifted(read, np.array([shift]), reach)
-    return loads[within], values[within]
+    """Loads and values (M,) that belong together for forces `shift` s late, or filtered.
 
-
-def fitted(
-    load: np.ndarray, value: np.ndarray, sd: float, rounds: int = 5, there: np.ndarray | bool = True
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slopes -dvalue/dload (...), their information and residuals (..., N); Student-t, reweighted.
-
-    Only samples `there` (..., N) count. Noise of the loads would flatten the slope by its share of their
-    variance: that much is not known. Both are 0 where fewer than four samples count, or none differs.
+    Loads are interpolated to the times of the values, whose noise matters more; up to `reach` [s] beyond the
+    first and the last of them they are extrapolated. A contact with a toe is read as if it were straight.
     """
-    weight = np.broadcast_to(there, load.shape).astype(float)
-    count = weight.sum(axis=-1)
-    determined, free = count > 3, np.maximum(count - 2, 1)
-    mask, slope, scale2, square = weight, np.zeros(count.shape), np.full(count.shape, sd**2), count
-    residual = np.zeros_like(value)
-    for _ in range(rounds):
-        total = np.maximum(weight.sum(axis=-1), 1e-300)
-        mean = [((weight * v).sum(axis=-1) / total)[..., None] for v in (load, value)]
-        x, y = load - mean[0], value - mean[1]
-        wx = weight * x
-        square = (wx * x).sum(axis=-1)
-        determined = determined & (square > 0)
-        square = np.where(determined, square, 1.0)
-        slope = -(wx * y).sum(axis=-1) / square * determined
-        residual = y + slope[..., None] * x
-        scale2 = np.maximum((weight * residual**2).sum(axis=-1) / free, sd**2)
-        weight = mask * ((TAIL + 1) / (TAIL + residual**2 / scale2[..., None]))
-    share = scale2 * weight.sum(axis=-1) / np.maximum(slope**2 * square, 1e-300)
-    flattened = slope * np.minimum(share, 1.0)
-    return np.asarray(slope), np.asarray(determined / (scale2 / square + flattened**2)), residual
+    s = unfiltered(s, constant) if constant > 0 else s
+    t, late = s.t, s.clock + shift
+    if t.size < 2:
+        return np.zeros(0), np.zeros(0)
+    after = np.clip(np.searchsorted(t, late), 1, t.size - 1)
+    step, edge = np.diff(t)[after - 1], reach + 1e-9
+    # A straight line between two loads, and beyond the first and the last.
+    load = s.load[after - 1] + (s.load[after] - s.load[after - 1]) * ((late - t[after - 1]) / step)
+    within = (late >= t[0] - edge) & (late <= t[-1] + edge) & (step < 1.5 * s.interval)
+    return load[within], s.place[within] + s.toe.give(load[within])
 
 
-def _medians(values: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Medians (...) of the values (..., N) that are `there`; 0 of none."""
-    if not values.size:
-        return np.zeros(values.shape[:-1])
-    ordered, count = np.sort(np.where(there, values, np.inf), axis=-1), there.sum(axis=-1)
-    pair = [
-        np.take_along_axis(ordered, i[..., None], -1)[..., 0]
-        for i in (np.maximum(count - 1, 0) // 2, count // 2)
-    ]
-    return np.where(count > 0, (pair[0] + pair[1]) / 2, 0.0)
+def fitted(load: np.ndarray, value: np.ndarray, sd: float) -> tuple[float, float]:
+    """Slope -dvalue/dload of samples (N,) and its information; Student-t, reweighted.
 
-
-def evidence(
-    kinds: Sequence[Sequence[Stretch]],
-    priors: Sequence[tuple[float, float]],
-    delays: np.ndarray,
-    filtered: bool,
-    inner: bool = False,
-) -> np.ndarray:
-    """Log-likelihoods (num_kinds, num_delays) of all stretches, each with a rest, each kind a compliance.
-
-    Of a sample on the average, times their number, as not every delay leaves all of them in contact;
-    -inf where it leaves too few. `inner`: without the ends of each contact, where a delay of less than a
-    sample takes one sample out that no delay leaves in, which counts more than the delay itself. `priors`:
-    mean and sd [m/N] of the compliance of each kind.
+    Noise of the loads, taken as what the line leaves of values, would flatten the slope by its share of their
+    variance: that much is not known. Both are 0 of fewer than four samples, or where no load differs.
     """
-    out = np.zeros((len(kinds), delays.size))
-    for row, own, prior in zip(out, kinds, priors, strict=True):
-        if not own:
-            continue
-        num_samples = sum(s.t.size for s in own)
-        usual = float(_medians(np.array([s.sd for s in own]), np.ones(len(own), bool)))
-        read = [_read(s, delays, filtered, -inner * s.interval / 2) for s in own]
-        found = [fitted(*r[:2], s.sd, 3, r[2])[:2] for r, s in zip(read, own, strict=True)]
-        slope, determined = (np.stack([f[i] for f in found], axis=-1) for i in (0, 1))
-        weight = np.minimum(
-            determined, len(own) * _medians(determined, np.ones_like(determined, bool))[:, None]
-        )
-        total = weight.sum(axis=-1) + prior[1] ** -2
-        c = np.maximum(((weight * slope).sum(axis=-1) + prior[0] * prior[1] ** -2) / total, 0.0)
-        rests = [value + c[:, None] * load for load, value, _ in read]
-        residual = np.concatenate(
-            [r - _medians(r, one[2])[:, None] for r, one in zip(rests, read, strict=True)], axis=-1
-        )
-        there = np.concatenate([one[2] for one in read], axis=-1)
-        count = there.sum(axis=-1)
-        enough = count >= KEPT * num_samples
-        scale = max(min(NORMAL * _medians(np.abs(residual), there)[enough], default=usual), usual)
-        cost = (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL) * there
-        row[:] = np.where(enough, -num_samples * cost.sum(axis=-1) / np.maximum(count, 1), -np.inf)
-    return DEPENDENT * out
-
-
-def _read(
-    s: Stretch, delays: np.ndarray, filtered: bool, reach: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A stretch as `shifted`, for each delay, or each time constant of a filter."""
-    if not filtered:
-        return shifted(s, delays, reach)
-    none = np.zeros(1)
-    every = [shifted(unfiltered(s, d) if d > 0 else s, none, reach) for d in delays]
-    width = max(loads.size for loads, *_ in every)
-    loads, values, there = (
-        np.concatenate([np.pad(one[i], ((0, 0), (0, width - one[i].size))) for one in every])
-        for i in range(3)
-    )
-    return loads, values, there
+    weight, slope, information = np.ones(load.size), 0.0, 0.0
+    for _ in range(ROUNDS - 1 if load.size > 3 else 0):
+        x, y = (v - np.average(v, weights=weight) for v in (load, value))
+        square = float(weight @ x**2)
+        if square <= 0:
+            return 0.0, 0.0
+        slope = -float((weight * x) @ y) / square
+        left = (y + slope * x) ** 2
+        scale2 = max(float(weight @ left) / (load.size - 2), sd**2)
+        weight = (TAIL + 1) / (TAIL + left / scale2)
+        flattened = slope * min(scale2 * float(weight.sum()) / max(slope**2 * square, 1e-300), 1.0)
+        information = 1 / (scale2 / square + flattened**2)
+    return slope, information

@@ -26,7 +26,7 @@ from hmmseg.sequence.fit import boundary_probabilities, fit_sequence
 from hmmseg.sequence.model import NamedCourse, SequenceModel, find_failure, optional_states
 
 LISTED = 0.05  # chosen: least probability of a place that is listed
-SURE = 0.95  # chosen: from here on one place is the answer and no other is listed
+SURE = 1 - LISTED  # from here on one place is the answer: no other can be listed
 FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
 LEAST = 1e-3  # numerics: probability of a naming that makes no difference
 EXACT = 1e-6  # numerics: of a feature's spread: what is nearer to a level than that is at it

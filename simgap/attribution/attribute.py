@@ -24,6 +24,7 @@ from simgap.attribution.search import Detection, detected, leniently, sought, st
 from simgap.attribution.verdict import (
     ALARM,
     LEAST,
+    RULED_OUT,
     Cell,
     Explanation,
     Shares,
@@ -192,7 +193,7 @@ def attribute(
     ranked, others = ranked[:EXAMINED], None
     if heldout and (found.p_value < ALARM or forced):
         others = Heldout.of(gap, noise**2, (j for part in ranked for j in part))
-    examined = {part: _examined(f, part, by_group, rng, others) for part in ranked}
+    examined = {part: _examined(f, part, models, by_group, rng, others) for part in ranked}
     sets = [_explanation(f, parts[m.effects], float(x), examined) for m, x in zip(models, w, strict=True)]
     small = None
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
@@ -310,6 +311,7 @@ class _Examined:
 def _examined(
     f: Forms,
     effects: tuple[int, ...],
+    models: list[Model],
     by_group: np.ndarray,
     rng: np.random.Generator,
     others: Heldout | None = None,
@@ -318,18 +320,12 @@ def _examined(
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     same = {j: _same(f, model, j) for j in effects}
-    part = explained.each.mean(0) if effects else np.zeros(0)
-    least = LEAST * float(part.sum())
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(
         j
-        for j, p in zip(effects, part, strict=True)
+        for j in effects
         if j in scattering
-        or (
-            (p >= least or _matters(f, model, j))
-            and same[j].log_bayes_factor > POSITIVE
-            and _there(f, model, j)
-        )
+        or (_needed(f, model, j) and same[j].log_bayes_factor > POSITIVE and _there(f, model, j))
     )
     if others is not None:
         causes = _predicting(others, causes)
@@ -340,7 +336,7 @@ def _examined(
     share = 1 - explained.remainder if far is None else far.fraction
     if far is None and others is not None and shifting:
         share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
-    sure = known(left, share, factors) if causes else 0.0
+    sure = known(left, share, factors, detected(statistic(f, models, causes)).p_value) if causes else 0.0
     return _Examined(effects, model, explained, same, causes, sure)
 
 
@@ -358,7 +354,8 @@ def _same(f: Forms, model: Model, effect: int) -> Invariance:
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     """Those causes without which trials that took no part are predicted worse, taken out one by one."""
     while causes:
-        gains = {j: others.gain(causes, [i for i in causes if i != j]) for j in causes}
+        rest = {j: [i for i in causes if i != j] for j in causes}
+        gains = {j: others.gain(causes, rest[j], rest[j]) for j in causes}
         least = min(gains, key=lambda j: gains[j])
         if gains[least] > POSITIVE:
             break
@@ -366,10 +363,10 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     return causes
 
 
-def _matters(f: Forms, model: Model, effect: int) -> bool:
-    """Whether an effect's own deviation matters, however little it shifts compared with others."""
-    c, own = f.gap.candidates[effect], coordinates(f, model.effects)[effect]
-    return c.least is not None and bool((np.abs(c.scale * model.x[own]) >= c.least).any())
+def _needed(f: Forms, model: Model, effect: int) -> bool:
+    """Whether doing without an effect is ruled out by the evidence of its set."""
+    rest = fitted(f, tuple(j for j in model.effects if j != effect))
+    return model.score - rest.score > np.log(RULED_OUT)
 
 
 def _there(f: Forms, model: Model, effect: int) -> bool:

@@ -152,6 +152,16 @@ def residual_left(f: Forms, model: Model) -> np.ndarray:
     return out
 
 
+def form_error(f: Forms, model: Model) -> np.ndarray:
+    """Mean square (G,) of each group by which the effects of a set are off as their forms usually are, in
+    units of the noise's."""
+    out = np.zeros(f.count.size)
+    for j, mine in coordinates(f, model.effects).items():
+        own, x = f.spectrum.own[j], np.append(1.0, model.x[mine])
+        out += f.gap.candidates[j].form ** 2 * np.einsum("i,gij,j->g", x, f.product[:, own[:, None], own], x)
+    return np.maximum(out, 0.0) / f.count
+
+
 # How far causes shrink the gap of trials that took no part: predicted by what the other trials say.
 #
 # Causes are chosen on all trials; how large they are is then found without the trial that is predicted. The
@@ -199,7 +209,7 @@ class Heldout:
     noise: np.ndarray
     among: tuple[int, ...]
     folds: tuple[tuple[Forms, Forms], ...]
-    computed: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    computed: dict[tuple[tuple[int, ...], ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, gap: Gap, noise: np.ndarray, among: Iterable[int]) -> Heldout | None:
@@ -220,22 +230,26 @@ class Heldout:
         n, gone = float(floor.sum()), fraction_gone(before - after, before - floor)
         return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *gone, self.gain(effects, ()))
 
-    def gain(self, effects: Sequence[int], without: Sequence[int]) -> float:
-        """Log predictive density of all trials by a set of effects over that by another [nats]."""
-        (more, wide), (less, plain) = self._squares(effects), self._squares(without)
+    def gain(self, effects: Sequence[int], without: Sequence[int], off: Sequence[int] = ()) -> float:
+        """Log predictive density of all trials by a set of effects over that by another [nats]; forms of the
+        effects that may be `off` are no better than they usually are."""
+        (more, wide), (less, plain) = self._squares(effects, off), self._squares(without, off)
         return 0.5 * float((less + plain - more - wide).sum())
 
-    def _squares(self, effects: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        key = tuple(sorted(self.among.index(j) for j in effects))
-        if key not in self.computed:
-            each = np.array([self._predicted(train, test, key) for train, test in self.folds])
-            self.computed[key] = each[:, 0], each[:, 1]
-        return self.computed[key]
+    def _squares(self, effects: Sequence[int], off: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
+        key, loose = (tuple(sorted(self.among.index(j) for j in which)) for which in (effects, off))
+        if (key, loose) not in self.computed:
+            each = np.array([self._predicted(train, test, key, loose) for train, test in self.folds])
+            self.computed[key, loose] = each[:, 0], each[:, 1]
+        return self.computed[key, loose]
 
-    def _predicted(self, train: Forms, test: Forms, effects: tuple[int, ...]) -> tuple[float, float]:
-        """Squares of a trial, and log determinant of its noise over the stated one; `effects` of `among`."""
+    def _predicted(
+        self, train: Forms, test: Forms, effects: tuple[int, ...], off: tuple[int, ...]
+    ) -> tuple[float, float]:
+        """Squares of a trial, and log determinant of its noise over the stated one; `effects` and those whose
+        forms may be `off` of `among`."""
         model, taken = fitted(train, effects), quadratic_forms(test, effects)
-        weight = np.exp(-taken.shift) / self.noise[channel_of(test)]
+        weight = np.exp(-taken.shift) / (self.noise[channel_of(test)] + form_error(test, fitted(train, off)))
         loose = ~model.at_bound  # what is at a bound stays there
         precision = np.zeros_like(model.covariance)
         precision[np.ix_(loose, loose)] = np.linalg.inv(model.covariance[np.ix_(loose, loose)])

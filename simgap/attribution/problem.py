@@ -65,8 +65,7 @@ class Candidate:
     parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
     a parameter is a share of; its deviation from neutral where that is not given, or not finite.
     `frees` (n,): by how much, at most, the variance of cosine coefficients of cells may be larger
-    where it acts, in units of the noise's. `least` (k,): deviations that matter by themselves, whatever they
-    shift.
+    where it acts, in units of the noise's.
     """
 
     name: str
@@ -85,7 +84,6 @@ class Candidate:
     hidden: tuple[str, ...] = ()
     size: Float[np.ndarray, " k"] | None = None
     frees: np.ndarray | None = None
-    least: Float[np.ndarray, " k"] | None = None
 
     def taken(self, rows: np.ndarray) -> Candidate:
         """The candidate on some rows."""
@@ -93,7 +91,7 @@ class Candidate:
         return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
                          self.jacobian[rows], self.low, self.high, variance, self.evidence, self.named,
                          self.form, self.hidden, self.size,
-                         None if self.frees is None else self.frees[rows], self.least)  # fmt: skip
+                         None if self.frees is None else self.frees[rows])  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,13 @@ def sought(
     seen: dict[tuple[int, ...], Model] = {(): fitted(f, ()), **{(j,): fitted(f, (j,)) for j in among}}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
+    # What leaves the least squares may be the larger of two causes, though others score higher while the
+    # smaller one is there: a background that is off everywhere costs little.
+    alone = min((seen[(j,)] for j in among), key=lambda m: float(m.energy.sum()), default=seen[()])
     while True:
         best = max(m.score for m in seen.values())
         ranked = sorted(seen.values(), key=lambda m: -m.score)
-        leading = [m for m in ranked if m.score > best - WINDOW][:beam]
+        leading = [alone, *[m for m in ranked if m.score > best - WINDOW][:beam]]
         leading += [m for m in ranked if len(m.effects) == 1][: 2 if beam > 1 else 0]
         todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
         if not todo:

@@ -22,8 +22,7 @@ ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
 SOFT = 0.5  # chosen: of the p-value's logarithm, logistic: so sharply an alarm turns into a gap
 MOST = 0.5  # cited: share of the gap left from which on it is unknown (the interface's definition)
 WIDTH = 0.25  # chosen: of that share's logarithm, logistic
-# chosen: share of the explained gap below which an effect is a cause only if its own size says so: an error
-# of a tenth in the form of the largest leaves half of that
+# chosen: share of the gap that is nothing next to the rest: an error of a tenth in a form leaves half of that
 LEAST = 0.02
 RULED_OUT = 20.0  # chosen: odds against a set from which on it is no alternative
 LISTED = 1e-4  # look: probability below which a set is one of the others
@@ -119,15 +118,17 @@ def acting(sets: Sequence[Explanation], p_value: float) -> dict[str, float]:
     return {name: min(value, 1.0) for name, value in out.items()}  # a sum of many is rounded
 
 
-def known(left: float, explained: float, same: Iterable[float] = ()) -> float:
+def known(left: float, explained: float, same: Iterable[float] = (), p_rest: float = 0.0) -> float:
     """Probability that a set's effects are the cause: they leave little, and are the same everywhere.
 
     `left`: share of the gap that the set leaves where it acts, `explained`: what it explains of all of it in
-    trials that took no part. Logistic in the logarithm of the larger share that is left. `same`: log Bayes
-    factors of each effect, one cause against as many as there are parts: an effect whose parameters wander is
-    as likely an imitation as its factor says.
+    trials that took no part. Logistic in the logarithm of the larger share that is left, as far as anything
+    is: `p_rest` is the chance of noise to look like what is left, for of a small gap no share is certain.
+    `same`: log Bayes factors of each effect, one cause against as many as there are parts: an effect whose
+    parameters wander is as likely an imitation as its factor says.
     """
     most = expit(np.log(MOST / max(left, 1 - explained, 1e-6)) / WIDTH)
+    most = 1 - (1 - healthy(p_rest)) * (1 - most)
     return float(most * min((expit(factor) for factor in same), default=1.0))
 
 

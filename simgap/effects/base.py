@@ -21,6 +21,20 @@ from simgap.effect import Array, Effect
 Values = dict[str, float]  # parameter name -> its value
 
 
+class DeadBand(NamedTuple):
+    """Where joints lie in their dead bands: `place` (T, N, 4) [rad] as expected, certain where `pinned`.
+
+    Elsewhere a joint goes on from one sample to the next by `drift` (T, N, 4) [rad], with variance `wander`
+    (T, N, 4), or anywhere in its band, with variance `jump` (T, 4) [rad^2].
+    """
+
+    place: Array
+    pinned: Array
+    drift: Array
+    wander: Array
+    jump: Array
+
+
 class World(NamedTuple):
     """Aligned trials and the constants of the hand, as far as an effect may change them.
 
@@ -35,7 +49,8 @@ class World(NamedTuple):
     turned clockwise against how it stood.
     `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
     `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
-    `doubt_joints` [rad^2] (T, N, 4): variance that a correction leaves in angles.
+    `off` [m] (T, N, 4): by how much x, y, distance and offset are off besides.
+    `dead_band`: what is known of where joints lie in theirs, None where they have none.
     `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (6,): 1 where a candidate delays or
     smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE, SMOOTH, CREEPING,
     SLIDING, RINGING, YIELDING), so that equations without it are not evaluated.
@@ -66,7 +81,6 @@ class World(NamedTuple):
     couple: Array
     loudness: Array
     ring: Array
-    doubt_joints: Array
     slip: Array
     modes: Array
     free: Array
@@ -74,6 +88,8 @@ class World(NamedTuple):
     carry: Array
     events: Array
     hang: Array | float = 0.0
+    off: Array | float = 0.0
+    dead_band: DeadBand | None = None
 
 
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)

@@ -10,7 +10,7 @@ from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from simgap import channels
 from simgap.effect import Parameter
-from simgap.effects.base import KINEMATICS, HandEffect, Performance, World, gradient
+from simgap.effects.base import KINEMATICS, DeadBand, HandEffect, Performance, World, gradient
 from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
@@ -61,7 +61,7 @@ def moved_joints(p: Performance, values, change) -> Performance:
 
 def _patched_link_length(document, found):
     """Links longer by `scale`, all of them, or each by its own: link11 is finger 1's first."""
-    from simgap.patch.write import interval_comment, number
+    from simgap.patch import interval_comment, number
 
     if "fingers" not in document:
         return None
@@ -116,7 +116,7 @@ LINK_LENGTH = HandEffect(
 # Joints that turn within a dead band before the sensor follows.
 
 HUSH = 3.0  # chosen: sds of an angle by which it must turn on before its joint is taken to move
-CROSSED, STAYED = 0.6, 0.1  # chosen: variance midway through a rest of a joint that turns back, or goes on
+ANYWHERE = 4 / 3  # physics: mean square way from a side of a dead band to anywhere in it, in half its width
 
 
 def _noise_backlash(values: np.ndarray) -> np.ndarray:
@@ -152,12 +152,13 @@ def _nearest_backlash(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.
     return move, (here - last).astype(float)
 
 
-def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where in the dead band of so much to either side [rad] each joint lies (T, N, 4): mean and variance.
+def within(world: World, half: float, unseen: float) -> DeadBand:
+    """Where in the dead band of so much to either side [rad] each joint lies, and what is known of that.
 
     A recorded angle that moves pins its joint to the side it moves to. At rest the joint goes from one pin
-    to the next: as its speed says, unless that is `unseen`; then no one knows when. A band narrower than what
-    an angle must turn on by to be seen moving is not seen either.
+    to the next: as its speed says, unless that is `unseen`; then no one knows when, and it may have gone
+    anywhere in the band from any sample to the next. A band narrower than what an angle must turn on by to be
+    seen moving is not seen either.
     """
     band = half * np.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
     moves, calm = _moves_backlash(world.joints)
@@ -165,9 +166,6 @@ def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.nda
     rest = ago + ahead - 1
     share = (ago - 0.5) / rest
     share = np.where(last == 0, 1.0, np.where(following == 0, 0.0, share))
-    midway = np.where(last == following, STAYED * (1 - 1 / rest), CROSSED)
-    open_end = (last == 0) | (following == 0)
-    blind = np.square(band) * np.where(open_end, STAYED, 4 * share * (1 - share) * midway)
 
     # Speeds integrated less what the sensor saw: how far the joint went in its dead band, but for a constant.
     step = (world.t[:, 1:] - world.t[:, :-1])[..., None]
@@ -181,22 +179,30 @@ def within(world: World, half: float, unseen: float) -> tuple[np.ndarray, np.nda
     before, after = (
         np.take_along_axis(hidden, np.clip(here + k.astype(int), 0, n - 1), axis=1) for k in (-ago, ahead)
     )
-    pinned = band * (last * (1 - share) + following * share)
+    side = band * (last * (1 - share) + following * share)
     free = (moves == 0) | (last != following)
-    path = pinned + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
-    walk = np.square(_noise_backlash(world.rates)[:, None] * np.median(step))
-    length = np.where(open_end, np.minimum(ago, ahead), rest * share * (1 - share))
-    seen = np.minimum(walk * length, blind)
-    return np.clip(path, -band, band), unseen * blind + (1 - unseen) * seen
+    path = side + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
+    place = np.clip(path, -band, band)
+    seen = np.square(_noise_backlash(world.rates)[:, None] * np.median(step))
+    # What noise takes on by from one sample to the next pins nothing.
+    went_on = np.abs(np.diff(calm, axis=1))
+    far = np.pad(went_on, ((0, 0), (1, 0), (0, 0))) + np.pad(went_on, ((0, 0), (0, 1), (0, 0)))
+    return DeadBand(
+        place,
+        (last == following) & (rest == 1) & (far > HUSH * _noise_backlash(world.joints)[:, None]),
+        (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]),
+        np.broadcast_to((1 - unseen) * seen, place.shape),
+        np.square(unseen * band[:, 0]) * ANYWHERE,
+    )
 
 
 def _correct_backlash(world: World, values, on) -> World:
     half, unseen = 0.5 * values["width"] * world.jointed, values["unseen"]
-    place, variance = within(world, half, unseen)
+    band = within(world, half, unseen)
     return world._replace(
-        joints=world.joints + place,
-        rates=world.rates + unseen * gradient(world.t, place),
-        doubt_joints=world.doubt_joints + variance,
+        joints=world.joints + band.place,
+        rates=world.rates + unseen * gradient(world.t, band.place),
+        dead_band=band,
     )
 
 
@@ -215,7 +221,7 @@ BACKLASH = HandEffect(
     parameters={
         "width": Parameter(0.0, 0.004, "rad", starts=(0.002, 0.006), low=0.0, high=0.05),
         # Rates from the encoder miss what it misses (1); a tachometer's do not (0).
-        "unseen": Parameter(0.0, 0.5, starts=(0.8,), low=0.0, high=1.0, hidden=True),
+        "unseen": Parameter(0.0, 0.5, starts=(1.0,), low=0.0, high=1.0, hidden=True),
     },
     forms=(("width",), ("width", "unseen")),
     stage=KINEMATICS,

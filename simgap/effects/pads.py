@@ -60,7 +60,7 @@ def _phrase_fingertip_compliance(means, rig):
 
 def _patched_fingertip_compliance(document, found):
     """The pads' own numbers, each with what it was and what rig.toml says of it."""
-    from simgap.patch.write import interval_comment, number, table
+    from simgap.patch import interval_comment, number, table
 
     pads = table(document, "fingertip")
     names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]

@@ -66,9 +66,8 @@ WRONG = 0.05  # prior: share by which a measured property may be off
 def _wrong_actual(given, push: np.ndarray) -> list:
     """A candidate for each property that was measured apart."""
     from simgap.attribution.problem import Candidate
-    from simgap.gap.problem import properties_tolerated
 
-    out, nothing, least = [], np.zeros(1), properties_tolerated(given)
+    out, nothing = [], np.zeros(1)
     for o, name in enumerate(given.frame.task.objects):
         for k, kind in enumerate(("weight", "width", "height")):
             column = push[:, 3 * o + k]
@@ -76,7 +75,7 @@ def _wrong_actual(given, push: np.ndarray) -> list:
                 usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.sd[o, k])
                 out.append(Candidate(ACTUAL.name, (f"{name}.{kind}",), nothing, nothing, usual,
                                      np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
-                                     np.full(1, np.inf), least=least[[3 * o + k]]))  # fmt: skip
+                                     np.full(1, np.inf)))  # fmt: skip
     return out
 
 

@@ -119,11 +119,15 @@ def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
     doubt = np.square(arrays.sd[there] / arrays.plain[there])
     sure = (np.bincount(rows.cell, doubt) < CLEAN * np.bincount(rows.cell))[rows.cell]
     phase = arrays.phase.argmax(-1)[..., None].repeat(len(CHANNELS), -1)[there]
-    quiet = (None, (Phase.PICKUP, Phase.PLACE), (Phase.FREE,))
+    still = np.isin(phase, (Phase.PICKUP, Phase.PLACE))
     variance = shape.copy()
-    for names, at in zip(KINDS, quiet, strict=True):
-        mine = np.isin(rows.channel, [CHANNELS.index(n) for n in names])
-        seen = mine & sure & (frequency > SLOWEST) & (True if at is None else np.isin(phase, at))
+    # Hands that move do more within a sample than differences show: speeds have another noise there.
+    for names, at, quiet in (
+        (KINDS[0], True, True), (KINDS[1], still, True), (KINDS[1], ~still, True),
+        (KINDS[2], True, phase == Phase.FREE),
+    ):  # fmt: skip
+        mine = np.isin(rows.channel, [CHANNELS.index(n) for n in names]) & at
+        seen = mine & sure & (frequency > SLOWEST) & quiet
         level, colour = _likeliest(turn[seen], square[seen])
         variance[mine] *= level**2 * _density(turn[mine], colour)
     return replace(rows, sd=np.sqrt(variance), shape=shape)

@@ -468,7 +468,6 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
         couple=zero,
         loudness=np.ones_like(stack["force"]),
         ring=np.array([1.0, 0.05, 0.0]),
-        doubt_joints=np.zeros_like(stack["joints"]),
         slip=np.zeros_like(carry),
         modes=np.zeros(6),
         free=phase[..., Phase.FREE],

@@ -142,12 +142,8 @@ def _settling(given: Problem) -> list[np.ndarray]:
 
 
 def _column(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
-    """The whitened column (n, 1) of shifts (T, N) of channels, known up to a constant in every grip."""
-    weight, onehot = given.whitening.weight, given.frame.arrays.onehot
-    out = np.zeros_like(weight)
+    """The whitened column (n, 1) of shifts (T, N) of x, y, distance or offset."""
+    world, off = given.frame.world, np.zeros((*given.frame.world.t.shape, 4))
     for name, shift in shifts.items():
-        c = CHANNELS.index(name)
-        mine = onehot * (weight[..., c] > 0)[..., None]
-        mean = np.einsum("tnm,tn->tm", mine, shift) / np.maximum(mine.sum(1), 1.0)
-        out[..., c] = (shift - np.einsum("tnm,tm->tn", onehot, mean)) * weight[..., c]
-    return out[weight > 0][:, None]
+        off[..., CHANNELS.index(name)] = shift
+    return -(residual_of(given, world._replace(off=off)) - residual_of(given, world))[:, None]

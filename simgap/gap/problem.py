@@ -261,8 +261,8 @@ def whitened(given: Problem, world: World, properties: np.ndarray) -> tuple[np.n
     `properties` (O, 3): weight, width, height.
     """
     weight = given.whitening.weight
-    raw, factor = residuals(world, given.frame.arrays, properties, given.noise)
-    cost = 0.5 * float(np.log(factor[weight > 0]).sum())
+    raw, factor, unseen = residuals(world, given.frame.arrays, properties, given.noise)
+    cost = unseen + 0.5 * float(np.log(factor[weight > 0]).sum())
     return raw / np.sqrt(factor) * weight, cost
 
 

@@ -18,9 +18,9 @@ from simgap.effects.base import (
     CREEPING,
     LATE,
     RINGING,
-    SLIDING,
     SMOOTH,
     YIELDING,
+    DeadBand,
     World,
     gradient,
     swung,
@@ -233,41 +233,46 @@ def recorded(arrays: Arrays, channel: str) -> np.ndarray:
     return arrays.there[..., CHANNELS.index(channel)]
 
 
-def less_mean(values: np.ndarray, arrays: Arrays, weight: np.ndarray) -> np.ndarray:
-    """Values (T, N) less their weighted mean in every grip."""
-    total = (weight[:, None] @ arrays.onehot)[:, 0]
-    mean = ((weight * values)[:, None] @ arrays.onehot)[:, 0] / np.maximum(total, 1e-9)
-    return (values - (arrays.onehot @ mean[..., None])[..., 0]) * weight
+# prior: shares of the variances of anywhere in a dead band, of a slide of both pads and of one pad alone, by
+# which joints and pads move unseen between two samples, and their chances: as a rule they do not
+SHARES, CHANCES = np.array([[0, 0, 0], [0.01, 0.01, 0], [1, 1, 1]]), np.array([0.8, 0.1, 0.1])
 
 
 def in_grip(
-    values: np.ndarray, firm: np.ndarray, channel: str, arrays: Arrays, noise: np.ndarray, world: World
-) -> tuple[np.ndarray, np.ndarray]:
-    """Values (T, N) that are one constant in every grip, less that constant; and their variance's factor.
+    values: np.ndarray, weight: np.ndarray, noise: np.ndarray, firm: np.ndarray, world: World,
+    arrays: Arrays,
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
+    """x, y, distance and offset (T, N, 4), of which all but the distance are one constant in every grip, less
+    their prediction from the samples before; its variance over the `noise`'s squared, and what unseen moves
+    cost [nats].
 
-    Where pads may slide the constant walks at random; the values are less its prediction from those before.
+    A block on the ground is taken along by a hand that moves: it stays where it was pushed to. Pads may
+    slide, and joints move in their dead bands. A grip's first value sets its constant and says nothing; the
+    distance counts as `firm`ly as the block is held.
     """
-    weight = firm * recorded(arrays, channel)
-    if world.modes[SLIDING]:
-        sd = noise[..., CHANNELS.index(channel)]
-        return _followed(values, weight, sd, SLIDE * world.slip, arrays.onehot)
-    return less_mean(values, arrays, weight), np.ones_like(values)
+    from simgap.recursions import tracked
+
+    place = arrays.phase[..., Phase.PLACE]
+    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
+    grip, part = _others(arrays.onehot), _others(parts.reshape(*place.shape, -1))
+    band = world.dead_band or DeadBand(*np.zeros((4, *place.shape, 0)), np.zeros((len(place), 0)))
+    (x, y), apart = swung(world), np.array([-1.0, -1.0, 1.0, 1.0])
+    levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)[..., : band.place.shape[-1]]
+    return tracked(
+        values - (levers @ band.place[..., None])[..., 0], weight, noise, -levers,
+        np.square(_wider(arrays.pushed)), np.stack([part, grip, grip], -1), ANYWHERE**2, SLIDE**2,
+        _wider(world.slip), band.pinned > 0, *band[:1], *band[2:], SHARES, CHANCES,
+    )  # fmt: skip
 
 
-def _followed(
-    values: np.ndarray, weight: np.ndarray, sd: np.ndarray, walk: np.ndarray, grips: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations (T, N) of a Kalman filter, and their variances over sd squared.
+def _others(grips: np.ndarray) -> np.ndarray:
+    """Samples (T, N) of another grip than the one before, of those that each is in (T, N, G)."""
+    return np.pad((grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5, ((0, 0), (1, 0)), constant_values=True)
 
-    The state is where a grip holds its block, or where that stands: it goes by about `walk` (T, N) from one
-    sample to the next, the larger of both. A grip's first value sets it and says nothing.
-    """
-    from simgap.recursions import innovations
 
-    other = np.ones(walk.shape, bool)
-    other[:, 1:] = (grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5
-    before = np.concatenate([walk[:, :1], walk[:, :-1]], 1)
-    return innovations(values, weight, sd, np.square(np.maximum(walk, before)), other, ANYWHERE**2)
+def _wider(values: np.ndarray) -> np.ndarray:
+    """The larger of each value (T, N) and the one before."""
+    return np.maximum(values, np.concatenate([values[:, :1], values[:, :-1]], 1))
 
 
 TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
@@ -277,8 +282,9 @@ CLOSED = 0.8  # chosen: share of its usual force by which a grip has closed: unt
 
 def residuals(
     world: World, arrays: Arrays, properties: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (T, N, C) in units of the channels, and how far their variance exceeds `noise` squared.
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Residuals (T, N, C) in units of the channels, how far their variance exceeds `noise` squared, and what
+    joints cost [nats] that move unseen.
 
     `properties` (O, 3): weight, width, height. The variance's factor is 1 where the correction of an effect
     leaves nothing in doubt.
@@ -317,14 +323,13 @@ def residuals(
     both = firmness(lesser, held, arrays.onehot, CLOSED)
     closed = firm * both
     still = closed * (arrays.phase[..., Phase.PICKUP] + place)
-    offset, loose_offset = in_grip(offset, closed * held, "offset", arrays, noise, world)
-    # A hand that moves takes what it holds on the ground along: the block stays where it was pushed to.
-    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
-    x, loose_x = _followed(
-        x, still * recorded(arrays, "x"), noise[..., CHANNELS.index("x")], arrays.pushed,
-        parts.reshape(*x.shape, -1),
-    )  # fmt: skip
-    y, loose_y = in_grip(y, closed * world.ground, "y", arrays, noise, world)
+    there = arrays.there[..., :4]
+    weight_of = np.stack([still, closed * world.ground, held, closed * held], -1) * there
+    sd = np.sqrt(np.square(noise[..., :4]) + _doubt(world, firm))
+    geometry, loose, unseen = in_grip(
+        np.stack([x, y, distance, offset], -1) + world.off, weight_of, sd, firm, world, arrays
+    )
+    factor = loose * np.square(sd / noise[..., :4])
 
     acceleration, _ = fivepoint(world, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
@@ -343,31 +348,22 @@ def residuals(
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     speeds = _compact(mean_v) - gradient(world.t, mean_p)
-    geometry = np.stack([x, y, distance * held, offset], -1)
     # In the units of what was recorded: an effect must not gain by scaling the noise down.
     size = np.mean(world.link)
-    loose = np.stack([loose_x, loose_y, np.ones_like(x), loose_offset], -1)
-    factor = loose + _doubt(world, firm) / np.square(noise[..., :4])
     return (
         np.concatenate([geometry / size, speeds / size, forces], -1),
         np.concatenate([factor, np.ones_like(speeds), 1 + either / np.square(noise[..., 6:])], -1),
+        unseen,
     )
 
 
 def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
-    """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of angles and forces."""
-    if not (world.doubt_joints.any() or world.modes[LATE] or world.modes[SMOOTH]):
+    """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of forces."""
+    if not (world.modes[LATE] or world.modes[SMOOTH]):
         return np.zeros((*firm.shape, 4))
-    turn_x, turn_y = (np.where(world.jointed > 0.5, turn, 0.0) for turn in swung(world))
     pads = doubt_between(world)
-
-    def finger(turn: np.ndarray, give: np.ndarray, force: int) -> tuple[np.ndarray, np.ndarray]:
-        place = np.square(turn) * world.doubt_joints
-        pad = pads[..., force::2] * np.square(give)
-        return (place[..., :2].sum(-1) + pad[..., 0]), (place[..., 2:].sum(-1) + pad[..., 1])
-
-    (x1, x2), (y1, y2) = finger(turn_x, world.give_normal, 0), finger(turn_y, world.give_shear, 1)
-    x, y = x1 + x2, y1 + y2
+    x = (pads[..., ::2] * np.square(world.give_normal)).sum(-1)
+    y = (pads[..., 1::2] * np.square(world.give_shear)).sum(-1)
     return np.stack([x / 4, y / 4, x, y], -1) * np.square(firm)[..., None]
 
 

@@ -79,7 +79,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
     what swings with it has no size.
     """
-    every, usual = starts(given, key, healthy.u), healthy.push
+    every, usual = starts(given, key, neutral(given)), healthy.push
     ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < PROMISING:
         return fit(given, ranked[0][2], 0, usual)
@@ -223,7 +223,7 @@ def search(
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
         aligned, misled = _aligned_all(aligned, actual, keys)
-    aligned, warnings = _complete(aligned)
+    every, aligned = aligned, _complete(aligned)
     if identified is None and not _all_measured(aligned, actual):
         tell("identifying properties")
         identified = identify_aligned(aligned).centres
@@ -234,7 +234,7 @@ def search(
     fits = [best_fit(given, key, healthy) for key in keys]
     others = redrawn(given) if noisy else ()
     for _ in range(ROUNDS if noisy else 0):
-        again = _anew(aligned, given, healthy, fits, others)
+        again = _anew(every, aligned, given, healthy, fits, others)
         if again is None:
             break
         tell("aligning again without the best explanation")
@@ -242,8 +242,8 @@ def search(
         others = redrawn(given)
     scattering = scatters(given, given.nuisances.left(healthy.residual), names)
     gap = gap_of(given, healthy, fits, scattering, others)
-    if of_wrist(trials):
-        warnings = [not_compared(trials), *warnings]
+    warnings = [not_compared(trials)] if of_wrist(trials) else []
+    warnings += _failures(every, aligned)
     return Search(aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
                   identified, (*misled, *warnings))  # fmt: skip
 
@@ -255,28 +255,46 @@ def _all_measured(aligned: AlignedTrials, actual: dict | None) -> bool:
 
 
 def _anew(
+    every: AlignedTrials,
     aligned: AlignedTrials,
     given: Problem,
     healthy: Fitted,
     fits: Sequence[Fitted],
     others: Sequence[Problem],
 ):
-    """Everything once more with boundaries from forces without the best explanation, if that fits better.
+    """Everything once more with boundaries from signals without the best explanation, if that fits better, or
+    if more of `every` trial then fits its task.
 
-    Late, slow or soft contacts displace boundaries.
+    Late, slow or soft contacts displace boundaries, and what displaces fingers may look like a dropped block.
     """
     best = _known(fits)[0]
     gained = healthy.cost - best.cost
     if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
         return None
-    again = realigned(aligned, given, best)
-    if not SHIFT < moved(aligned, again) < np.inf:
-        return None
-    other = with_nuisances(rebased(build(again), given))
-    if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
-        return None
+    again = _recovered(every, aligned, given, best)
+    if again is None:
+        again = realigned(aligned, given, best)
+        if not SHIFT < moved(aligned, again) < np.inf:
+            return None
+        other = with_nuisances(rebased(build(again), given))
+        if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
+            return None
+    else:
+        other = with_nuisances(rebased(build(again), given))
     plain = fit(other, Start((), healthy.u))
     return again, other, plain, [fit(other, Start(f.effects, f.u), usual=plain.push) for f in fits]
+
+
+def _recovered(
+    every: AlignedTrials, aligned: AlignedTrials, given: Problem, best: Fitted
+) -> AlignedTrials | None:
+    """The trials that fit their task once the best explanation has been taken out, if these are more."""
+    if len(aligned.trials) == len(every.trials):
+        return None
+    forced = align([one.trial for one in every.trials], every.task, every.rig, all_fit=True)
+    again = realigned(forced, rebased(build(forced), given), best)
+    fit_now = tuple(one for one in again.trials if one.segmentation.failed is None)
+    return replace(again, trials=fit_now) if len(fit_now) > len(aligned.trials) else None
 
 
 def _known(fits: Sequence[Fitted]) -> list[Fitted]:
@@ -308,10 +326,20 @@ def _aligned_all(
     return failed, []
 
 
-def _complete(aligned: AlignedTrials) -> tuple[AlignedTrials, list[str]]:
-    """The trials that fit their task, and warnings of the others."""
-    failed = [(one.trial, one.segmentation.failed) for one in aligned.trials if one.segmentation.failed]
+def _complete(aligned: AlignedTrials) -> AlignedTrials:
+    """The trials that fit their task."""
     keep = tuple(one for one in aligned.trials if one.segmentation.failed is None)
     if not keep:
-        raise InputError(failed[0][0].file, str(failed[0][1]), "a recording that shows every subtask")
-    return replace(aligned, trials=keep), [f"{t.name}: {why}; left out" for t, why in failed]
+        one = aligned.trials[0]
+        raise InputError(one.trial.file, str(one.segmentation.failed), "a recording that shows every subtask")
+    return replace(aligned, trials=keep)
+
+
+def _failures(every: AlignedTrials, aligned: AlignedTrials) -> list[str]:
+    """A warning of each trial that did not fit its task at first: whether it is left out."""
+    kept, out = {one.trial.name for one in aligned.trials}, []
+    for one in every.trials:
+        if one.segmentation.failed is not None:
+            what = "left out" if one.trial.name not in kept else "without the best explanation it fits"
+            out.append(f"{one.trial.name}: {one.segmentation.failed}; {what}")
+    return out

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hmmseg.cache import cache_folder, keep_value, kept_value
+from hmmseg.cache import cache_folder, keep_numbers, kept_numbers
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -150,7 +150,7 @@ def twin_statistics(
     """
     frame = found.problem.frame
     file = _file(found.trials, frame.task, frame.rig, actual, seed)
-    known: list[float] = kept_value(file) or []
+    known = kept_numbers(file)
     yield from known
     start = 0
     for size in BATCHES:
@@ -171,7 +171,7 @@ def twin_statistics(
                 most = healthy_statistic(twin, actual, found.identified, noisy=False)
                 sure = most <= 0 or clear(value, most)  # what is no sign of a gap counts as nothing
                 known.append(most if sure else healthy_statistic(twin, actual, found.identified))
-                keep_value(file, known)
+                keep_numbers(file, known)
                 yield known[-1]
 
 
@@ -281,4 +281,4 @@ def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | Non
     more = (repr(task), rig.model_dump_json(), repr(actual), str(seed), source_digest())
     digest.update("\n".join(more).encode())
     folder = cache_folder()
-    return None if folder is None else folder / "twins" / f"{digest.hexdigest()[:24]}.npz"
+    return None if folder is None else folder / "twins" / f"{digest.hexdigest()[:24]}.json"

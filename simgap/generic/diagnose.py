@@ -6,7 +6,7 @@ ways in which whole trials differ (offset, slope, size, time) and an autocorrela
 & Ware, Biometrics 38, 1982) by moments. Rows are whitened by its symmetric root, which leaves every row
 closest to its own feature (Kessy, Lewin & Strimmer, Am. Stat. 72, 2018). All real trials share the error of
 the simulated mean, S trials of covariance B: for R real ones of covariance A, rows are whitened by
-A + B R / S, so that their mean is known as well as it is; their mean square, less than one, is in `told`.
+A + B R / S, so that their mean is known as well as it is; `Block.expected` has their mean square, below one.
 
 Whether there is a gap is judged by exchanging the labels real and simulated (Besag & Clifford, Biometrika 78,
 1991): exchanged trials are healthy twins.
@@ -24,14 +24,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.rig import Rig
-from hmmseg.io.task import BlockTask, SequenceTask
-from hmmseg.io.trial import Trial
-from hmmseg.sequence.model import SequenceModel
 from simgap.attribution.attribute import Attribution, attribute
 from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Candidate, Gap, Rows
-from simgap.attribution.search import detected, sought, statistic
+from simgap.attribution.search import sought, statistic
 from simgap.attribution.verdict import ALARM, entries, log_odds, rows
 from simgap.channels import delayed
 from simgap.effect import Parameter
@@ -41,8 +37,6 @@ from simgap.generic.trials import (
     SLOW,
     Ensembles,
     Layout,
-    align,
-    align_block_trials,
     bin_edges,
     both,
     layout,
@@ -84,54 +78,26 @@ class GenericDiagnosis:
 
 
 def diagnose(
-    real: Sequence[Trial],
-    sim: Sequence[Trial],
-    task: SequenceTask,
-    model: SequenceModel | None = None,
-    forced: Sequence[str] = (),
-    seed: int = 0,
-    progress: Progress | None = None,
-    boundaries: Mapping[str, np.ndarray] | None = None,
+    ensembles: Ensembles, forced: Sequence[str] = (), seed: int = 0, tell: Progress = silent
 ) -> GenericDiagnosis:
-    """Diagnose real trials against simulated ones of the same plain ordered task.
+    """Diagnose real trials against simulated ones of the same task.
 
-    `boundaries` [s] by file (one fewer than subtasks, or as many with the end of what is compared) take the
-    place of the HMM; `forced` names effects to be taken instead of choosing. InputError where a kind has no
-    trial that shows the whole task.
+    Args:
+        ensembles: Both kinds of trials, cut into subtasks (`simgap.generic.trials`).
+        forced: Effects to be taken instead of choosing.
+        seed: Of the exchanged labels.
+        tell: Called with a description of each stage.
+
+    Returns:
+        The document, and what its figures are drawn from.
+
+    Raises:
+        InputError: A forced effect is unknown, or one that only the virtual model has.
     """
-    tell = progress or silent
-    _check(forced)
-    tell("aligning trials")
-    return diagnosed(align(real, sim, task, model, boundaries), forced, seed, tell)
-
-
-def diagnose_blocks(
-    real: Sequence[Trial],
-    sim: Sequence[Trial],
-    task: BlockTask,
-    rig: Rig,
-    forced: Sequence[str] = (),
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> GenericDiagnosis:
-    """The same of a block task, its channels the task-space ones."""
-    tell = progress or silent
-    _check(forced)
-    tell("aligning trials")
-    return diagnosed(align_block_trials(real, sim, task, rig), forced, seed, tell)
-
-
-def _check(forced: Sequence[str]) -> None:
     for name in forced:
         if name not in effects():
             raise InputError(f"effect {name!r}", "needs the virtual model or is unknown",
                              nearest(name, list(effects())))  # fmt: skip
-
-
-def diagnosed(
-    ensembles: Ensembles, forced: Sequence[str] = (), seed: int = 0, tell: Progress = silent
-) -> GenericDiagnosis:
-    """Diagnose ensembles that are cut already."""
     lay = layout(ensembles)
     real, sim = both(lay)
     given = scene(lay)
@@ -164,15 +130,6 @@ def searched(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[tuple[Blo
     )
 
 
-def detect(ensembles: Ensembles, seed: int = 0) -> float:
-    """The p-value of any gap between ensembles that are cut already, and nothing else."""
-    lay = layout(ensembles)
-    given, (real, sim) = scene(lay), both(lay)
-    given = replace(given, ring=find_ring(given))
-    value = statistic(forms(searched(given, real, sim)[1]))
-    return detected(value, _exchanged(given, real, sim, seed) if value > NIL else ()).p_value
-
-
 def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> Iterator[float]:
     """The statistic where other trials are called real; the courses that effects act on stay as they are."""
     every, count = np.concatenate([real, sim]), len(real)
@@ -197,7 +154,7 @@ class Block:
     index: np.ndarray
     root: np.ndarray
     variance: np.ndarray
-    told: np.ndarray
+    expected: np.ndarray
     trials: int
 
 
@@ -213,8 +170,8 @@ def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Block, .
         of_row = a + b * len(real) / len(sim)
         values, vectors = np.linalg.eigh(of_row)
         root = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))) @ vectors.T
-        told = np.einsum("ij,jk,ik->i", root, a + b / len(sim), root)
-        out.append(Block(c, index, root, np.diag(of_row), told, len(real)))
+        expected = np.einsum("ij,jk,ik->i", root, a + b / len(sim), root)
+        out.append(Block(c, index, root, np.diag(of_row), expected, len(real)))
     return tuple(out)
 
 
@@ -287,12 +244,12 @@ def gap_of(
         np.tile(time, count), tuple(cut.trial.file for cut in lay.ensembles.real[:count]),
         (*names, *(n + POWER for n in names), DURATIONS), lay.ensembles.subtasks,
     )  # fmt: skip
-    told = np.zeros(lay.kind.size)
+    expected = np.zeros(lay.kind.size)
     for block in white:
-        told[block.index] = block.told
+        expected[block.index] = block.expected
     residual = np.concatenate([_whitened(white, row) for row in real - sim.mean(0)])
     return Gap(parts, residual, np.zeros((residual.size, 0)), tuple(candidates),
-               told=np.tile(told, count), parts_alike=True)  # fmt: skip
+               told=np.tile(expected, count), parts_alike=True)  # fmt: skip
 
 
 def _whitened(white: Sequence[Block], values: np.ndarray) -> np.ndarray:

@@ -275,9 +275,7 @@ RINGS = 0.2  # chosen: share of the square after an event that an oscillation mu
 
 @dataclass(frozen=True)
 class Ring:
-    """`frequency` [Hz], `damping` (ratio to critical) with standard errors and 90 % intervals;
-    `amplitude` (n,) of each trial at the start; `share` of the square about the parabola explained;
-    `resolved`: whether the best frequency lies inside the range looked at and the damping is light."""
+    """`frequency` [Hz] and `damping` (ratio to critical) with standard errors and 90 % intervals."""
 
     frequency: float
     damping: float
@@ -285,16 +283,15 @@ class Ring:
     damping_sd: float
     frequency_90: tuple[float, float]
     damping_90: tuple[float, float]
-    amplitude: np.ndarray
-    share: float
-    resolved: bool = True
 
 
 def find_ring(given: Scene) -> Ring | None:
-    """The strongest oscillation after an event in the real trials, where they hold more power; after the last
-    from as long as all of them go on, for what is compared may end sooner."""
-    lay, best, windows = given.layout, 0.0, None
+    """The strongest oscillation after an event in the real trials, where they hold more power than the
+    simulated ones; after the last event from as long as all of them go on, for what is compared may end
+    sooner."""
+    lay, best, found = given.layout, 0.0, None
     last = len(lay.ensembles.subtasks) - 1
+    longest = min(c.trial.t[-1] - c.edges[-2] for c in lay.ensembles.real)
     for k in range(1, last + 1):
         for c, name in enumerate(lay.ensembles.channels):
             real, sim = (np.array([windowed(lay, cut, c, k) for cut in kind])
@@ -302,20 +299,17 @@ def find_ring(given: Scene) -> Ring | None:
             if real.shape[1] < 4 * LEAST or real.var(1).mean() < sim.var(1).mean():
                 continue
             rest = real - sim.mean(0)  # what the simulation has is no ring
-            here = from_swing(list(rest if rest.var(1).mean() < real.var(1).mean() else real))
-            longest = min(c.trial.t[-1] - c.edges[-2] for c in lay.ensembles.real)
+            windows = list(rest if rest.var(1).mean() < real.var(1).mean() else real)
             if k == last and longest > given.edges[-1] - given.edges[-2] + 0.5 / lay.rate:
-                here = from_swing([
-                    resampled(c.trial.t, c.trial.channels[name],
-                              np.arange(c.edges[-2], c.edges[-2] + longest, 1 / lay.rate), lay.rate)
-                    for c in lay.ensembles.real
-                ])  # fmt: skip
-            _, _, share, square = screen(here, lay.rate)
-            strength = square * here.shape[1] / lay.scale[c] ** 2
+                since = np.arange(0.0, longest, 1 / lay.rate)
+                windows = [resampled(cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since, lay.rate)
+                           for cut in lay.ensembles.real]  # fmt: skip
+            swings = from_swing(windows)
+            share = 1 - _screened(swings, lay.rate)[2]
+            strength = share * np.square(_detrended(swings)).sum() / (len(swings) * lay.scale[c] ** 2)
             if share > RINGS and strength > best:
-                best, windows = strength, here
-    found = None if windows is None else fit_ring(windows, lay.rate)
-    return found if found is not None and found.resolved else None
+                best, found = strength, swings
+    return None if found is None else fit_ring(found, lay.rate)
 
 
 def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
@@ -331,67 +325,63 @@ def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([v[:n] for v in cut])
 
 
-def _range(length: int, rate: float) -> tuple[float, float] | None:
-    """Lowest and highest frequency [Hz] that windows of so many samples tell; None where none."""
-    low, high = PERIODS * rate / max(length, 1), HIGHEST * rate
-    return (low, high) if length >= SHORTEST and low < high else None
-
-
-def screen(windows: np.ndarray, rate: float) -> tuple[float, float, float, float]:
-    """Best frequency [Hz] and damping on a grid, the share of the square about the parabola explained and
-    its mean square; zeros where windows are too short."""
-    edges = _range(windows.shape[1], rate)
-    if edges is None:
-        return np.nan, np.nan, 0.0, 0.0
-    grid = [(f, z) for f in np.geomspace(*edges, FREQUENCIES) for z in DAMPINGS]
-    shares = [1 - _left(windows, rate, *g)[0] for g in grid]
-    best = int(np.argmax(shares))
-    t = np.linspace(-1, 1, windows.shape[1])
-    plain = windows.T - _fitted(np.stack([np.ones_like(t), t, t**2], 1), windows.T)
-    return *grid[best], float(shares[best]), float(shares[best] * (plain**2).mean())
-
-
 def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
-    """A ring common to windows (trials, n) of samples at `rate` [Hz]; None where they are too short."""
-    edges, start = _range(windows.shape[1], rate), screen(windows, rate)
-    if edges is None:
+    """The ring common to several windows.
+
+    Args:
+        windows: Samples (trials, n), from a swing on.
+        rate: Of the samples [Hz].
+
+    Returns:
+        The ring; None where windows are too short, or the best frequency lies at an end of the range that
+        they resolve, or the best damping is none of a ring.
+    """
+    low, high = PERIODS * rate / max(windows.shape[1], 1), HIGHEST * rate
+    ends = np.log([(low, high), (LIGHTEST, HEAVIEST)])
+
+    def refined(windows: np.ndarray, start: Sequence[float]) -> np.ndarray:
+        return minimize(
+            lambda u: np.log(_left(windows, rate, *np.exp(u))), np.log(start), method="Nelder-Mead",
+            bounds=[*map(tuple, ends)], options={"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
+        ).x  # fmt: skip
+
+    *start, left = _screened(windows, rate)
+    if left == 1.0:
         return None
-
-    def refined(windows: np.ndarray, start: tuple[float, float]) -> tuple[float, float]:
-        found = minimize(
-            lambda u: np.log(_left(windows, rate, *np.exp(u))[0]), np.log(start), method="Nelder-Mead",
-            bounds=[tuple(np.log(edges)), (np.log(LIGHTEST), np.log(HEAVIEST))],
-            options={"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
-        )  # fmt: skip
-        return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
-
-    best = refined(windows, start[:2])
-    left, amplitude = _left(windows, rate, *best)
-    inside = edges[0] * 1.01 < best[0] < edges[1] * 0.99 and 1.01 * LIGHTEST < best[1] < 0.99 * HEAVIEST
-    n, sd, reach = len(windows), np.full(2, np.nan), np.nan
+    best, n = refined(windows, start), len(windows)
+    if (np.abs(best[:, None] - ends) < 0.01).any():
+        return None
+    sd, reach = np.full(2, np.nan), np.nan
     if n > 1:
-        logs = np.log([refined(np.delete(windows, i, 0), best) for i in range(n)])  # both are positive
-        sd = np.sqrt((n - 1) / n * ((logs - logs.mean(0)) ** 2).sum(0))
+        each = np.array([refined(np.delete(windows, i, 0), np.exp(best)) for i in range(n)])
+        sd = np.sqrt((n - 1) / n * ((each - each.mean(0)) ** 2).sum(0))
         reach = -float(stdtrit(n - 1, 0.05))
-    low, high = best * np.exp(-reach * sd), best * np.exp(reach * sd)
-    return Ring(*best, float(best[0] * sd[0]), float(best[1] * sd[1]), (float(low[0]), float(high[0])),
-                (float(low[1]), float(high[1])), amplitude, 1 - left, inside)  # fmt: skip
+    (f, z), (f_sd, z_sd) = map(float, np.exp(best)), map(float, np.exp(best) * sd)
+    f_90, z_90 = ((float(a), float(b)) for a, b in np.exp(best + np.outer([-reach, reach], sd)).T)
+    return Ring(f, z, f_sd, z_sd, f_90, z_90)
 
 
-def _left(windows: np.ndarray, rate: float, frequency: float, damping: float) -> tuple[float, np.ndarray]:
-    """Share of the squares about each window's parabola that a ring leaves; amplitudes (trials,)."""
-    t = np.arange(windows.shape[1]) / rate
-    s = 2 * t / t[-1] - 1
-    parabola = np.stack([np.ones_like(s), s, s**2], 1)
-    plain = windows.T - _fitted(parabola, windows.T)
-    omega = 2 * np.pi * frequency
-    decay = np.exp(-damping * omega * t)
-    wave = np.stack([decay * np.sin(omega * t), decay * np.cos(omega * t)], 1)
-    basis = np.concatenate([parabola, wave], 1)
-    found = np.linalg.lstsq(basis, windows.T, rcond=None)[0]
-    size = np.maximum((plain**2).sum(0), 1e-300)  # each trial counts alike
-    return float((((windows.T - basis @ found) ** 2).sum(0) / size).mean()) + 1e-300, np.hypot(*found[3:])
+def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
+    """Best frequency [Hz] and damping on a grid, and the share of the square about each window's parabola
+    that they leave: 1 where windows are too short."""
+    low, high = PERIODS * rate / max(windows.shape[1], 1), HIGHEST * rate
+    if windows.shape[1] < SHORTEST or low >= high:
+        return np.nan, np.nan, 1.0
+    grid = [(f, z) for f in np.geomspace(low, high, FREQUENCIES) for z in DAMPINGS]
+    left, place = min((_left(windows, rate, *g), g) for g in grid)
+    return *place, left
 
 
-def _fitted(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+def _left(windows: np.ndarray, rate: float, frequency: float, damping: float) -> float:
+    """Share of the square about each window's parabola that a ring leaves, mean over trials."""
+    angle = 2 * np.pi * frequency * np.arange(windows.shape[1]) / rate
+    waves = np.exp(-damping * angle) * np.array([np.sin(angle), np.cos(angle)])
+    basis, rest = np.linalg.qr(_detrended(waves).T)[0], _detrended(windows)
+    size = np.maximum(np.square(rest).sum(1), 1e-300)  # each trial counts alike
+    return max(1 - float((np.square(rest @ basis).sum(1) / size).mean()), 1e-300)
+
+
+def _detrended(windows: np.ndarray) -> np.ndarray:
+    """Windows (trials, n) without the parabola that fits each best."""
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, windows.shape[1]), 3))[0]
+    return windows - windows @ basis @ basis.T

@@ -72,11 +72,24 @@ def align(
     model: SequenceModel | None = None,
     boundaries: Mapping[str, np.ndarray] | None = None,
 ) -> Ensembles:
-    """Both kinds of trials cut at given boundaries [s] by file, or by the task's HMM.
+    """Cut both kinds of trials into the subtasks of a plain ordered task.
 
-    Without a model one is learned from all trials together, every channel first brought to the median and
-    spread of its own kind: a bias or a gain between the kinds must not displace boundaries. InputError
-    where a kind has no complete trial or there are too few trials to know how trials scatter.
+    Args:
+        real: Recorded trials.
+        sim: Simulated ones.
+        task: Their task.
+        model: Emissions and durations; without them they are learned from all trials together, every channel
+            first brought to the median and spread of its own kind: a bias or a gain between the kinds must
+            not displace boundaries.
+        boundaries: By file the boundaries [s], one fewer than subtasks, or as many with the end of what is
+            compared; they replace the HMM.
+
+    Returns:
+        The cut trials; those that do not fit the task are left out, with a warning.
+
+    Raises:
+        InputError: A kind has no complete trial, a trial lacks a channel, boundaries are none of the task, or
+            there are too few trials to know how they scatter.
     """
     every, channels = [*real, *sim], _channels([*real, *sim], task)
     if boundaries is not None:
@@ -99,9 +112,19 @@ def align(
 
 
 def align_block_trials(real: Sequence[Trial], sim: Sequence[Trial], task: BlockTask, rig: Rig) -> Ensembles:
-    """Trials of a block task in task space, cut at contact changes, each kind aligned by its own fit.
+    """Cut trials of a block task at contact changes, each kind aligned by its own fit.
 
-    InputError where a kind has no complete trial.
+    Args:
+        real: Recorded trials.
+        sim: Simulated ones.
+        task: Their task.
+        rig: The nominal hand of both.
+
+    Returns:
+        The cut trials, whose channels are those of task space.
+
+    Raises:
+        InputError: A kind has no trial that shows the whole task.
     """
     kinds: tuple[list[Cut], list[Cut]] = [], []
     warnings, names = [], ()
@@ -266,7 +289,7 @@ def transformed(values: np.ndarray) -> np.ndarray:
 def windowed(
     given: Layout, cut: Cut, channel: int, subtask: int, values: np.ndarray | None = None
 ) -> np.ndarray:
-    """Samples (window,) of a channel from a subtask's start on, or of `values` in its stead."""
+    """Samples (window,) of a channel from a subtask's start on, or of other `values` at its times."""
     n, t = int(given.window[subtask]), cut.trial.t
     if values is None:
         values = cut.trial.channels[given.ensembles.channels[channel]]

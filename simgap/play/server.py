@@ -24,8 +24,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from hmmseg.errors import InputError
-from simgap.play.felt import effect_values, felt_effects
 from simgap.play.session import Session
+from simgap.play.world import effect_values, felt_effects
 
 HOST = "127.0.0.1"
 FRAME = 1 / 60  # look: s
@@ -97,7 +97,7 @@ class PlayServer:
             drawing = asyncio.create_task(self._draw(connection))
             try:
                 async for message in connection:
-                    answer = await self._told(message)
+                    answer = await self._handled(message)
                     if answer is not None:
                         await connection.send(json.dumps(answer))
             finally:
@@ -124,20 +124,20 @@ class PlayServer:
             await connection.send(json.dumps(self.session.frame()))
             await asyncio.sleep(max(FRAME - (time.monotonic() - now), 0.001))
 
-    async def _told(self, message: str | bytes) -> dict[str, Any] | None:
-        """What a message of the page does; what cannot be read is answered so and changes nothing."""
+    async def _handled(self, message: str | bytes) -> dict[str, Any] | None:
+        """Act on a message of the page; one that cannot be read changes nothing and is answered so."""
         try:
-            asked = json.loads(message)
-            kind = asked["kind"]
+            request = json.loads(message)
+            kind = request["kind"]
             if kind == "aim":
-                grip = float(asked.get("grip", 3.0))
-                self.session.aim(float(asked["x"]), float(asked["y"]), asked["closed"] is True, grip)
+                grip = float(request.get("grip", 3.0))
+                self.session.aim(float(request["x"]), float(request["y"]), request["closed"] is True, grip)
             elif kind == "touch":
-                self.session.touch(np.array(asked["tips"], float))
+                self.session.touch(np.array(request["tips"], float))
             elif kind == "reset":
                 self.session.reset()
             elif kind == "effect":
-                return await self._change(asked["name"])
+                return await self._change(request["name"])
             elif kind == "save":
                 return self._save()
             else:
@@ -153,7 +153,7 @@ class PlayServer:
         world = None
         if name is not None:  # compiled while the page goes on
             world = await asyncio.to_thread(self.session.world_with, {name: effect_values(name)})
-        self.session.beside(world)
+        self.session.compare_with(world)
         return self._scene()
 
     def _save(self) -> dict[str, Any]:

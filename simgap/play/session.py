@@ -69,7 +69,7 @@ class Session:
         """Another world with these effects, ready to run next to the nominal one."""
         return PlayedWorld(self.task, self.rig, self.blocks, self.x, self.nominal.start, effects)
 
-    def beside(self, world: PlayedWorld | None) -> None:
+    def compare_with(self, world: PlayedWorld | None) -> None:
         """Run another world next to the nominal one, or none; both restart."""
         self.other = world
         self.reset()

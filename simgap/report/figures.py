@@ -1,4 +1,5 @@
-"""Figures of a diagnosis, drawn from its JSON: where, which suspects, how far; and one signal."""
+"""Figures of a diagnosis: of its JSON where, which suspects, how far; of signals the recorded, simulated and
+corrected course where they part most."""
 
 from __future__ import annotations
 
@@ -9,8 +10,14 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hmmseg.plot.style import BLUE, GREY, RED, canvas
+from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
+from simgap.gap.diagnose import Diagnosis
+from simgap.generic.diagnose import GenericDiagnosis
+from simgap.generic.trials import SLOW, bin_edges
 from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
+from simgap.report.robot import Course, Own, courses
+from simgap.robots.changes import Changes
+from simgap.robots.diagnose import RobotDiagnosis
 
 Body = Mapping[str, Any]
 
@@ -91,3 +98,160 @@ def draw_how_far(body: Body, path: Path) -> None:
             axes.set_xscale("log")
         axes.set_xlabel(f"mean squared residual on {s['evaluated_on']} [noise variances]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))  # above the bars, which reach the edge
+
+
+def _unit(channel: str) -> tuple[float, str]:
+    """How a channel of task space is shown: a factor, and its label."""
+    if channel in ("fx", "fy", "grip", "shear"):
+        return 1.0, f"{'net ' if channel.startswith('f') else ''}{channel} [N]"
+    return 100.0, f"{channel} [cm{'/s' if channel.startswith('v') else ''}]"
+
+
+def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
+    """A recorded signal in task space, SI."""
+    from simgap.effects.base import tips
+
+    world = found.problem.frame.world
+    (x1, y1, x2, y2), (vx1, vy1, vx2, vy2) = (each[trial].T for each in tips(world))
+    fx1, fy1, fx2, fy2 = world.force[trial].T
+    return {
+        "x": (x1 + x2) / 2, "y": (y1 + y2) / 2, "distance": x2 - x1, "offset": y2 - y1,
+        "vx": (vx1 + vx2) / 2, "vy": (vy1 + vy2) / 2, "fx": fx1 + fx2, "fy": fy1 + fy2,
+        "grip": np.minimum(fx1, -fx2), "shear": (fy1 - fy2) / 2,
+    }[channel]  # fmt: skip
+
+
+def draw_signal(found: Diagnosis, path: Path) -> None:
+    """The channel and trial of the largest excess: the signal, and its whitened residual beneath."""
+    frame = found.problem.frame
+    cell = max(found.cells, key=lambda c: c.energy - c.count)
+    r, c, n = cell.trial, list(CHANNELS).index(cell.channel), frame.lengths[cell.trial]
+    t, there = frame.world.t[r, :n], found.problem.whitening.weight[r, :n, c] > 0
+    with canvas(path, height=3.4) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        factor, label = _unit(cell.channel)
+        recorded = _recorded(found, r, cell.channel)[:n]
+        above.plot(t, factor * recorded, color="black", lw=1.2, label="recorded")
+        off = found.problem.whitening.weight[r, :n, c]
+        for residual, colour, name in ((found.before, RED, "simulated"), (found.after, BLUE, "corrected")):
+            left = np.divide(residual[r, :n, c], off, out=np.full(n, np.nan), where=off > 0)
+            above.plot(t, factor * (recorded - left), ".", color=colour, ms=2, label=name)
+        above.set_ylabel(label)
+        above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+        inside = t[frame.arrays.subtask[r, :n] == cell.subtask]
+        for axes in (above, below):
+            for event in frame.world.events[r]:
+                axes.axvline(event, color=GREY, lw=0.5)
+            axes.axvspan(inside[0], inside[-1], color=ORANGE, alpha=0.2, lw=0)
+        below.plot(t[there], found.before[r, :n, c][there], ".", color=RED, ms=3)
+        below.plot(t[there], found.after[r, :n, c][there], ".", color=BLUE, ms=3)
+        below.set_yscale("symlog", linthresh=3)
+        below.set(xlabel="time [s]", ylabel="residual [sd]")
+        above.set_title(f"{cell.channel} in {frame.files[r]}, largest gap shaded", loc="left")
+
+
+def draw_generic(found: GenericDiagnosis, path: Path) -> None:
+    """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
+    lay = found.scene.layout
+    excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
+    courses = [(c, k) for c in range(len(lay.ensembles.channels)) for k in range(len(lay.ensembles.subtasks))]
+    channel, worst = max(courses, key=lambda cell: excess[lay.where(SLOW, *cell)].mean())
+    index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
+    ends = found.scene.edges
+    edges = [bin_edges(lay, ends[k], ends[k + 1], k) for k in range(ends.size - 1)]
+    t = np.concatenate([(e[1:] + e[:-1]) / 2 for e in edges])
+    real, sim = found.real[:, index], found.sim[:, index]
+    with canvas(path, height=3.8) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        for rows, colour, label in ((real, RED, "real"), (sim, BLUE, "simulated")):
+            above.plot(t, rows.T, color=colour, lw=0.5, alpha=0.35)
+            above.plot(t, rows.mean(0), color=colour, lw=1.4, label=label)
+        moved = sim.mean(0) + found.shift[index]
+        if found.leading:
+            what = " + ".join(found.leading)
+            above.plot(t, moved, color="black", lw=1, ls="--", label=f"corrected: {what}")
+        above.legend(fontsize=6.5)
+        above.set_ylabel(lay.ensembles.channels[channel])
+        sd = np.sqrt(found.variance[index])
+        below.plot(t, (real.mean(0) - sim.mean(0)) / sd, ".-", color=RED, ms=3, lw=0.6, label="before")
+        below.plot(t, (real.mean(0) - moved) / sd, ".-", color=BLUE, ms=3, lw=0.6, label="after")
+        below.set_yscale("symlog", linthresh=3)
+        below.set(xlabel="time [s], subtasks at their mean real durations", ylabel="residual [sd]")
+        below.legend()
+        for axes in (above, below):
+            for edge in found.scene.edges[1:-1]:
+                axes.axvline(edge, color=GREY, lw=0.5)
+            axes.axvspan(*found.scene.edges[worst : worst + 2], color="#E69F00", alpha=0.15, lw=0)
+        above.set_title(f"Largest difference of a course: {lay.ensembles.channels[channel]} (shaded subtask)")
+
+
+Robot = RobotDiagnosis | Changes
+
+
+def draw_robot(
+    found: Robot, body: dict[str, Any], own: Mapping[str, Own], path: Callable[[str], Path]
+) -> None:
+    """All figures, at the paths that `path(name)` gives."""
+    if isinstance(found, RobotDiagnosis):
+        phases = sorted({cell["subtask"] for cell in body["where"]})
+        if phases:
+            draw_heat_map(body, phases, path("gap_where.png"))
+        draw_suspects(body, path("gap_probabilities.png"))
+    draw_robot_page(found, own, path)
+
+
+def draw_robot_page(found: Robot, own: Mapping[str, Own], path: Callable[[str], Path]) -> None:
+    """Those that a page shows next to its own tables."""
+    draw_course(max(courses(found, own), key=lambda c: c.over), found, path("gap_signal.png"))
+    if isinstance(found, RobotDiagnosis):
+        draw_before_after(found, path("gap_before_after.png"))
+
+
+def _short(name: str) -> str:
+    stem = Path(name).stem
+    return stem if len(stem) <= 22 else "…" + stem[-21:]
+
+
+def draw_course(one: Course, found: Robot, path: Path) -> None:
+    """Recorded, simulated and corrected, and what each leaves beneath."""
+    if isinstance(found, Changes):
+        names, how = ("as it was", "with what changed"), "run freely from its first sample"
+    else:
+        last = "with the causes, held out" if found.shrinkage is not None else "with what was fitted"
+        names, how = ("model as it came", last), "windows restarted from the recording"
+    with canvas(path, height=4.2) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        above.plot(one.t, one.recorded, color="black", lw=1.2, label="recorded")
+        for run, colour, name in zip((one.simulated, one.corrected), (RED, BLUE), names, strict=True):
+            above.plot(one.t, run, color=colour, lw=0.8, label=name)
+            below.plot(one.t, one.recorded - run, color=colour, lw=0.8)
+        above.set_ylabel(f"{one.channel} [{one.unit}]")
+        below.set(xlabel="time [s]", ylabel=f"residual [{one.unit}]")
+        below.axhline(0, color=GREY, lw=0.5)
+        above.legend(fontsize=6.5)
+        above.set_title(f"{_short(one.log)}: {how}")
+
+
+def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
+    """Root mean square residual by log, before and after, each log predicted from the others where that was
+    done."""
+    rows, far = found.composed.rows, found.shrinkage
+    both = (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
+    logs = [r.name for r in found.composed.recordings]
+    size = np.sqrt(rows.variance)
+    at = np.arange(len(logs))
+    with canvas(path, height=2.6) as figure:
+        axes = figure.add_subplot()
+        for place, residual, colour, name in zip(
+            (-0.2, 0.2), both, (RED, BLUE), ("before", "after"), strict=True
+        ):
+            each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
+            axes.bar(at + place, each, 0.4, color=colour, label=name)
+        axes.axhline(1, color=GREY, lw=0.8, ls="--")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
+        axes.set_ylabel("rms residual [sd of noise]")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+        axes.set_title("Held-out logs" if far is not None else "All logs")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
+from hmmseg.tables import listed
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from simgap.effects.base import HandEffect
 
 
@@ -346,10 +347,10 @@ def to_do(body: Body) -> list[str]:
     """What to check on the rig, the next experiment last."""
     suspects = [*body["causes"], *body["indistinguishable"]]
     out = checks(suspects)
-    asked = body.get("next_experiment")
-    if asked:
-        text = ", ".join(plain_name(n) for n in asked["separates"])
-        out.append(f"Record once more: {asked['do']}. That separates: {text}.")
+    following = body.get("next_experiment")
+    if following:
+        text = ", ".join(plain_name(n) for n in following["separates"])
+        out.append(f"Record once more: {following['do']}. That separates: {text}.")
     if body["verdict"] == "unknown" and body["where"]:
         (channel, subtask), *_ = by_place(body)
         what, at = CHANNELS.get(channel, channel), when(subtask)
@@ -370,37 +371,26 @@ def share_of(cells: Sequence[Mapping[str, Any]]) -> float:
     return float(sum(c["share"] for c in cells))
 
 
-def tables(body: Mapping[str, Any]) -> list[Table]:
-    """Probabilities, parameters of the cause and the largest cells, for people to read."""
-    likely = Table(title="probabilities", title_justify="left")
-    likely.add_column("candidate", no_wrap=True)
-    likely.add_column("probability", justify="right")
-    for name, value in sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]:
-        likely.add_row(name, f"{value:.3f}")
-    out = [likely]
+def tables(body: Body) -> list[Table]:
+    """Probabilities, the cause's parameters, the next experiment and the largest cells, for people."""
+    likely = sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]
+    rows = [(name, f"{value:.3f}") for name, value in likely]
+    out = [listed("probabilities", ("candidate", "probability"), rows, right=["probability"])]
     if body["causes"]:
-        values = Table(title="parameters", title_justify="left")
-        for head in ("parameter", "estimate", "90 % interval"):
-            values.add_column(head, no_wrap=True)
+        rows = []
         for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
-            low, high = p["interval_90"]
             shown = shown_as(p["unit"])
-            values.add_row(name, estimate(p["mean"], p["sd"], shown), interval(low, high, shown))
-        out.append(values)
-    if body["next_experiment"] is not None:
-        following = Table(title="next experiment", title_justify="left", show_header=False)
-        asked = body["next_experiment"]
-        gain = f"by {asked['expected_gain_nats']:.0f} nats at least"
-        following.add_row(asked["do"])
-        following.add_row(f"expected to separate {', '.join(asked['separates'])}, {gain}")
-        out.append(following)
+            rows.append((name, estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown)))
+        out.append(listed("parameters", ("parameter", "estimate", "90 % interval"), rows))
+    if (following := body["next_experiment"]) is not None:
+        gain = f"by {following['expected_gain_nats']:.0f} nats at least"
+        separates = f"expected to separate {', '.join(following['separates'])}, {gain}"
+        out.append(listed("next experiment", (), [(following["do"],), (separates,)]))
     if body["where"]:
-        cells = Table(title="where the gap is largest", title_justify="left")
-        for head in ("trial", "channel", "subtask", "band [Hz]", "share", "z"):
-            cells.add_column(head, no_wrap=True)
-        for row in body["where"][:8]:
-            low, high = row["band"]
-            numbers = f"{low:g}-{high:g}", f"{100 * row['share']:.0f} %", f"{row['z']:.1f}"
-            cells.add_row(row["trial"], row["channel"], row["subtask"], *numbers)
-        out.append(cells)
+        heads = ("trial", "channel", "subtask", "band [Hz]", "share", "z")
+        cells = [
+            (c["trial"], c["channel"], c["subtask"], f"{c['band'][0]:g}-{c['band'][1]:g}",
+             f"{100 * c['share']:.0f} %", f"{c['z']:.1f}") for c in body["where"][:8]
+        ]  # fmt: skip
+        out.append(listed("where the gap is largest", heads, cells))
     return out

@@ -1,4 +1,4 @@
-"""What the diagnosis asks of a simulator: its parameters, its channels, and to be run.
+"""What the diagnosis needs of a simulator: its parameters, its channels, and runs.
 
 A simulator is any object with `parameters`, `channels` and `simulate`; it need not inherit from anything
 here, and `parameters` and `channels` may hold plain dicts (`simgap.simulators.user` reads them).

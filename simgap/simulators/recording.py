@@ -52,13 +52,24 @@ def read_recording(
     path: Path, wanted: Iterable[str], times: str = "t", unit: float = 1.0, commands: Collection[str] = (),
     acts: str | None = None,
 ) -> Recording:  # fmt: skip
-    """Recording from a file of any kind with the columns that a simulator needs.
+    """Read the columns that a simulator needs from a file of any kind.
 
-    `times` is the name of the time column, `unit` its size [s]; `commands` are held from sample to sample.
-    Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept; a column
-    `acts`, where it is requested, says when each row's commands were given.
-    InputError names the file and the row or column at fault: a column that is missing, a cell that is no
-    number, a clock that goes back or cannot be in this unit.
+    Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept.
+
+    Args:
+        path: The file.
+        wanted: Names of its columns.
+        times: The column of times.
+        unit: Its unit [s].
+        commands: Columns that are held from sample to sample.
+        acts: Name of a further column, of the times [s] at which each row's commands were given, which is
+            added where rows differ in that.
+
+    Returns:
+        The recording.
+
+    Raises:
+        InputError: A column is missing, a cell is no number, or the clock goes back or has another unit.
     """
     names = tuple(dict.fromkeys(wanted))
     clock = {"t": Column.model_validate({"from": times, "unit": unit})}

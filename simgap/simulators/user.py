@@ -51,10 +51,17 @@ class UserSimulator:
 
 
 def load_simulator(spec: str) -> UserSimulator:
-    """The simulator NAME of a file, from `FILE.py:NAME`: an object, a class (made without arguments) or a
-    function with attributes `parameters` and `channels`.
+    """Load a simulator from a user's Python file.
 
-    InputError where the file or the name is missing, its code fails, or what it declares cannot be used.
+    Args:
+        spec: `FILE.py:NAME`; the name is of an object, a class (made without arguments) or a function with
+            attributes `parameters` and `channels`.
+
+    Returns:
+        The simulator, all its calls checked.
+
+    Raises:
+        InputError: The file or the name is missing, its code fails, or what it declares cannot be used.
     """
     file, _, name = spec.rpartition(":")
     where = f"--simulator {spec}"
@@ -149,9 +156,8 @@ class Checks:
         found = self.call(lambda: list(run(lent)))
         if len(found) != len(jobs):
             raise InputError(self.of(run), f"gave {len(found)} runs", f"{len(jobs)}, one for each job")
-        told = [None if f is None else self.given_back(run, f, j.recording)
+        return [None if f is None else finite(self.given_back(run, f, j.recording))
                 for f, j in zip(found, jobs, strict=True)]  # fmt: skip
-        return [None if f is None else finite(f) for f in told]
 
     def state_at(self, run: Callable[..., Any], recording: Recording, t: float) -> dict[str, Any]:
         """State name -> (value, standard deviation)."""

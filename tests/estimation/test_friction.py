@@ -73,9 +73,6 @@ def wander(rng: np.random.Generator, size: int) -> np.ndarray:
 NUM = int(5 * DURATION * RATE)
 
 
-# --- the bound ---
-
-
 @pytest.mark.parametrize("limit", [np.inf, 0.3])
 def test_lower_bound_covers_the_largest_true_ratio_and_is_close(limit):
     """The naive maximum exceeds the truth nearly always; the 5 % quantile hardly ever."""
@@ -139,9 +136,6 @@ def test_nothing_held_gives_a_reason():
     assert found.to_json() == {"unit": "1", "lower_bound": None}
 
 
-# --- slip ---
-
-
 def stretches(
     rng: np.random.Generator, num: int, mu: float | None, drift: float = 0.0, scale: float = 2.5e-5
 ) -> list[Stretch]:
@@ -201,9 +195,6 @@ def test_planted_slip_tells_mu():
     assert stuck.reason == "no finger was seen to slip on cup: a bound is all it tells"
 
 
-# --- sliding ---
-
-
 @pytest.mark.parametrize(("task", "close"), [(SLID, 0.12), (BOTH, 0.03)])
 def test_sliding_tells_the_friction_of_the_support(task, close):
     """By the law's slope where the weight is unknown, better where a carry tells it."""
@@ -228,6 +219,3 @@ def test_sliding_tells_the_friction_of_the_support(task, close):
         assert ground.mu_draws.mean() == pytest.approx(mu, abs=close)
         z.append((ground.mu_draws.mean() - mu) / ground.mu_draws.std())
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 2.0
-
-
-# --- recordings, with their true boundaries ---

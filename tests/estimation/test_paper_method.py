@@ -67,12 +67,6 @@ def test_threshold_is_tri_valued_and_keeps_missing_samples_missing():
     np.testing.assert_array_equal(out, [1, 0, 0, 0, -1, np.nan])
 
 
-def test_states_in_the_paper_s_numbering():
-    labels = label_states(make_signals("123s0"))
-    np.testing.assert_array_equal(labels.state, [1, 2, 3, 3, 0])
-    np.testing.assert_array_equal(labels.sliding, [False, False, False, True, False])
-
-
 @pytest.mark.parametrize(("state", "change", "options", "expected"), [
     ("1", {"fx1": -0.06}, {}, 0), ("1", {"fy1": -0.06}, {}, 0), ("1", {"fx2": -0.06}, {}, 0),
     ("1", {"fy2": -0.06}, {}, 0), ("3", {"vy1": 0.04, "vy2": 0.04}, {}, 3),

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from estimation_scene import SD, TRUE, UNIT, drawn, make_design
+from estimation_scene import TRUE, UNIT, drawn, make_design
 
 from estimation import priors
 from estimation.pads import SLOPE_SD
@@ -123,15 +123,6 @@ def test_a_channel_without_observations_keeps_its_prior():
     assert cut.repeats().tolist() == [3, 3, 0]
     mean, _ = post.given(theta)
     np.testing.assert_allclose(mean[:, -4], 0.0)  # the share of a channel that shows nothing
-
-
-def test_least_squares_is_the_reference():
-    design, true, *_ = drawn(make_design(num_trials=16), 5)
-    post = posterior(design)
-    weighed = design.coefficients / np.sqrt(design.variance)[:, None]
-    residual = (design.mean - design.coefficients @ post.reference) / np.sqrt(design.variance)
-    np.testing.assert_allclose(weighed.T @ residual, 0.0, atol=1e-6 * np.abs(weighed).max())
-    np.testing.assert_allclose(post.reference, true, rtol=0.03)
 
 
 def test_priors_are_in_the_order_of_the_names():
@@ -278,12 +269,3 @@ def test_planted_scatter_is_found_and_widens_what_it_touches(share):
     assert sd[width] == pytest.approx(np.hypot(found, found / np.sqrt(12)) * UNIT[1], rel=0.15)
     assert sd[weight] == pytest.approx(sd_before[weight], rel=0.2)
     assert np.abs((mode.unknowns - true) / sd).max() < 4
-
-
-def test_without_scatter_the_means_error_is_that_of_the_sensors():
-    design, *_ = drawn(make_design(num_trials=12, count=1e6), 3, scales=np.array([0.0] * 3 + [-6.0] * 3))
-    mode = find_mode(posterior(design))
-    own = design.variance[(design.channel == 0) & (design.move == 0)]
-    sensors = 1 / np.sqrt((1 / own).sum())
-    assert sensors < np.sqrt(mode.unknowns_covariance[0, 0]) < 1.3 * sensors
-    assert sensors == pytest.approx(SD[0] / np.sqrt(12), rel=0.3)

@@ -8,14 +8,7 @@ from estimation_scene import UNIT, drawn, make_design
 
 from estimation import priors, sampler
 from estimation.posterior import find_mode, posterior
-from estimation.sampler import (
-    GROUPS,
-    MIN_ESS,
-    effective_sample_size,
-    proposal,
-    sample,
-    split_rhat,
-)
+from estimation.sampler import GROUPS, MIN_ESS, effective_sample_size, proposal, sample, split_rhat
 
 
 def importance(post, mode, seed, num):

@@ -40,18 +40,6 @@ def test_pad_stiffness_and_width_follow_from_the_recordings_alone(case):
         assert found["width"] == pytest.approx(width, abs=3e-5)
 
 
-def test_what_the_papers_widths_need(case, shortfalls):
-    need = rigid.needed(case, shortfalls)
-    assert need["grip_ratio"] == pytest.approx(1.5)
-    assert need["blocks"]["block1"]["grip_at_nominal"] == pytest.approx(4000 * 1.2e-3 / 2)
-    block2 = need["blocks"]["block2"]
-    assert np.allclose(2 * need["grip"] / block2["stiffness"], 1.8e-3)
-
-
-def test_sequence_takes_runs_and_dropouts_out():
-    assert states.sequence(np.array([1, 1, 0, 1, 3, 0, 2, 2])) == [1, 3, 2]
-
-
 def test_states_come_in_the_expected_order(case):
     rows = states.trials(case)
     assert all(row["ordered"] == list(states.EXPECTED) for row in rows)

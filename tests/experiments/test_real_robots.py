@@ -5,10 +5,8 @@ import pytest
 from experiments.real import robot_gap
 
 FOUR = [
-    "xl330_kp100_sin_sin",
-    "xl330_kp200_up_and_down",
-    "xl330_kp400_lift_and_drop",
-    "xl330_kp800_sin_time_square",
+    f"xl330_{n}"
+    for n in ("kp100_sin_sin", "kp200_up_and_down", "kp400_lift_and_drop", "kp800_sin_time_square")
 ]
 NOT_THERE = ("backlash", "delay", "spring", "stribeck", "sag", "mass", "length")
 

@@ -8,8 +8,6 @@ import pytest
 
 from experiments.blind_check.tables import fresh
 from experiments.calibration import Estimates, summarise_estimates
-from experiments.real import hiro_snap
-from experiments.table_text import as_csv, covered, markdown
 from experiments.worlds import Deviations, deviated, scene, simulated_cases
 from experiments.write_tables import TABLES, fill
 from hmmseg.hand.signals import task_space
@@ -47,39 +45,6 @@ def test_every_table_has_what_writes_it_and_a_target():
     assert [path.name for path in shown if f"{path.parent.name}/{path.name}" not in text] == []
 
 
-def test_a_table_becomes_comma_separated_values():
-    text = "### Pooled\n\n" + markdown(["a", "b"], [["1, 2", "`c`"]]) + "\n\nnote"
-    assert as_csv(text) == 'Pooled\na,b\n"1, 2",c\nnote\n'
-
-
-def test_markdown_and_coverage():
-    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
-    assert covered({"c": 0.9, "c_se": 0.0123}, "c") == "90.0 ± 1.2 %"
-    assert covered({"c": 0.9, "c_se": None}, "c") == "90.0 %"
-
-
-def snap_results():
-    def of(scale):
-        return {"trials": 14, "median_abs": [scale, 2 * scale], "p95_abs": [3 * scale, 4 * scale],
-                "within_0.3": [1.0, 0.5]}  # fmt: skip
-
-    kind = {"training_mean": [1.5, 1.4], "training_mean_uncropped": [0.003, 0.002]}
-    for channels, scale in (("wrench_and_pose", 0.01), ("wrench", 0.02)):
-        kind[channels] = {"with_labels": of(scale), "without_labels": of(10 * scale)}
-    return {"seeds": 2, "max_crop": 3.0, "kinds": {"real_guarded": kind, "real_pivot": kind}}
-
-
-def test_real_recordings_stand_beside_the_predictor_without_ears(monkeypatch):
-    monkeypatch.setattr(hiro_snap, "load", {"hiro_snap": snap_results()}.get)
-    table = hiro_snap.table() or ""
-    assert "7 guarded, 7 pivoting trials, 2 random crops of up to 3 s" in table
-    assert "| guarded | none: answers the training mean | 1500 ms | 1400 ms |" in table
-    row = "| pivoting | force and torque alone; no labels | 200 ms, 600 ms, 100 % | 400 ms, 800 ms, 50 % |"
-    assert row in table
-    monkeypatch.setattr(hiro_snap, "load", {}.get)
-    assert hiro_snap.table() is None
-
-
 def test_coverages_have_clusters_as_their_units():
     names = (("block", "weight"), ("block", "width"))
 
@@ -106,13 +71,6 @@ def hand(**deviations):
 @pytest.fixture(scope="module")
 def trial():
     return simulated_cases(1, trials=1, seed=20_990)[0].trials[0]
-
-
-def test_a_hand_without_deviations_records_the_same(trial):
-    rig, _ = scene()
-    again = deviated(trial, rig, hand())
-    for name, values in trial.channels.items():
-        np.testing.assert_allclose(again.channels[name], values, atol=1e-9)
 
 
 def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):

@@ -17,6 +17,7 @@ from experiments.fuzz import run
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder
 from hmmseg.hand.read import read_trial
+from hmmseg.io.formats import npz
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.task import parse_task, read_task
 from hmmseg.io.trial import Trial
@@ -66,21 +67,20 @@ def bare_pickle(path):
     path.write_bytes(pickle.dumps(Exploding()))
 
 
-def zip_bomb(path):
-    """An array that claims a thousand times what the file holds."""
+def claiming(path, size, held, how):
+    """An archive of an array that claims so many numbers, of which the file holds so many bytes."""
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (2_000_000_000,)}
-    )
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bomb:
-        bomb.writestr("t.npy", header.getvalue() + bytes(50_000_000))
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (size,)})
+    with zipfile.ZipFile(path, "w", how) as file:
+        file.writestr("t.npy", header.getvalue() + bytes(held))
+
+
+def zip_bomb(path):
+    claiming(path, 2_000_000_000, 50_000_000, zipfile.ZIP_DEFLATED)
 
 
 def huge_claim(path):
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr("t.npy", header.getvalue() + bytes(80))
+    claiming(path, 10**15, 80, zipfile.ZIP_STORED)
 
 
 def climbing(path):
@@ -182,6 +182,13 @@ def test_a_hostile_archive_is_refused_and_runs_nothing(read, make, tmp_path, mon
     make(path)
     told(READERS[read], path)
     assert [each.name for each in tmp_path.iterdir()] == ["t.npz"]
+
+
+def test_an_archive_that_unpacks_to_much_more_than_it_has_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(npz, "BOMB", 10**6)
+    np.savez_compressed(tmp_path / "t.npz", t=np.zeros(10**7))
+    for read in ("trial", "model"):
+        assert "unpacks from" in told(READERS[read], tmp_path / "t.npz")
 
 
 SOME = settings(

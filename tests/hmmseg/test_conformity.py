@@ -5,13 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from misfit_edits import EDITS, FORCES, join, let_go
+from misfit_edits import EDITS, FORCES, RIG, TRIALS, TRUTH, join, let_go
 
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, Cell, World, replicates, scene, trials_of
-from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation import align as segmentation
@@ -19,12 +17,8 @@ from hmmseg.segmentation.conformity import MAX_RATE, examine
 from hmmseg.segmentation.emissions import features, thin
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
-STACK = Path(__file__).parents[1] / "data" / "stack"
-RIG = read_rig(STACK / "rig.toml")
 MOVES = (Move("block1", "ground"), Move("block2", "block1"))
 TASK = BlockTask({"block1": "block2", "block2": "ground"}, MOVES)
-TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
-TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
 ONE_BLOCK = BlockTask({"block1": "ground"}, (Move("block1", "ground"),))
 
 

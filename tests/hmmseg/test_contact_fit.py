@@ -17,9 +17,7 @@ from hmmseg.io.task import BlockTask, Move
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import (
-    LOST,
     RUNG,
-    STRAY,
     Features,
     Parameters,
     _log_ungripped,
@@ -130,28 +128,6 @@ def score(f: Features, state: str) -> np.ndarray:
     return log_likelihoods(f, step(state), PARAMETERS, 0)[:, 0]
 
 
-def own_sample(state: str, num: int, rng) -> Features:
-    """Samples drawn as the state has them (Gaussian noise at the parameters' scales)."""
-    p, scale = PARAMETERS, PARAMETERS.scale
-    noise = scale["force"] * rng.normal(size=(num, 4))
-    if state == FREE:
-        return features(num, force=p.bias + noise, vx=rng.uniform(-0.2, 0.2, num),
-                        vy=rng.uniform(-0.15, 0.15, num), y=rng.uniform(0, 0.06, num),
-                        d=rng.uniform(0.02, 0.06, num))  # fmt: skip
-    grip = rng.uniform(1, 3, num)
-    above = state == ABOVE_GROUND
-    ay = rng.normal(size=num) if above else np.zeros(num)
-    fy = 0.4 * (1 + ay / 9.81) if above else rng.uniform(-1, 0.2, num)
-    force = np.stack([grip, fy / 2, -grip, fy / 2], axis=1) + p.bias + noise
-    moving = rng.uniform(-0.2, 0.2, num)
-    still = 0.003 * rng.normal(size=(2, num))
-    return features(
-        num, force=force, ay=ay, d=0.02 - 2 * grip * 2.5e-4 + 1e-4 * rng.normal(size=num),
-        vx=still[0] if state == ON_GROUND else moving, vy=moving if above else still[1],
-        y=rng.uniform(0.015, 0.06, num) if above else 0.01 + fy * 2e-4 + 1e-4 * rng.normal(size=num),
-    )  # fmt: skip
-
-
 def test_soft_uniform_is_a_density():
     def density(x):
         return float(np.exp(log_between(np.array([x]), 0.5, 4.0, 0.05))[0])
@@ -220,21 +196,6 @@ def test_a_sample_without_values_says_nothing(state):
     np.testing.assert_allclose(score(f, state), np.zeros(3), atol=1e-12)
 
 
-def test_one_missing_channel_leaves_the_others():
-    f = own_sample(ON_GROUND, 50, np.random.default_rng(1))
-    lost = replace(f, vx=np.full(50, np.nan))
-    difference = score(f, ON_GROUND) - score(lost, ON_GROUND)
-    spread = np.hypot(2e-3, PARAMETERS.scale["velocity"])
-    close, broad = stats.t.pdf(f.vx, TAIL, scale=spread), 1 / f.span["vx"]
-    off = f.block_y(PARAMETERS.bias) - PARAMETERS.levels[0][1]
-    level = stats.t.pdf(off, TAIL, scale=np.hypot(3e-5, PARAMETERS.scale["level"]))
-    near = stats.t.pdf(off, TAIL, scale=MOVED)
-    rest, astray = stats.t.pdf(f.vy, TAIL, scale=spread) * level, near / f.span["vy"]
-    with_it = ((1 - 2 * STRAY) * close + STRAY * broad) * rest + STRAY * broad * astray
-    expected = np.log(with_it / ((1 - STRAY) * rest + STRAY * astray))
-    np.testing.assert_allclose(difference, expected, rtol=1e-9)
-
-
 def test_a_block_held_still_above_its_place_is_not_at_rest_on_it():
     """However long it is held: it hangs by its weight, and 4 mm from where the block rests."""
     still = PARAMETERS.bias + np.array([2.0, 0.2, -2.0, 0.2])
@@ -251,14 +212,6 @@ def test_a_block_that_is_pushed_on_the_ground_is_still_on_it():
     assert score(pushed, ON_GROUND).sum() > score(pushed, ABOVE_GROUND).sum() + 20
 
 
-@pytest.mark.parametrize("own", [FREE, ON_GROUND, SLIDING, ABOVE_GROUND])
-def test_every_state_prefers_its_own_samples(own):
-    f = own_sample(own, 300, np.random.default_rng(2))
-    scores = {state: score(f, state).sum() for state in (FREE, ON_GROUND, SLIDING, ABOVE_GROUND)}
-    others = [scores[state] for state in scores if state != own]
-    assert scores[own] > max(others) + 100
-
-
 def test_weight_of_a_carried_block_includes_its_inertia():
     force = PARAMETERS.bias + np.array([2.0, 0.3, -2.0, 0.3])  # 0.6 N: 0.4 N at half a g upwards
     still, rising = (score(features(1, force=force, d=0.019, ay=a), ABOVE_GROUND)[0] for a in (0.0, 4.905))
@@ -273,12 +226,6 @@ def test_what_strays_on_its_support_stays_near_it():
     near, far = score(moving, ON_GROUND)
     assert near - far == pytest.approx(np.diff(stats.t.logpdf(off[::-1], TAIL, scale=MOVED))[0], rel=1e-4)
     assert near - far > 6
-
-
-def test_a_carry_may_lose_its_block_for_a_moment():
-    """Open hands without force: nothing but a lost grip explains them, at LOST times the density of none."""
-    empty = features(3, force=PARAMETERS.bias, d=0.05, vx=0.05, vy=0.05, y=0.05)
-    np.testing.assert_allclose(score(empty, ABOVE_GROUND) - score(empty, FREE), np.log(LOST), atol=1e-3)
 
 
 def test_otsu_against_trying_every_split():
@@ -344,12 +291,7 @@ def check_recovery(found, trials):
         assert np.mean(path == labels) > 0.985
 
 
-def test_planted_parameters_are_recovered():
-    trials = [planted(seed) for seed in range(3)]
-    check_recovery(fit([f for f, _ in trials], STEPS), trials)
-
-
-@pytest.mark.parametrize("wrong", ["weights", "scales", "biases"])
+@pytest.mark.parametrize("wrong", ["nothing", "weights", "scales", "biases"])
 def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
     trials = [planted(seed) for seed in range(2)]
 
@@ -359,7 +301,7 @@ def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
             return replace(right, weight={"block1": 0.9, "block2": 0.12})
         if wrong == "scales":
             return replace(right, scale={name: 4 * value for name, value in right.scale.items()})
-        return replace(right, bias=right.bias + 0.15)
+        return replace(right, bias=right.bias + 0.15 * (wrong == "biases"))
 
     monkeypatch.setattr(contact_fit, "initial_parameters", start)
     check_recovery(fit([f for f, _ in trials], STEPS), trials)
@@ -441,29 +383,9 @@ def test_em_ends_at_the_maximum_of_the_evidence():
     trials = recorded()
     fit = em(Levels(trials, 0.7), Fixed(), len(trials), max_iterations=500, tolerance=1e-10)
     assert fit.converged
-    grid = np.linspace(-1, 4, 1001)
-    best = grid[np.argmax([by_enumeration(trials, level) for level in grid])]
-    assert fit.emission.level == pytest.approx(best, abs=3e-3)
+    best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
+    assert fit.emission.level == pytest.approx(best.x, abs=1e-3)
     assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.emission.level), abs=1e-9)
-
-
-def test_evidence_never_decreases():
-    trials = recorded()
-    evidence = [em(Levels(trials, 0.3), Fixed(), len(trials), max_iterations=n).log_evidence
-                for n in range(1, 12)]  # fmt: skip
-    assert np.diff(evidence).min() > -1e-9
-    assert evidence[-1] > evidence[0] + 0.1
-
-
-def test_what_the_order_forbids_stays_exactly_zero_while_durations_are_learned():
-    trials = recorded()
-    shares = MeanShares(tuple(x.size for x in trials), np.array([0.9, 0.1]))
-    fit = em(Levels(trials, 0.7), shares, len(trials))
-    assert abs(fit.durations.shares[0] - 0.9) > 0.1  # learned they were
-    for found in fit.alignments:
-        assert (found.smoothed[0, 1], found.smoothed[-1, 0]) == (0.0, 0.0)
-        assert set(np.diff(found.path)) <= {0, 1}
-        assert len(found.moves) == 1  # and none past a state
 
 
 def test_a_trial_too_short_says_which_state_starves():

@@ -33,26 +33,26 @@ def test_systematic_uncertainty_by_number_list_or_name():
     assert rig.systematic.link_length == (0.0,) * 4
 
 
+def test_gripper_and_tolerance():
+    rig = parse_rig({"tolerance": {"position": 1e-3}, "gripper": {"opening": "width", "tool_mass": 0.5}})
+    assert (rig.tolerance.position, rig.tolerance.property) == (1e-3, None)
+    assert rig.gripper.channels[:4] == ("x", "y", "z", "width") and rig.gripper.tool_mass == 0.5
+
+
 REFUSED = [
     ({"speed": 1}, r"rig: key speed: unknown key; expected one of .*rate.* \(did you mean"),
     ({"noise": {"forse": 1}}, r"rig: key noise.forse: unknown key; .*did you mean force"),
     ({"fingertip": {"stiffness": 1}}, r"rig: key fingertip.stiffness: unknown key; .*normal_stiffness"),
     ({"systematic": {"bias": 1}}, r"rig: key systematic.bias: unknown key; .*did you mean force_bias"),
-    (
-        {"fingers": {"1": {**FINGER, "length": 1}, "2": FINGER}},
-        r"rig: key fingers.1.length: unknown key; .*links",
-    ),
+    ({"fingers": {"1": {**FINGER, "length": 1}, "2": FINGER}},
+     r"rig: key fingers.1.length: unknown key; .*links"),
     ({"fingers": {"1": FINGER}}, r"rig: fingers must be the two tables \[fingers.1\] and \[fingers.2\]"),
     ({"fingers": {"1": FINGER, "2": {"base": [0, 0]}}}, "rig: key fingers.2.links: missing"),
     ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [0.1]}}}, r"rig: key fingers.2.links.1: missing"),
-    (
-        {"fingers": {"1": FINGER, "2": {**FINGER, "links": [0.1, -0.1]}}},
-        r"rig: key fingers.2.links.1: .*greater than 0 \(found -0.1\)",
-    ),
-    (
-        {"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.1, math.nan]}}},
-        r"rig: key fingers.2.base.1: .*finite",
-    ),
+    ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [0.1, -0.1]}}},
+     r"rig: key fingers.2.links.1: .*greater than 0 \(found -0.1\)"),
+    ({"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.1, math.nan]}}},
+     r"rig: key fingers.2.base.1: .*finite"),
     ({"rate": 0}, r"rig: key rate: Input should be greater than 0 \(found 0"),
     ({"rate": "20"}, r"rig: key rate: Input should be a valid number \(found '20'\)"),
     ({"rate": True}, r"rig: key rate: Input should be a valid number \(found True\)"),
@@ -64,35 +64,27 @@ REFUSED = [
     ({"systematic": {"force_bias": -0.1}}, r"rig: key systematic.force_bias.0: .*greater than or equal to 0"),
     ({"systematic": {"force_bias": [0.1, 0.1]}}, r"rig: key systematic.force_bias.2: missing"),
     ({"systematic": {"force_bias": [0.1] * 5}}, r"rig: key systematic.force_bias: .*at most 4"),
-    (
-        {"systematic": {"force_bias": {"fz1": 0.1}}},
-        r"rig: key systematic.force_bias: unknown entry fz1; expected one of fx1, .*did you mean f",
-    ),
+    ({"systematic": {"force_bias": {"fz1": 0.1}}},
+     r"rig: key systematic.force_bias: unknown entry fz1; expected one of fx1, .*did you mean f"),
     ({"systematic": {"force_bias": True}}, r"rig: key systematic.force_bias: must be a number"),
     ({"systematic": {"force_bias": 10**400}}, r"rig: key systematic.force_bias: must be at most 1e\+12"),
     ({"noise": {"force": 1e300}}, r"rig: key noise.force: .*less than or equal to"),
-    (
-        {"columns": {"x1": {"from": "a", "unit": "furlong"}}},
-        "rig: key columns.x1.unit: unknown unit 'furlong'",
-    ),
-    (
-        {"columns": {"x1": {"from": "a", "sing": 1}}},
-        r"rig: key columns.x1.sing: unknown key; .*did you mean sign\?",
-    ),
+    ({"columns": {"x1": {"from": "a", "unit": "furlong"}}},
+     "rig: key columns.x1.unit: unknown unit 'furlong'"),
+    ({"columns": {"x1": {"from": "a", "sing": 1}}},
+     r"rig: key columns.x1.sing: unknown key; .*did you mean sign\?"),
     ({"columns": {"x1": {"from": "a", "sign": 2}}}, "rig: key columns.x1.sign: found 2; expected 1 or -1"),
     ({"columns": {"x1": {"from": "a", "offset": math.nan}}}, "rig: key columns.x1.offset: .*finite"),
     ({"columns": {"x1": {"from": ""}}}, "rig: key columns.x1.from: .*at least 1 character"),
     ({"columns": {"x1": 3}}, "rig: key columns.x1: "),
     ({"columns": {"x1": {"unit": -1.0}}}, "rig: key columns.x1.unit"),
     ({"columns": {"t": {"unit": "mm"}}}, "rig: key columns: t is a time, but its unit mm is one of length"),
-    (
-        {"columns": {"fx1": {"unit": "deg"}}},
-        "rig: key columns: fx1 is a force, but its unit deg is one of angle",
-    ),
+    ({"columns": {"fx1": {"unit": "deg"}}},
+     "rig: key columns: fx1 is a force, but its unit deg is one of angle"),
     ({"tolerance": {"lenght": 1}}, r"rig: key tolerance.lenght: unknown key; expected one of force, pos"),
     ({"tolerance": {"force": 0}}, "rig: key tolerance.force: .*greater than 0"),
     ({"gripper": {}}, r"rig: a hand has \[fingers\] or is a \[gripper\], not both"),
-]
+]  # fmt: skip
 GRIPPERS = [
     ({"frame": "base"}, "key gripper.frame: "),
     ({"wrench": ["fx"]}, "key gripper.wrench: has 1 columns; expected 3 forces"),

@@ -46,17 +46,6 @@ def test_abrupt_changes_are_dated_where_they_jump_and_short_states_are_there():
     assert spans[1].start == 3.5 and spans[1].start_90[0] <= 3.5 <= spans[1].start_90[1]
 
 
-def test_a_jump_is_dated_within_a_sample():
-    rng = np.random.default_rng(5)
-    ends = np.array([[2.013, 3.291, 5.002], [1.8, 2.937, 5.211]])
-    t = np.arange(0, 7, 0.01)
-    trials = [{"t": t, "f": np.array([0, 1, -1, 2.0])[np.searchsorted(e, t)] + rng.normal(0, 0.1, t.size)}
-              for e in ends]  # fmt: skip
-    for each, true in zip(segment(trials, {"sequence": list("abcd")}), ends, strict=True):
-        found = np.array([span.start for span in each.spans[1:]])
-        np.testing.assert_allclose(found, true, atol=0.01)
-
-
 EXPECTED = {
     "check_clustering": "rows are samples in time, not points to be clustered in any order",
     "check_methods_sample_order_invariance": "the order of the samples is what is modelled",

@@ -118,20 +118,6 @@ def test_draws_have_the_exact_path_probabilities():
     assert chisquare(observed[expected > 0], expected[expected > 0]).pvalue > 1e-3
 
 
-def test_geometric_tables_are_the_chain_that_has_no_memory():
-    rng = np.random.default_rng(0)
-    ll, means = rng.normal(size=(40, 4)), np.array([8.0, 5.0, 12.0, 20.0])
-    presence = [1.0, 0.6, 1.0, 1.0]
-    n = np.arange(1, 41)
-    tables = [(n - 1) * np.log1p(-1 / m) + np.log(1 / m) for m in means]
-    tables[3] = np.full(40, np.log(1 / 40))  # the last state of left_to_right lasts for sure
-    plain, tabled = hmm.left_to_right(means, presence), hmm.DurationChain(tables, presence)
-    assert hmm.viterbi(ll, plain).starts.tolist() == hmm.viterbi(ll, tabled).starts.tolist()
-    a, b = hmm.smooth(ll, plain), hmm.smooth(ll, tabled)
-    np.testing.assert_allclose(a.smoothed, b.smoothed, atol=1e-12)
-    np.testing.assert_allclose(a.boundary, b.boundary, atol=1e-12)
-
-
 def test_durations_decide_where_samples_do_not():
     """Two states alike but for how long they last; several recordings of different lengths in one call."""
     chain = hmm.lasting([30.0, 10.0], [2.0, 2.0])

@@ -161,12 +161,10 @@ def performed():
     [
         ([("fx1", "fy1"), ("fx2", "fy2")], "column fx1: and y are exchanged: the fingers press against each"),
         ([("x1", "y1"), ("x2", "y2"), ("vx1", "vy1"), ("vx2", "vy2")], "column x1: .* stand apart in a grip"),
-        (
-            [(f"{a}x{i}", f"{a}y{i}") for a in ("", "v", "f") for i in (1, 2)],
-            "column x1: and y are exchanged",
-        ),
+        ([(f"{a}x{i}", f"{a}y{i}") for a in ("", "v", "f") for i in (1, 2)],
+         "column x1: and y are exchanged"),
     ],
-)
+)  # fmt: skip
 def test_exchanged_axes_are_refused_with_what_mends_them(pairs, line):
     wrong = exchanged(CARTESIAN, pairs)
     with pytest.raises(InputError, match=line) as told:

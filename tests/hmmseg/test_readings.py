@@ -21,7 +21,7 @@ from hmmseg.sequence.courses import (
     probabilities,
     seen,
 )
-from hmmseg.sequence.emissions import StudentEmissions, from_weights, independent_share, learn, transitions
+from hmmseg.sequence.emissions import StudentEmissions, from_weights, independent_share, transitions
 from hmmseg.sequence.features import cell_means, edge_preserving_slopes, feature_map, features, without_old
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import NamedCourse, load_model, save_model
@@ -300,14 +300,6 @@ def test_features_do_not_depend_on_units():
     np.testing.assert_allclose(values[0], values[1], atol=1e-9)
 
 
-def test_slope_of_a_ramp():
-    t = np.arange(400) / 20
-    trial = Trial("x", t, {"a": 3 * t})
-    mapping = feature_map([trial], ("a",))
-    slope = features(trial, mapping).values[:, 1] * mapping.scale[1] + mapping.center[1]
-    np.testing.assert_allclose(slope[5:-5], 3.0, rtol=1e-6)
-
-
 def test_no_slope_looks_across_a_jump():
     x = np.concatenate([0.5 * np.arange(60), 40 - 0.2 * np.arange(60)])[:, None]
     slope = edge_preserving_slopes(x, 9)[:, 0]
@@ -371,20 +363,3 @@ def test_transitions_are_probabilities():
         assert leaving == pytest.approx(1.0)
     assert np.exp(law.log_initial).sum() == pytest.approx(1.0)
     np.testing.assert_array_equal(np.isfinite(law.log_final), [False, False, False, True])
-
-
-def test_detectors_find_a_learned_course():
-    rng = np.random.default_rng(3)
-    bump = np.exp(-0.5 * ((np.arange(40) - 20) / 4) ** 2)[:, None] * 5
-
-    def record(at):
-        x = rng.normal(size=(300, 1)) * 0.5
-        x[at : at + 40] += bump
-        return x
-
-    detectors = learn(
-        [record(at) for at in (50, 120, 200)], [np.array([at + 25]) for at in (50, 120, 200)], 15
-    )
-    assert detectors.log_ratios(record(90))[:, 0].argmax() == pytest.approx(90 + 25, abs=2)
-    unseen = learn([record(50), record(80)], [np.array([-1]), np.array([-1])], 15)
-    np.testing.assert_array_equal(unseen.log_ratios(record(90)), 0.0)

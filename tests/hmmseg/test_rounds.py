@@ -4,24 +4,17 @@ import json
 import time
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from misfit_edits import join, let_go
+from misfit_edits import RIG, TRIALS, TRUTH, join, let_go
 
 from hmmseg.contact.decompose import subtasks
-from hmmseg.hand.read import read_trial
-from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align
 from hmmseg.segmentation.rounds import round_tasks
 
-STACK = Path(__file__).parents[1] / "data" / "stack"
-RIG = read_rig(STACK / "rig.toml")
-TRIALS = [read_trial(STACK / f"trial_0{i}.csv", RIG) for i in (1, 2, 3)]
-TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for i in (1, 2, 3)]
 PICK = BlockTask({"block1": "ground"}, (Move("block1", "ground"),), repeat="unknown")
 BACK = BlockTask({"a": "ground", "b": "ground"}, (Move("a", "ground"), Move("b", "ground")), repeat="unknown")
 BEFORE, AFTER = 0.6, 0.5  # s of free motion kept about a move

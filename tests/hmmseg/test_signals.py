@@ -205,10 +205,7 @@ def test_velocities_of_their_own_stay():
     trial, rig = _trial()
     signals = task_space(trial, rig)
     assert timely(signals, trial, rig) is signals
-
-
-def test_positions_that_never_change_prove_nothing():
-    still = np.zeros(50)
+    still = np.zeros(50)  # positions that never change prove nothing
     assert not late_differences(np.arange(50) * 0.05, still, still)
 
 
@@ -218,9 +215,6 @@ def test_rates_beside_a_kink_are_those_of_their_own_side():
     left, right = one_sided(t, np.where(t < kink, 0.3 * t + 0.1 * t**2, 0.3 * kink + 0.1 * kink**2))[0]
     assert left[20] == pytest.approx(0.3 + 0.2 * kink, rel=1e-6)
     assert right[20] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_noise_of_one_sided_rates():
     t, rng = np.arange(20_000) * 0.05, np.random.default_rng(1)
     rates, noise = one_sided(t, rng.standard_normal(t.size))
     assert rates[:, 5:-5].std() == pytest.approx(noise, rel=0.03)
@@ -341,6 +335,7 @@ def test_a_weighted_median_is_that_of_repeated_values():
     values, times = rng.normal(size=31), rng.integers(1, 9, 31)
     times[0] += 1 - times.sum() % 2  # an odd number of values has one in the middle
     assert weighted_median(values, times.astype(float)) == np.median(np.repeat(values, times))
+    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0  # of what is there
 
 
 def test_gaps_are_bridged_in_time():
@@ -350,17 +345,6 @@ def test_gaps_are_bridged_in_time():
     assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ValueError, match="empty"):
         bridged(np.full(3, np.nan))
-
-
-def test_a_weighted_median_is_of_what_is_there():
-    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0
-
-
-NUMBERS = range(76100, 76106)
-
-
-def _without_column(trial):
-    return replace(trial, channels={k: v for k, v in trial.channels.items() if k != ROLL})
 
 
 def test_equations_of_a_rolled_block():

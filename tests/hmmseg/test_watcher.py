@@ -25,7 +25,7 @@ from hmmseg.online.hypothesis import HYPOTHESIS, RANGES, READING
 from hmmseg.online.watcher import Watcher
 from hmmseg.online.wrist import Closings
 from hmmseg.segmentation.align import align, segment
-from hmmseg.segmentation.emissions import LOST, STILL, Parameters, _log_halting, features, log_likelihoods
+from hmmseg.segmentation.emissions import STILL, Parameters, _log_halting, features, log_likelihoods
 from hmmseg_cli.main import main
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
@@ -92,7 +92,6 @@ def test_emissions_are_those_off_line():
                 found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
             if step.state == ABOVE_GROUND:
                 found += np.logaddexp(np.log1p(-STILL), np.log(STILL) + more)
-                found = np.logaddexp(np.log1p(-LOST) + found, np.log(LOST) + expected[n, 0])
             np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
 
 
@@ -179,7 +178,7 @@ def test_late_and_repeated_rows_lose_nothing(watched):
     order = [*range(50), 52, 51, 50, 50, *range(53, 120), 122, 120, 121, *range(123, 200)]
     lines = follow(watcher, t[order], table[order])
     notes = [line["note"].split(":")[0] for line in lines if "note" in line]
-    assert notes == ["late", "late", "repeated", "late", "late"] or set(notes) >= {"late", "repeated"}
+    assert notes == ["late", "late", "repeated", "late", "late"]
     assert watcher.counts["late"] == 4 and watcher.counts["repeated"] == 1
     found = json.loads(watcher.finish().line())
     assert [c.step.name for c in watcher.crossings] == [c.step.name for c in straight.crossings]

@@ -28,15 +28,8 @@ def logs(tmp_path_factory):
 def test_a_cause_is_named_and_patched(logs, tmp_path):
     target = tmp_path / "out.json"
     patch = tmp_path / "patch"
-    options = [
-        "--json",
-        str(target),
-        "--patch",
-        str(patch),
-        "--report",
-        str(tmp_path / "page.html"),
-        "--quiet",
-    ]
+    page = tmp_path / "page.html"
+    options = ["--json", str(target), "--patch", str(patch), "--report", str(page), "--quiet"]
     assert main(["diagnose", *logs, "--simulator", f"{SWING}:Swing", *options]) == 0
     found = json.loads(target.read_text())
     assert found["verdict"] == "named" and found["causes"] == ["viscous"]
@@ -48,11 +41,9 @@ def test_a_cause_is_named_and_patched(logs, tmp_path):
     assert moving["fraction"] > 0.9 and moving["rms"]["angle"]["after"] < moving["rms"]["angle"]["before"]
     ranges = json.loads((patch / "ranges.json").read_text())
     assert ranges["causes"]["viscous"]["parameters"]["viscous"]["range"] == told["interval_90"]
-    page = (tmp_path / "page.html").read_text()
-    assert (
-        "Viscous" in page
-        and "With it in the model the gap shrinks by over 99 % on held-out stretches" in page
-    )
+    said = page.read_text()
+    assert "Viscous" in said
+    assert "With it in the model the gap shrinks by over 99 % on held-out stretches" in said
 
 
 @pytest.mark.parametrize(

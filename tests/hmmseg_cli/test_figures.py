@@ -45,19 +45,9 @@ def texts(monkeypatch):
 
 
 def make_segmentation() -> Segmentation:
-    steps = subtasks(BlockTask({"block": "ground"}, (Move("block", "ground"),)))
+    steps, sd = subtasks(BlockTask({"block": "ground"}, (Move("block", "ground"),))), 0.01
     spans = tuple(
-        Span(
-            s.name,
-            s.object,
-            s.state,
-            float(i),
-            i + 1.0,
-            0.01,
-            0.01,
-            (i - 0.02, i + 0.02),
-            (i + 0.98, i + 1.02),
-        )
+        Span(s.name, s.object, s.state, 1.0 * i, i + 1.0, sd, sd, (i - 0.02, i + 0.02), (i + 0.98, i + 1.02))
         for i, s in enumerate(steps)
     )
     return Segmentation("made.csv", 20.0, None, spans)

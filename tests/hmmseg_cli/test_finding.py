@@ -17,20 +17,14 @@ from simgap.report.finding import (
     to_do,
 )
 from simgap.robot_effects import FAMILIES
-from simgap.simulators.mjcf.settable import KNOWN
+from simgap.simulators.mjcf.setting import KINDS
 
 SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
 
 
 def cell(channel: str, subtask: str, share: float, trial: str = "trial_01.csv", band=(0.0, 1.0)) -> dict:
-    return {
-        "trial": trial,
-        "channel": channel,
-        "subtask": subtask,
-        "band": list(band),
-        "share": share,
-        "z": 100 * share,
-    }
+    where = {"trial": trial, "channel": channel, "subtask": subtask, "band": list(band)}
+    return where | {"share": share, "z": 100 * share}
 
 
 def body(verdict: str, causes: list[str], **more) -> dict:
@@ -128,7 +122,7 @@ def test_a_part_of_a_robot_is_told_in_words_with_the_models_own_value():
 def test_every_part_of_a_model_that_is_offered_has_words_and_a_check():
     kinds = [
         f"{kind}.{what.removesuffix('_extra').removesuffix('_speed')}"  # of one effect, joint.stribeck
-        for kind, known in KNOWN.items() for what in known if kind in ("joint", "actuator")
+        for kind, (_, known) in KINDS.items() for what in known if kind in ("joint", "actuator")
     ]  # fmt: skip
     for kind in (*kinds, "body.mass", "body.com", "body.payload", "geom.friction"):
         head, _, what = kind.partition(".")

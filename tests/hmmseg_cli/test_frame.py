@@ -130,15 +130,12 @@ def test_a_process_with_a_bug_shows_its_traceback(task):
     [
         ({"json": "{}/trial.csv"}, "--json .*trial.csv: would be written over, .*; expected a .json file"),
         ({"json": "{}"}, "--json .*: is a folder; expected a file"),
-        (
-            {"json": "{}/file/a.json"},
-            "--json .*file is not a folder; expected a folder",
-        ),
+        ({"json": "{}/file/a.json"}, "--json .*file is not a folder; expected a folder"),
         ({"report": "{}/a.json"}, "--report .*a.json: unknown kind of file; expected .html or .htm"),
         ({"figures": "{}/file"}, "--figures .*file is not a folder; expected a folder"),
         ({"figures": "{}/file/below"}, "--figures .*file is not a folder"),
     ],
-)
+)  # fmt: skip
 def test_destinations_are_checked_beforehand(tmp_path, arguments, message):
     (tmp_path / "file").write_text("")
     given = {name: value.format(tmp_path) for name, value in arguments.items()}

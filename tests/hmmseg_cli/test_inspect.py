@@ -30,21 +30,12 @@ from file_writers import (
 from experiments.wrist_scene import Setup, performances, wrist_recording
 from hmmseg.hand.inspect import inspect, propose
 from hmmseg.hand.read import read_trial
-from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.table import plain_table
 from hmmseg.io.task import read_task
-from hmmseg_cli.inspect import sparkline
 from hmmseg_cli.main import main
 
 NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
-
-
-def cartesian() -> dict[str, np.ndarray]:
-    rig = read_rig(NONE / "rig.toml")
-    signals = task_space(read_trial(NONE / "trial_01.csv", rig), rig)
-    names = ("t", "x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
-    return {name: getattr(signals, name) for name in names}
 
 
 T = np.arange(0, 2, 0.02)
@@ -61,7 +52,7 @@ OTHERS = {
 
 def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
     """Foreign names, units partly told, finger 2's forces with the other sign, times in ns."""
-    ours = cartesian()
+    ours = dict(CARTESIAN)
     frame = pd.DataFrame({name: ours[channel] * factor for channel, (name, factor) in OTHERS.items()})
     frame["stamp"] = frame["stamp"].round().astype(np.int64)
     frame.to_csv(tmp_path / "a.csv", index=False, sep=";", decimal=",")
@@ -138,7 +129,7 @@ def test_what_to_do_next_is_said_and_no_line_to_copy_is_wrapped(tmp_path, capsys
     monkeypatch.setenv("COLUMNS", "40")
     assert main(["inspect", str(NONE / "trial_01.csv")]) == 0
     assert "all columns understood; next: hmmseg segment" in capsys.readouterr().out
-    ours = cartesian()
+    ours = dict(CARTESIAN)
     frame = pd.DataFrame({OTHERS[name][0]: values for name, values in ours.items()})
     frame.to_csv(tmp_path / "a.csv", index=False)
     assert main(["inspect", str(tmp_path / "a.csv")]) == 0
@@ -165,13 +156,6 @@ def test_a_rate_that_is_not_the_files_is_said(tmp_path):
     assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
 
 
-def test_sparkline():
-    assert sparkline((0.0, 7.0, float("nan"), 3.5)) == "▁█ ▅"
-    assert sparkline((1.0, 1.0)) == "▁▁"
-    assert sparkline((float("nan"),)) == ""
-    assert len(sparkline((-1e308, 0.0, float("nan"), 1e308))) == 4
-
-
 @pytest.mark.parametrize(
     ("rig", "line"),
     [
@@ -181,7 +165,7 @@ def test_sparkline():
     ],
 )
 def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, rig, line):
-    ours = cartesian()
+    ours = dict(CARTESIAN)
     pd.DataFrame({"time": ours.pop("t"), **ours}).to_csv(tmp_path / "a.csv", index=False)
     (tmp_path / "rig.toml").write_text(rig)
     assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--quiet"]) == 2
@@ -215,16 +199,6 @@ def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
     assert set(kept) <= {*before.split("\n"), 'closing = "y"  # the axis along which the pads close'}
     assert main(["inspect", str(log), "--write", str(rig), "--quiet"]) == 2  # they are somebody's now
     assert "already has [gripper]; expected a rig without it" in capsys.readouterr().err
-
-
-def test_axes_of_the_work_are_found_in_what_the_fingers_do(tmp_path):
-    """Three axes of poses and wrenches, of which the fingers close along y and lift along z."""
-
-    ours = cartesian()
-    found = inspect(mcap_of(tmp_path / "a.mcap", finger_topics(ours)))
-    assert {name: fields["from"].rsplit(".", 1)[1] for name, fields in found.mapping.items()} == {
-        "x1": "y", "y1": "z", "fx1": "y", "fy1": "z", "x2": "y", "y2": "z", "fx2": "y", "fy2": "z",
-    }  # fmt: skip
 
 
 def test_new_never_hangs_and_never_writes_over(tmp_path):

@@ -17,14 +17,12 @@ import sys
 import tempfile
 import threading
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hmmseg.example import example_folder
-from hmmseg_cli import console
 from hmmseg_cli.main import heard, main
 
 STACK = Path(__file__).parents[1] / "data/stack"
@@ -209,32 +207,6 @@ def test_names_may_hold_what_a_file_system_allows(lab, capsys):
     assert main(["segment", "b" * 252 + ".csv", *HAND]) == 2
 
 
-def test_what_a_killed_run_left_is_swept_by_the_next(lab, monkeypatch, tmp_path):
-    where = tmp_path / "tmp"
-    where.mkdir()
-    environment = {**os.environ, "TMPDIR": str(where)}
-    program = "from hmmseg_cli.console import scratch\nwith scratch() as f: print(f, flush=True); input()"
-    alive, dead = (
-        subprocess.Popen([sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE,
-                         stdout=subprocess.PIPE, text=True) for _ in range(2)
-    )  # fmt: skip
-    folders = [Path(p.stdout.readline().strip()) for p in (alive, dead)]
-    dead.kill()
-    dead.communicate()
-    (where / "hmmseg-notes").mkdir()
-    (where / "hmmseg-theirs").mkdir()
-    (where / "hmmseg-theirs" / "thesis.txt").touch()
-    for path in where.iterdir():
-        os.utime(path, (time.time() - 3600,) * 2)
-    monkeypatch.setattr(tempfile, "tempdir", str(where))
-    alive2 = folders[0].exists()
-    with console.scratch() as mine:
-        assert mine.exists() and not folders[1].exists()
-    assert alive2 and folders[0].exists()
-    alive.communicate("\n", timeout=60)
-    assert sorted(p.name for p in where.iterdir()) == ["hmmseg-theirs"]
-
-
 def test_without_a_temporary_folder_a_line_says_so(lab, monkeypatch, capsys):
     monkeypatch.setattr(tempfile, "tempdir", str(lab / "nowhere"))
     assert main(COMMANDS["decompose"]) == 2
@@ -314,21 +286,6 @@ def test_properties_that_nothing_has_are_refused(value, key, lab, capsys):
     assert f"block1.{key}" in capsys.readouterr().err
 
 
-def test_an_archive_that_unpacks_to_a_gigabyte_of_nothing_is_refused(lab, capsys):
-    with zipfile.ZipFile("trial.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        with archive.open("t.npy", "w", force_zip64=True) as member:
-            header = io.BytesIO()
-            np.lib.format.write_array_header_1_0(
-                header, {"descr": "<f8", "fortran_order": False, "shape": (2**25 + 2**20,)}
-            )
-            member.write(header.getvalue())
-            for _ in range(2**8 + 2**3):
-                member.write(bytes(2**20))
-        archive.writestr("x1.npy", b"")
-    assert main(["segment", "trial.npz", *HAND]) == 2
-    assert "unpacks from" in capsys.readouterr().err
-
-
 # Slow, as an alarm that goes off in the wrong place ends the whole test run.
 # A reader interrupted between opening a file and holding on to it leaves its closing to Python.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -378,7 +335,8 @@ def test_ctrl_c_in_a_callback_is_heard(capsys):
     try:
         with pytest.raises(KeyboardInterrupt), heard():
             called()
-            time.sleep(5)
+            for _ in range(100):
+                time.sleep(0.05)
     finally:
         signal.signal(signal.SIGINT, usual)
     assert capsys.readouterr().err == ""
@@ -446,13 +404,3 @@ def test_the_same_seed_gives_the_same_digits(name, lab):
     restore(lab, before)
     main([*COMMANDS[name], "--seed", "5"])
     assert files(lab) == first
-
-
-def test_a_run_that_fails_leaves_another_s_results(lab):
-    assert main(COMMANDS["identify"]) == 0
-    kept = files(lab)
-    (lab / "bad.csv").write_text("t,x\n0,1\n")
-    assert main(["identify", "bad.csv", *HAND, "--json", "out.json"]) == 2
-    (lab / "bad.csv").unlink()
-    assert files(lab) == kept
-    assert json.loads(kept["out.json"])["format"] == "hmmseg.identify/1"

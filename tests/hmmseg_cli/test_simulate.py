@@ -10,7 +10,7 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
 from hmmseg_cli.main import main
-from simgap.world.animation import FRAMES
+from simgap.world import animation
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.simulate import scene_files
 
@@ -84,7 +84,8 @@ def test_what_is_refused_writes_nothing(tmp_path, inputs, more, message, monkeyp
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_the_operator_does_as_told(tmp_path, inputs):
+def test_the_operator_does_as_told(tmp_path, inputs, monkeypatch):
+    monkeypatch.setattr(animation, "FRAMES", 2.0)
     (tmp_path / "operator.toml").write_text("grip = 1.5\ntremor = 0.0\nwander = [0.0, 0.0]\n")
     args = ["simulate", *inputs, "--operator", str(tmp_path / "operator.toml")]
     assert main([*args, "--output", str(tmp_path / "out"), "--animation"]) == 0
@@ -95,4 +96,4 @@ def test_the_operator_does_as_told(tmp_path, inputs):
     grip = (trial.channels["fx1"] - trial.channels["fx2"])[held] / 2
     assert grip.mean() == pytest.approx(1.5, abs=0.06)
     with Image.open(tmp_path / "out/trial_01.gif") as film:
-        assert film.n_frames == pytest.approx(trial.t[-1] * FRAMES, abs=2)
+        assert film.n_frames == pytest.approx(trial.t[-1] * 2.0, abs=2)

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from hmmseg import Watcher
-from hmmseg_cli.live import Live, picture, spark
 from hmmseg_cli.main import main
+from hmmseg_cli.watch import Live, picture, spark
 
 CASE = Path(__file__).parents[2] / "recordings" / "paper_blocks"
 ROWS = (CASE / "trial_01.csv").read_text().splitlines()

@@ -7,22 +7,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from hmmseg.errors import InputError
 from simgap.attribution.attribute import _examined, _predicting, _there, attribute, noise_of
 from simgap.attribution.heldout import WANDER, Heldout, invariance, scatter_between
 from simgap.attribution.posterior import Background, Forms, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines
 from simgap.attribution.search import detected, leniently, sought, statistic, weights
-from simgap.attribution.verdict import (
-    ALARM,
-    Explanation,
-    acting,
-    alike,
-    conclude,
-    known,
-    leading,
-    probabilities,
-    significant,
-)
+from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known, probabilities, significant
 
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
@@ -288,6 +279,11 @@ def test_what_has_no_name_explains_only_what_names_do_not():
     assert rest.verdict == "unknown" and rest.causes == ()
 
 
+def test_an_effect_that_cannot_act_on_these_recordings_is_not_taken():
+    with pytest.raises(InputError, match=r"'actual': cannot act on these recordings; expected a, b, c, d"):
+        attribute(gap_of({1: 3.0}), heldout=False, forced=("actual",))
+
+
 def test_a_cause_of_a_sliver_of_the_gap_leaves_it_unknown():
     steady = [3.0]
     assert known(0.05, 0.9, steady) > 0.9
@@ -369,13 +365,14 @@ def test_causes_of_less_than_the_wanted_share_of_held_out_gap_are_unknown():
     assert attribute(gap).causes == ("a",)
 
 
-def test_a_cause_is_not_known_where_other_trials_show_no_gap_that_it_could_shrink():
-    """Noise of nine times the squares that there are: nothing to be gone, so no share of it is."""
+def test_a_cause_that_leaves_nothing_that_can_be_seen_is_known_however_little_it_was():
+    """Noise of nine times the squares that there are: no share is certain, unless something is left."""
     gap = gap_of({0: 3.0}, seed=6)
-    f, rng = forms(gap), np.random.default_rng(0)
-    for variance, likely in ((1.0, True), (9.0, False)):
-        others = Heldout.of(gap, np.full(3, variance), (0,))
-        found = _examined(f, (0,), np.full(f.count.size, variance), rng, others)
+    rest = 9.0 * np.sin(gap.rows.time * 40.0 + gap.rows.trial) * (gap.rows.channel == 2)
+    for more, likely in ((0.0, True), (rest, False)):
+        f, rng = forms(replace(gap, residual=gap.residual + more)), np.random.default_rng(0)
+        others = Heldout.of(f.gap, np.full(3, 9.0), (0,))
+        found = _examined(f, (0,), sought(f), np.full(f.count.size, 9.0), rng, others)
         assert found.causes == (0,)
         assert (found.known > 0.5) == likely
 
@@ -434,6 +431,9 @@ def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
     assert sum(plain) < 20 if wander else np.median(widened) < 1
 
 
+SURE = 1e-12  # a p-value that leaves no doubt of a gap
+
+
 def test_what_changes_sign_between_trials_is_no_cause():
     rows = rows_of(samples=30)
     push = np.ones(rows.time.size) * (rows.channel == 0)
@@ -444,9 +444,6 @@ def test_what_changes_sign_between_trials_is_no_cause():
     model = next(m for m in sought(f) if m.effects == (0,))
     assert invariance(f, model, 0, rows.trial).log_bayes_factor < -3
     assert attribute(gap, heldout=False).verdict == "unknown"
-
-
-SURE = 1e-12  # a p-value that leaves no doubt of a gap
 
 
 def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | None = None) -> Explanation:
@@ -462,9 +459,9 @@ def test_probabilities_are_the_weights_where_every_set_is_known():
 
 
 def test_what_a_set_is_not_known_to_explain_is_unknown():
-    found = probabilities([one("a", 0.8, 0.25), one("b", 0.2, 0.5)], SURE)
-    assert found["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
-    assert conclude([one("a", 0.8, 0.25), one("b", 0.2, 0.5)], SURE).verdict == "unknown"
+    sets = [one("a", 0.8, 0.25), one("b", 0.2, 0.5)]
+    assert probabilities(sets, SURE)["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
+    assert conclude(sets, SURE).verdict == "unknown"
 
 
 def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
@@ -472,46 +469,34 @@ def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
     assert probabilities(sets, ALARM)["none"] == pytest.approx(0.5)
     assert acting(sets, ALARM)["a"] == pytest.approx(0.45)
     assert conclude(sets, 1.01 * ALARM).verdict == "none" and conclude(sets, 0.99 * ALARM).verdict == "named"
+    small = conclude(sets, SURE, matters=False)  # a gap that does not matter is none however sure
+    assert small.verdict == "none" and small.causes == () and small.probabilities["none"] > 0.99
 
 
-def test_a_gap_that_does_not_matter_is_none_however_sure():
-    told = conclude([one("a", 1.0)], SURE, matters=False)
-    assert told.verdict == "none" and told.causes == () and told.probabilities["none"] > 0.99
+B_IN_TWO = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
 
 
-def test_forced_effects_are_named_whatever_the_gap():
-    assert conclude([one("ab", 1.0, 0.0)], 0.9, forced=("b", "a")).causes == ("a", "b")
-
-
-def test_sets_of_the_same_causes_count_together():
-    """Two sets whose smaller effects differ have the same cause, likelier than the single likeliest set."""
-    sets = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
-    assert leading(sets) == ("b",)
-    assert conclude(sets, SURE).causes == ("b",)
-    assert conclude(sets, SURE, chosen=("a",)).causes == ("a",)
-
-
-@pytest.mark.parametrize(("odds", "verdict"), [(19.0, "set"), (21.0, "named")])
-def test_what_takes_a_causes_place_is_told_down_to_one_in_twenty(odds, verdict):
-    weight = odds / (1 + odds)
-    told = conclude([one("a", weight), one("b", 1 - weight)], SURE)
-    assert told.verdict == verdict and told.indistinguishable == (("b",) if verdict == "set" else ())
-
-
-def test_an_effect_too_small_to_be_a_cause_is_no_cause_beside_an_alternative_either():
-    """Beside a and beside b stands the same small effect s: b takes a's place, s takes nobody's."""
-    sets = [one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))]
-    assert alike(sets, ("a",)) == ("b",)
-
-
-def test_a_larger_set_is_no_alternative():
-    assert alike([one("a", 0.5), one("bc", 0.5)], ("a",)) == ()
-
-
-def test_what_a_set_can_do_without_is_no_cause():
-    nested = [one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)]
-    assert conclude(nested, SURE).causes == ("a",)
-    assert conclude([one("ab", 0.96), one("a", 0.03)], SURE).causes == ("a", "b")  # ruled out
-    assert conclude([one("ab", 0.6), one("a", 0.3, 0.01)], SURE).causes == ("a", "b")  # it leaves too much
-    other = conclude([one("ab", 0.6), one("c", 0.3)], SURE)  # not a part of the set but an alternative to it
-    assert other.causes == ("a", "b") and other.indistinguishable == ("c",)
+@pytest.mark.parametrize(
+    ("sets", "more", "causes", "others"),
+    [
+        # Sets of the same causes count together; what was chosen, or forced, is named all the same.
+        (B_IN_TWO, {}, ("b",), ("a",)),
+        (B_IN_TWO, {"chosen": ("a",)}, ("a",), ()),
+        ([one("ab", 1.0, 0.0)], {"p_value": 0.9, "forced": ("b", "a")}, ("a", "b"), ()),
+        # What takes a cause's place is told down to one in twenty: an effect too small to be a cause is none
+        # beside an alternative either, and a larger set is no alternative.
+        ([one("a", 19 / 20), one("b", 1 / 20)], {}, ("a",), ("b",)),
+        ([one("a", 21 / 22), one("b", 1 / 22)], {}, ("a",), ()),
+        ([one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))], {}, ("a",), ("b",)),
+        ([one("a", 0.5), one("bc", 0.5)], {}, ("a",), ()),
+        # What a set can do without is no cause, unless that is ruled out or leaves too much.
+        ([one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)], {}, ("a",), ()),
+        ([one("ab", 0.96), one("a", 0.03)], {}, ("a", "b"), ()),
+        ([one("ab", 0.6), one("a", 0.3, 0.01)], {}, ("a", "b"), ()),
+        ([one("ab", 0.6), one("c", 0.3)], {}, ("a", "b"), ("c",)),  # not a part of the set but an alternative
+    ],
+)
+def test_causes_and_what_takes_their_place(sets, more, causes, others):
+    told = conclude(sets, **{"p_value": SURE} | more)
+    assert (told.causes, told.indistinguishable) == (causes, others)
+    assert told.verdict == ("set" if others else "named")

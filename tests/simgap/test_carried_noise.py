@@ -104,9 +104,7 @@ def given():
 def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
     healthy = fit(given, Start((), neutral(given)))
     noise = carried(
-        healthy.residual[:, None],
-        redrawn(given),
-        lambda other: on_other(other, healthy).residual[:, None],
+        healthy.residual[:, None], redrawn(given), lambda other: on_other(other, healthy).residual[:, None]
     )
     there, arrays = given.whitening.weight > 0, given.frame.arrays
     channel, doubted = np.nonzero(there)[2], (arrays.sd / arrays.plain)[there]

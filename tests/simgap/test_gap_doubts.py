@@ -7,22 +7,40 @@ from scipy.stats import multivariate_normal
 
 from simgap.channels import play
 from simgap.effects.geometry import within
-from simgap.gap.residuals import ANYWHERE, SLIDE, _followed, driven, sensed
+from simgap.gap.residuals import ANYWHERE, SLIDE, driven, sensed
+from simgap.recursions import tracked
 from tests.simgap.test_gap_effects import performance, world_of
 
 
-def _cost(values, weight, sd, slip, grips) -> float:
-    out, factor = _followed(*(np.asarray(z)[None] for z in (values, weight, sd, SLIDE * slip, grips)))
-    out, factor = np.asarray(out)[0], np.asarray(factor)[0]
-    return float(0.5 * ((out / sd) ** 2 / factor + np.log(factor)).sum())
+def _tracked(
+    values, sd, *, weight=1.0, walk=0.0, new=False, may=0.0, joints=None, shares=(0.0,), chance=(1.0,)
+):
+    """What the filter makes of one trial's values (N, 4). `joints`: levers, pinned, place and jump of two."""
+    n = len(values)
+    levers, pinned, place, jump = joints or (np.zeros((n, 4, 0)), np.zeros((n, 0)) > 0, np.zeros((n, 0)), 0.0)
+    still = np.zeros((1, *place.shape))
+    return tracked(
+        values[None], np.broadcast_to(weight, (1, n, 4)) * 1.0, np.full((1, n, 4), sd), levers[None],
+        np.broadcast_to(walk, (1, n)) * 1.0, np.broadcast_to(new, (1, n, 3)) > 0, ANYWHERE**2, SLIDE**2,
+        np.broadcast_to(may, (1, n)) * 1.0, pinned[None], place[None], still, still + 1e-6,
+        np.full((1, place.shape[1]), jump), np.asarray(shares)[:, None] * np.ones(3), np.asarray(chance),
+    )  # fmt: skip
 
 
-def test_a_slide_is_a_random_walk_marginalised_exactly():
+def _cost(found, sd, channel) -> float:
+    out, factor = (z[0, :, channel] for z in found[:2])
+    return float(0.5 * ((out / sd) ** 2 / factor + np.log(factor)).sum()) + found[2]
+
+
+def _alone(values, channel):
+    """One channel's values, the others of no weight."""
+    return np.outer(values, np.eye(4)[channel]), np.eye(4)[channel]
+
+
+def test_a_block_that_is_taken_along_is_a_random_walk_marginalised_exactly():
     rng = np.random.default_rng(0)
     n, sd = 12, 2e-5
-    slip = np.zeros(n)
-    slip[[4, 5]] = 1.0
-    walk = np.maximum(slip, np.concatenate([slip[:1], slip[:-1]])) * SLIDE
+    walk = np.where(np.isin(np.arange(n), (4, 5, 6)), 2e-3, 0.0)
     for values in (rng.normal(0, sd, n), np.where(np.arange(n) > 4, 1e-3, 0.0) + rng.normal(0, sd, n)):
         # The oracle: the joint normal density of all samples but the first, given the first.
         steps = np.cumsum(walk**2 * (np.arange(n) > 0))
@@ -30,15 +48,31 @@ def test_a_slide_is_a_random_walk_marginalised_exactly():
         whole = multivariate_normal(np.full(n, values[0]), covariance).logpdf(values)
         first = multivariate_normal(values[0], ANYWHERE**2 + sd**2).logpdf(values[0])
         plain = -0.5 * (n - 1) * np.log(2 * np.pi * sd**2)
-        cost = _cost(values, np.ones(n), np.full(n, sd), slip, np.ones((n, 1)))
+        of, weight = _alone(values, 0)
+        cost = _cost(_tracked(of, sd, weight=weight, walk=walk**2), sd, 0)
         assert cost == pytest.approx(-(whole - first - plain), abs=2e-3)
+
+
+def test_a_slide_is_the_likeliest_of_all_moves_and_pays_for_being_one():
+    values, sd = np.where(np.arange(12) > 5, 1e-3, 0.0), 2e-5
+    for channel in (1, 3):
+        of, weight = _alone(values, channel)
+        holding, may = (
+            _tracked(of, sd, weight=weight, may=chance, shares=(0.0, 1.0), chance=(0.8, 0.2))
+            for chance in (0.0, 0.5)
+        )
+        assert holding[2] == 0.0 and _cost(holding, sd, channel) > 100
+        # Eleven times it held, which the first sample cannot tell, and once it slid.
+        assert may[2] == pytest.approx(-11 * np.log(0.9) - np.log(0.1))
+        assert _cost(may, sd, channel) < 12
 
 
 def test_a_new_grip_and_unknown_samples_tell_nothing():
     values = np.array([0.0, 0.0, 3e-3, 3e-3, 9.0, 3e-3])
-    grips = np.eye(2)[[0, 0, 1, 1, 1, 1]]
-    weight = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0])
-    assert _cost(values, weight, np.full(6, 2e-5), np.zeros(6), grips) < 1.5
+    known = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0])
+    of, weight = _alone(values, 3)
+    new = (np.arange(6) == 2)[:, None]
+    assert _cost(_tracked(of, 2e-5, weight=known[:, None] * weight, new=new), 2e-5, 3) < 1.5
 
 
 def test_a_joint_lies_where_it_was_pushed_to():
@@ -48,28 +82,70 @@ def test_a_joint_lies_where_it_was_pushed_to():
     played = np.stack([play(each, width) for each in true.T], 1)
     recorded = played + 1e-4 * rng.standard_normal(true.shape)
     half, inner = width / 2, slice(10, -10)
-
-    def off_and_variance(rates, unseen: float) -> tuple[np.ndarray, np.ndarray]:
-        world = world_of(performance())._replace(
-            t=np.asarray(t)[None], joints=np.asarray(recorded)[None], rates=np.asarray(rates)[None]
-        )
-        place, variance = (
-            np.asarray(z)[0, inner] for z in within(world, np.asarray(half), np.asarray(unseen))
-        )
-        return ((true - recorded)[inner] - place) / half, variance / half**2
-
+    world = world_of(performance())._replace(t=t[None], joints=recorded[None])
     # An encoder's speeds say nothing of the dead band.
-    off, blind = off_and_variance(np.gradient(recorded, t, axis=0), 1.0)
-    sure = blind < 0.02
-    assert sure.mean() > 0.7
-    assert np.sqrt(np.mean(off[sure] ** 2)) < 0.15
-    assert 0.3 < np.sqrt(np.mean(off[~sure] ** 2 / blind[~sure])) < 1.5
+    band = within(world._replace(rates=np.gradient(recorded, t, axis=0)[None]), half, 1.0)
+    off, pinned = (((true - recorded) - band.place[0]) / half)[inner], band.pinned[0, inner]
+    assert pinned.mean() > 0.6
+    assert np.sqrt(np.mean(off[pinned] ** 2)) < 0.15
+    assert np.abs(off[~pinned]).max() < 2.2 and (band.jump > 0).all() and not band.wander.any()
     # A tachometer's say how the joint crosses it.
-    off, variance = off_and_variance(
-        np.gradient(true, t, axis=0) + 2e-3 * rng.standard_normal(true.shape), 0.0
-    )
-    assert variance.sum() < 0.2 * blind.sum()
+    rates = np.gradient(true, t, axis=0) + 2e-3 * rng.standard_normal(true.shape)
+    band = within(world._replace(rates=rates[None]), half, 0.0)
+    off = (((true - recorded) - band.place[0]) / half)[inner]
     assert np.sqrt(np.mean(off**2)) < 0.15
+    assert not band.jump.any() and (band.wander > 0).all()
+
+
+def test_joints_in_dead_bands_are_marginalised_exactly():
+    """Without jumps: the joint normal density of all values, given the first of each constant."""
+    rng = np.random.default_rng(0)
+    n, sd, jump = 7, 0.03, 0.5
+    levers, values = rng.standard_normal((n, 4, 2)), rng.standard_normal((n, 4))
+    pinned = np.zeros((n, 2), bool)
+    pinned[3, 0] = True
+    place = rng.standard_normal((n, 2))
+    out, factor, cost = _tracked(values, sd, joints=(levers, pinned, place, jump))
+    assert cost == 0.0
+    # The oracle: states as sums of steps, one joint set anew at the fourth sample.
+    mean, covariance = np.zeros((n, 2)), np.zeros((2, n, n))
+    for j in range(2):
+        start, first = (3, 0.0) if j == 0 else (0, jump)
+        for k in range(n):
+            mean[k, j] = place[3, 0] if j == 0 and k >= 3 else place[0, j]
+            for m in range(n):
+                if (k >= 3) == (m >= 3) or j == 1:
+                    since = min(k, m) - (start if j == 1 or min(k, m) >= 3 else 0)
+                    covariance[j, k, m] = (jump if j == 0 and min(k, m) < 3 else first) + 1e-6 * since
+    lever = levers.reshape(-1, 2)
+    sample, constant = np.repeat(np.arange(n), 4), np.tile([0, 1, 3, 2], n)
+    whole = sum(np.outer(lever[:, j], lever[:, j]) * covariance[j][np.ix_(sample, sample)] for j in range(2))
+    same = (constant[:, None] == constant) & (constant != 3)
+    whole = whole + ANYWHERE**2 * same + sd**2 * np.eye(4 * n)
+    expected = (lever * mean[sample]).sum(1)
+    told = ~((sample == 0) & (constant != 3))  # constants of which nothing is known at first
+    full = multivariate_normal(expected, whole).logpdf(values.ravel())
+    known = multivariate_normal(expected[~told], whole[np.ix_(~told, ~told)]).logpdf(values.ravel()[~told])
+    z = out[0].ravel()[told] ** 2 / (sd**2 * factor[0].ravel()[told])
+    got = -0.5 * float((z + np.log(factor[0].ravel()[told]) + np.log(2 * np.pi * sd**2)).sum())
+    assert got == pytest.approx(full - known, rel=0.05)
+
+
+def test_a_joint_that_jumps_unseen_costs_one_choice_and_is_followed():
+    n, sd = 30, 0.01
+    place = np.where(np.arange(n) < 12, -1.0, 1.0)[:, None] * np.ones(2)
+    levers = np.zeros((n, 4, 2))
+    levers[:, 2] = 1.0
+    rng = np.random.default_rng(0)
+    values = (levers * place[:, None]).sum(-1) + sd * rng.standard_normal((n, 4))
+    start = np.full((n, 2), -1.0)
+    joints = levers, np.zeros((n, 2), bool), start, 4 / 3
+    out, factor, cost = _tracked(values, sd, joints=joints, shares=(0.0, 1.0), chance=(0.9, 0.1))
+    assert cost == pytest.approx(-(n - 1) * np.log(0.9) - np.log(0.1), abs=2.5)  # at the start it may as well
+    jumped = np.flatnonzero(factor[0, :, 2] > 1e3)
+    assert 12 in jumped and jumped.size <= 2
+    others = np.setdiff1d(np.arange(2, n), jumped)
+    assert np.sqrt(np.mean(out[0, others, 2] ** 2 / factor[0, others, 2])) < 1.5 * sd
 
 
 def _ringing(frequency=6.0, damping=0.05, drive=0.3):

@@ -108,28 +108,6 @@ def test_a_block_that_turns_frees_all_but_where_it_stands(given):
 
 
 @double_precision
-def test_angles_in_doubt_widen_positions_by_what_they_move(given):
-    """A variance of angles is that of the block's place and of the fingers' distance, by differences."""
-    frame, variance, step = given.frame, 1e-6, 1e-6
-    world = frame.world
-    noise = np.asarray(np.where(frame.arrays.sd > 0, frame.arrays.sd, 1.0))
-    doubtful = world._replace(doubt_joints=np.full_like(world.joints, variance))
-    sure, wide = (
-        np.asarray(residuals(w, frame.arrays, np.asarray(given.centre), noise)[1]) for w in (world, doubtful)
-    )
-    more = (wide - sure)[..., :4] * np.square(np.asarray(noise)[..., :4])
-    expected = np.zeros_like(more)
-    for k in range(4):
-        turned = world._replace(joints=world.joints + step * np.eye(4)[k])
-        x1, y1, x2, y2 = np.moveaxis(np.asarray((tips(turned)[0] - tips(world)[0]) / step), -1, 0)
-        expected += variance * np.stack([(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], -1) ** 2
-    firm = np.asarray(world.carry) > 0  # a block in the air is held firmly but at the ends
-    share = (more[firm] / expected[firm])[:, [0, 1, 2, 3]]
-    assert np.median(share, axis=0) == pytest.approx(np.ones(4), rel=0.05)
-    assert (share < 1.01).all() and (wide >= sure - 1e-12).all()
-
-
-@double_precision
 def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_no_weight(given):
     a, (column,) = given.frame.arrays, _inertial(given)
     there, free = given.whitening.weight > 0, a.phase[..., Phase.FREE] > 0
@@ -171,8 +149,8 @@ def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
         pushed = arrays.pushed.copy()
         pushed[0, at] += seen
         other = arrays._replace(pushed=pushed)
-        raw, factor = residuals(_moved(world, by), other, given.centre, given.noise)
-        usual, _ = residuals(world, other, given.centre, given.noise)
+        raw, factor, _ = residuals(_moved(world, by), other, given.centre, given.noise)
+        usual, _, _ = residuals(world, other, given.centre, given.noise)
         after = mine[mine > at]  # a filter is off where the step is, and knows it
         left[seen] = float(np.abs(raw - usual)[0, after, x].max())
         assert (factor[0, at, x] > 5) == (seen > 0)
@@ -186,6 +164,8 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     change = [residuals(w, arrays, given.centre, given.noise)[0][..., offset] for w in (world, tilted)]
     change = (change[1] - change[0])[0] * (arrays.there[0, :, offset] > 0)
     held, move = arrays.onehot[0, :, 0] > 0, width[0][arrays.onehot[0, :, 0] > 0][0]
-    air = np.median(change[held & (arrays.phase[0, :, Phase.CARRY] > 0)])
-    ground = np.median(change[held & (arrays.phase[0, :, Phase.PICKUP] > 0) & (change != 0)])
-    assert air - ground == pytest.approx(0.02 * 0.8 * move, rel=0.05)
+    there = held & (arrays.there[0, :, offset] > 0)
+    # Predictions from the samples before miss it once, at the first that is in the air.
+    first = np.flatnonzero(there & (arrays.phase[0, :, Phase.CARRY] > 0))[0]
+    assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05)
+    assert np.abs(change[:first]).max() < 1e-9

@@ -33,11 +33,8 @@ def test_a_grip_is_firm_by_what_it_usually_is(grip, holds):
     assert firm[5] > 0.95
 
 
-def test_a_light_grip_is_firm_where_it_is_usual():
+def test_a_light_grip_is_firm_where_it_is_usual_and_nothing_is_held_by_less_than_noise():
     assert (grips([])[10:] > 0.95).all()
-
-
-def test_nothing_is_held_by_less_than_noise():
     grip = np.full((1, 20), 0.5 * HELD)
     assert (np.asarray(firmness(grip, np.ones_like(grip), np.asarray(MOVES))) < 0.1).all() and 0 < LOOSE < 1
 

@@ -69,14 +69,7 @@ def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypat
 
 @pytest.mark.slow
 def test_a_bias_is_named_with_figures_and_page(folder):
-    outputs = [
-        "--json",
-        str(folder / "d.json"),
-        "--figures",
-        str(folder / "f"),
-        "--report",
-        str(folder / "p.html"),
-    ]
+    outputs = ["--json", f"{folder}/d.json", "--figures", f"{folder}/f", "--report", f"{folder}/p.html"]
     assert main(arguments(folder, *outputs, "--quiet")) == 0
     document = json.loads((folder / "d.json").read_text())
     assert document["format"] == "hmmseg.diagnose/1"

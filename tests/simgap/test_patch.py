@@ -10,8 +10,7 @@ from simgap_scenes import HAND, STACK
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig
 from simgap.gap.twins import performed, recorded
-from simgap.patch import files, replayed
-from simgap.patch.write import checked
+from simgap.patch import checked, files, replayed
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.replay import replay
 

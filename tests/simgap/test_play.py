@@ -25,9 +25,9 @@ from hmmseg.io.task import read_task
 from hmmseg.segmentation.align import align
 from hmmseg_cli.main import main
 from hmmseg_cli.play import diagnosed
-from simgap.play.felt import effect_values, felt_effects, scene_with, sensed
 from simgap.play.server import PlayServer
 from simgap.play.session import Session, default_rig, default_task
+from simgap.play.world import effect_values, felt_effects, scene_with, sensed
 from simgap.world.properties import PAPER_BLOCKS
 
 
@@ -38,7 +38,7 @@ def made() -> Session:
 
 @pytest.fixture
 def session(made):
-    made.beside(None)
+    made.compare_with(None)
     return made
 
 
@@ -105,7 +105,7 @@ def test_numbers_that_are_none_change_nothing(session, tmp_path):
 
 
 def test_an_effect_beside_is_felt(session):
-    session.beside(session.world_with({"force_gain": {"gain": 0.5}}))
+    session.compare_with(session.world_with({"force_gain": {"gain": 0.5}}))
     session.aim(session.x["block1"], 0.008, False)
     session.advance(1500)
     session.aim(session.x["block1"], 0.008, True)

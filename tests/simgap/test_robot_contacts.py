@@ -77,7 +77,7 @@ def test_each_log_has_its_own_shift_and_no_component_of_a_turn_a_gain():
 
 def test_a_brief_touch_counts_and_a_brief_break_does_not():
     pytest.importorskip("mujoco")
-    from simgap.simulators.mjcf.touching import closed
+    from simgap.simulators.mjcf.model import closed
 
     t = np.arange(12) * 0.01
     pair, none = frozenset({"cube on board"}), frozenset()

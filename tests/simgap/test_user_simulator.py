@@ -102,22 +102,16 @@ run.parameters, run.channels, run.timeout = parameters, channels, 0.5
         ("recording.t[0] = 7", r"robot\.py, line 7: ValueError: assignment destination is read-only"),
         ("return None", r"robot\.py, line 6: gave None; expected a dict of channels"),
         ("return {}", r"robot\.py, line 6: gave no channel 'y'; expected y"),
-        (
-            "return {'y': recording.t[1:]}",
-            r"line 6: channel y: gave an array \(2,\) of float64; ",
-        ),
+        ("return {'y': recording.t[1:]}", r"line 6: channel y: gave an array \(2,\) of float64; "),
         ("return {'y': 1.0}", r"channel y: gave float '1.0'; expected 3 numbers"),
         ("return {'y': None}", r"channel y: gave None; expected 3 numbers"),
         ("return {'y': ['a', 'b', 'c']}", r"channel y: gave list of 3; expected real numbers"),
         ("return {'y': [1, None, 10**400]}", r"channel y: gave list of 3; expected real numbers"),
         ("return {'y': recording.t * 1j}", r"of complex128; expected real numbers"),
         ("return {'y': [[1], [2, 3], 4]}", r"robot\.py.*: ValueError"),
-        (
-            "while True: time.sleep(0.01)",
-            r"robot\.py, line 7: took more than 0.5 s; expected a run",
-        ),
+        ("while True: time.sleep(0.01)", r"robot\.py, line 7: took more than 0.5 s; expected a run"),
     ],
-)
+)  # fmt: skip
 def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, line):
     simulator = load_simulator(f"{file(RUN % code)}:run")
     log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
@@ -133,15 +127,11 @@ def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, 
         ("simulate_many", "return [{'y': [1]}]", "channel y: gave list of 1; expected 3 numbers"),
         ("simulate_many", "return 3", "TypeError"),
         ("state_at", "return {'y': 1.0}", r"expected \{state: \(value, standard deviation\)\}"),
-        (
-            "state_at",
-            "return {'y': (float('nan'), 1.0)}",
-            "state y: nan with standard dev",
-        ),
+        ("state_at", "return {'y': (float('nan'), 1.0)}", "state y: nan with standard dev"),
         ("contacts", "return None", r"gave None; expected times \[s\] in one row"),
         ("contacts", "exit(3)", "line 10: SystemExit: 3"),
     ],
-)
+)  # fmt: skip
 def test_what_else_a_simulator_offers_is_checked_alike(file, name, code, line):
     text = RUN % "return {'y': recording.t}" + f"def more(*args):\n    {code}\nrun.{name} = more\n"
     simulator = load_simulator(f"{file(text)}:run")

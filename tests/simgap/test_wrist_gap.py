@@ -22,19 +22,13 @@ def read_all(recordings, **said):
     return [read_trial(columns, rig) for columns in recordings], rig
 
 
-def test_channels_that_a_wrist_has_not_are_compared_with_nothing(recordings):
-    trials, rig = read_all(recordings)
-    there = build(align(trials, TASK, rig)).arrays.there
-    seen = {name for k, name in enumerate(CHANNELS) if there[..., k].any()}
-    assert seen == {"x", "y", "fx", "fy"}
-
-
-def test_a_grip_force_adds_the_grip(recordings):
+@pytest.mark.parametrize(("said", "more"), [({}, set()), ({"grip_force": "grip"}, {"distance", "grip"})])
+def test_channels_that_a_wrist_has_not_are_compared_with_nothing(recordings, said, more):
     with_grip = [columns | {"grip": np.where(columns["gap"] < 0.045, 10.0, 0.0)} for columns in recordings]
-    trials, rig = read_all(with_grip, grip_force="grip")
+    trials, rig = read_all(with_grip, **said)
     there = build(align(trials, TASK, rig)).arrays.there
     seen = {name for k, name in enumerate(CHANNELS) if there[..., k].any()}
-    assert seen == {"x", "y", "fx", "fy", "distance", "grip"}
+    assert seen == {"x", "y", "fx", "fy"} | more
 
 
 def test_effects_of_one_finger_are_not_thought_of(recordings):

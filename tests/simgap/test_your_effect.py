@@ -15,7 +15,8 @@ from hmmseg.io.trial import Trial
 from simgap import channels, effects
 from simgap.generic import effects as of_ensembles
 from simgap.generic.diagnose import diagnose
-from simgap.play.felt import felt_effects
+from simgap.generic.trials import align
+from simgap.play.world import felt_effects
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
 from simgap.simulators.user import checked
@@ -70,6 +71,6 @@ def test_it_is_named_in_given_trials(step):
     changed = [
         Trial(t.file, t.t, t.channels | {"fa": step.read(t.t, t.channels["fa"], {"step": 1.0})}) for t in real
     ]
-    body = diagnose(changed, sim, TASK, boundaries=first | second).body
+    body = diagnose(align(changed, sim, TASK, boundaries=first | second)).body
     assert body["causes"] == ["force_step"]
     assert body["effects"]["force_step"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, rel=0.1)

@@ -7,23 +7,34 @@ motion.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
-from simgap.simulators.mjcf.laws import FADE, joint_law, most_of
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.play import played
-from simgap.simulators.mjcf.runs import HOLD, LATE, Runs
-from simgap.simulators.mjcf.settable import body_setting, payload_place, setting_of
-from simgap.simulators.mjcf.setting import Setting, name_of, names_of, object_id
+from simgap.simulators.mjcf.runs import Runs
+from simgap.simulators.mjcf.setting import (
+    FADE,
+    HOLD,
+    LATE,
+    Setting,
+    most_of,
+    name_of,
+    names_of,
+    nothing,
+    object_id,
+    payload,
+    payload_place,
+    setting_of,
+)
 from simgap.simulators.mjcf.transmission import (
     SHARE,
     Motion,
     elasticity,
-    gravity_compensation,
     motion_of,
     sizes_of,
 )
@@ -61,8 +72,7 @@ def offered(
     catalogue.add_play(joints, motions, {log.name: log for log in recordings})
     simulator.__post_init__()
     simulator.prepare(recordings)
-    beyond = (gravity_compensation, elasticity)
-    return [effect for family in beyond for effect in family(simulator, recordings, motions, joints)]
+    return elasticity(simulator, recordings, motions, joints)
 
 
 class _Catalogue:
@@ -78,7 +88,7 @@ class _Catalogue:
             effect: str | None = None, setting: Setting | None = None) -> None:  # fmt: skip
         """A parameter about the model's own value, unless it has no size; an effect may have several."""
         setting = setting_of(self.model, name) if setting is None else setting
-        nominal = setting.get(self.model)
+        nominal = setting.nominal
         if not sd > 0 or not np.isfinite(sd):
             return
         self.settings[name] = setting
@@ -102,7 +112,7 @@ class _Catalogue:
                 ("stiffness", size.torque / size.reach),
             ):
                 setting = setting_of(self.model, f"joint:{name}.{attribute}")
-                sd = max(SHARE * scale, SIZE * abs(setting.get(self.model)))
+                sd = max(SHARE * scale, SIZE * abs(setting.nominal))
                 self.add(setting.name, sd, f"{SAYS[attribute]} of {name}", low=0.0)
             self._add_laws(name, SHARE * size.torque, size.rate)
 
@@ -116,9 +126,9 @@ class _Catalogue:
         self.add(f"{head}.quadratic_drag", torque / rate**2, says, low=0.0)
         says = f"friction of {joint} larger near standstill, by extra exp(-(rate / speed)^2)"
         self.add(f"{head}.stribeck_extra", torque, says, low=0.0, effect=f"{head}.stribeck")
-        speed = joint_law(self.model, joint, "stribeck_speed", 0.3 * rate)
+        speed = replace(setting_of(self.model, f"{head}.stribeck_speed"), nominal=0.3 * rate)
         low = 0.03 * rate
-        self.add(f"{head}.stribeck_speed", 0.1 * rate, says, low, effect=f"{head}.stribeck", setting=speed)
+        self.add(speed.name, 0.1 * rate, says, low, effect=f"{head}.stribeck", setting=speed)
 
     def add_actuators(self) -> None:
         """Gains, velocity gains and saturation of actuators that a log drives."""
@@ -168,11 +178,8 @@ class _Catalogue:
         elif stated is not None:
             at = np.array(stated)
         where = ", ".join(f"{1e3 * x:.0f}" for x in at)
-        name = f"body:{body}.payload"
-        self.add(name, SIZE * _largest(m), f"a load on {body}, at {where} mm in its frame", low=0.0)
-        setting = body_setting(m, body, "payload", np.array(at))
-        assert setting is not None
-        self.settings[name] = setting
+        setting, says = payload(m, body, np.array(at)), f"a load on {body}, at {where} mm in its frame"
+        self.add(setting.name, SIZE * _largest(m), says, low=0.0, setting=setting)
 
     def add_play(
         self, joints: Sequence[int], motions: Sequence[Motion], logs: Mapping[str, Recording]
@@ -200,15 +207,15 @@ class _Catalogue:
             made[found.width] = found
             sd = GAP * sizes_of(motions, j).reach
             self.parameters[found.width] = Parameter(0.0, sd, unit, low=0.0, effect=effect)
-            self.settings[found.width] = Setting(
-                found.width, unit, lambda model: 0.0, lambda model, value: None, False, None
-            )
+            self.settings[found.width] = Setting(found.width, unit, 0.0, nothing, stored=False)
             self.says[effect] = f"play between motor and {name}"
         simulator.played = made
 
     def add_options(self) -> None:
         """Gravity's direction, and of the simulation its step, its solver and how it holds commands."""
         if np.linalg.norm(self.model.opt.gravity) > 0:
+            says = "drives carry this share of the weights by themselves (gravity compensation)"
+            self.add("drive.gravity_compensation", 0.1, says, low=-0.5, high=1.5)
             for axis in ("tilt_x", "tilt_y"):
                 self.add(f"option.{axis}", 0.01, "the base is tilted", effect="gravity.direction")
         says = "the simulator's own time step, relative"
@@ -239,10 +246,10 @@ class _Catalogue:
             self.add(f"geom:{name}.size", 0.01, f"size of {name}", low=-0.5)
 
     def add_named(self, named: Sequence[str]) -> None:
-        """What the user asks for beyond these."""
+        """What the user names beyond these."""
         for name in named:
             if name not in self.parameters:
-                nominal = setting_of(self.model, name).get(self.model)
+                nominal = setting_of(self.model, name).nominal
                 self.add(name, SIZE * abs(nominal) if nominal else 0.01)
 
 

@@ -21,40 +21,9 @@ from typing import Any
 import numpy as np
 
 from simgap.simulators.mjcf.engine import mujoco
-from simgap.simulators.mjcf.setting import Setting, object_id
+from simgap.simulators.mjcf.setting import FADE, OF_JOINTS, most_of, object_id
 
-OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
-FADE = "fade"  # of an actuator
 MOTOR = ":motor"  # behind a joint's name: of the motor, where it is a body of its own
-
-
-def law_setting(name: str, unit: str, nominal: float = 0.0) -> Setting:
-    """The setting of a law's parameter, which is none of the compiled model's own."""
-    return Setting(name, unit, lambda model: nominal, lambda model, value: None, False, None)
-
-
-def joint_law(model: Any, name: str, attribute: str, nominal: float = 0.0) -> Setting | None:
-    """The setting of a law of a joint; None where there is no such law."""
-    turning = int(model.jnt_type[object_id(model, "joint", name)]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-    force, rate = ("N m", "rad/s") if turning else ("N", "m/s")
-    units = dict(zip(OF_JOINTS, ("1", force, force, rate, f"{force} {rate}^-2"), strict=True))
-    units["quadratic_drag"] = "N m s^2/rad^2" if turning else "N s^2/m^2"
-    return (
-        None
-        if attribute not in units
-        else law_setting(f"joint:{name}.{attribute}", units[attribute], nominal)
-    )
-
-
-def most_of(model: Any, actuator: int) -> float:
-    """The largest force that an actuator can give, 0 where the model states none."""
-    if model.actuator_forcelimited[actuator]:
-        return float(np.abs(model.actuator_forcerange[actuator]).max())
-    if model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator, 1]:
-        return abs(float(model.actuator_gainprm[actuator, 0])) * float(
-            np.abs(model.actuator_ctrlrange[actuator]).max()
-        )
-    return 0.0
 
 
 @dataclass(frozen=True)
@@ -108,25 +77,24 @@ def _friction(model: Any, joint: str, own: Mapping[str, float]) -> _Friction:
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Sensors (B, steps, sensors) of runs from full states (B, size) with controls, and behind these applied
-    torques, (B, steps, width): as `mujoco.rollout` gives them, with laws that act."""
+    """Sensors (B, steps, sensors) of runs from full states (B, size) with controls (B, steps, actuators), as
+    `mujoco.rollout` gives them, with laws that act."""
     out = np.empty((*control.shape[:2], model.nsensordata))
-    spec, nu = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), model.nu
-    plain, applied = np.array(model.dof_frictionloss), control.shape[2] > nu
+    spec, plain = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), np.array(model.dof_frictionloss)
     step, limit, rate = mujoco.mj_step, model.dof_frictionloss, data.qvel
     motor, bias, force, pushed = data.qfrc_actuator, data.qfrc_bias, data.actuator_force, data.qfrc_applied
-    extra = applied or bool(laws.fading) or any(f.drag for f in laws.friction)
+    extra = bool(laws.fading) or any(f.drag for f in laws.friction)
     try:
         for b in range(len(first)):
             limit[:] = plain
             mujoco.mj_resetData(model, data)
             mujoco.mj_setState(model, data, first[b], spec)
-            data.ctrl[:] = control[b, 0, :nu]
+            data.ctrl[:] = control[b, 0]
             mujoco.mj_forward(model, data)
             data.qacc_warmstart[:] = 0.0
             for k in range(control.shape[1]):
                 if extra:
-                    pushed[:] = control[b, k, nu:] if applied else 0.0
+                    pushed[:] = 0.0
                 for f in laws.friction:
                     d, w = f.dof, float(rate[f.dof])
                     most = plain[d]
@@ -142,7 +110,7 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
                 for a, by, arm in laws.fading:
                     now = float(force[a])
                     pushed -= by * abs(now) * now * arm
-                data.ctrl[:] = control[b, k, :nu]
+                data.ctrl[:] = control[b, k]
                 step(model, data)
                 out[b, k] = data.sensordata
     finally:

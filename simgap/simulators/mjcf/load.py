@@ -7,16 +7,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.units import UNITS, known_unit, unwrapped
 from simgap.robot_effects.base import RobotEffect
-from simgap.simulators.mjcf.map import Map, Mapped, read_map
+from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
+
+if TYPE_CHECKING:
+    from simgap.simulators.mjcf.model import MjcfSimulator
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Loaded:
     """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs; `digest`:
     a hash of model and map."""
 
-    simulator: Any
+    simulator: MjcfSimulator
     map: Map
     candidates: Sequence[str]
     warnings: tuple[str, ...]
@@ -38,21 +41,21 @@ class Loaded:
             [name for name, mapped in columns.items() if mapped.kind == "command"], self.simulator.acts,
         )  # fmt: skip
         values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
-        told = list(raw.warnings)
+        warnings = list(raw.warnings)
         for name, mapped in columns.items():
             if mapped.kind == "command":  # a drive holds it until the next
                 values[name] = held(values[name])
             elif mapped.thing == "joint" and mapped.kind == "position" and self.turns(mapped.name):
                 wrapped, values[name] = values[name], unwrapped(values[name])
                 if not np.array_equal(wrapped, values[name], equal_nan=True):
-                    told.append(f"{path}: column {name} jumps by whole turns, which were taken out")
+                    warnings.append(f"{path}: column {name} jumps by whole turns, which were taken out")
         log = raw.with_columns(values)
         for pose in self.simulator.free.values():
-            log = continuous(log, [pose[a] for a in ("qw", "qx", "qy", "qz")])
+            log = continuous(log, [pose[a] for a in POSE[3:]])
         _check_ranges(self.simulator.model, columns, log, str(path))
         _check_goals(self.simulator, log, str(path))
-        told += _clipped(self.simulator, log, str(path))
-        return replace(log, warnings=tuple(told))
+        warnings += _clipped(self.simulator, log, str(path))
+        return replace(log, warnings=tuple(warnings))
 
     def turns(self, joint: str) -> bool:
         """Whether a joint is a hinge, whose angle may be recorded with jumps by whole turns."""
@@ -69,7 +72,20 @@ class Loaded:
 
 
 def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Loaded:
-    """Read and check a model and its map; InputError names the file and the column or thing at fault."""
+    """Read and check a model and its map.
+
+    Args:
+        xml: The MJCF or URDF file.
+        map_file: Its map (TOML).
+        candidates: Names of further settings that are to be causes.
+
+    Returns:
+        The simulator, and how logs are read for it.
+
+    Raises:
+        InputError: MuJoCo is missing or does not read the model, or the map or a candidate names what the
+            model does not have.
+    """
     try:
         from simgap.simulators.mjcf.engine import mujoco
     except ImportError:
@@ -89,37 +105,27 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     if not SHORTEST <= plain.opt.timestep <= 1.0:
         raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
                          f"from {SHORTEST:g} to 1 s")  # fmt: skip
-    from simgap.simulators.mjcf.settable import setting_of
-    from simgap.simulators.mjcf.setting import names_of
+    from simgap.simulators.mjcf.setting import compiled, names_of, setting_of
 
-    for column in described.columns.values():
-        known = names_of(plain, column.thing)
-        if column.name not in known:
-            raise InputError(
-                f"{map_file}: columns.{column.column}",
-                f"the model has no {column.thing} {column.name}",
-                nearest(column.name, known),
-            )
+    def check(key: str, kind: str, name: str, known: Sequence[str]) -> None:
+        if name not in known:
+            raise InputError(f"{map_file}: {key}", f"the model has no {kind} {name}", nearest(name, known))
+
+    for column, m in described.columns.items():
+        check(f"columns.{column}", m.thing, m.name, names_of(plain, m.thing))
     if described.keyframe is not None:
-        keys = [plain.key(i).name for i in range(plain.nkey)]
-        if described.keyframe not in keys:
-            raise InputError(
-                f"{map_file}: keyframe",
-                f"the model has no {described.keyframe}",
-                nearest(described.keyframe, keys),
-            )
+        check("keyframe", "keyframe", described.keyframe, names_of(plain, "key"))
     for name in candidates:
         setting_of(plain, name)
     for body, place in described.payload_at.items():
-        for kind, one in (("body", body), *((("site", place),) if isinstance(place, str) else ())):
-            if one not in names_of(plain, kind):
-                known = nearest(one, names_of(plain, kind))
-                raise InputError(f"{map_file}: payload_at.{body}", f"the model has no {kind} {one}", known)
+        check(f"payload_at.{body}", "body", body, names_of(plain, "body"))
+        if isinstance(place, str):
+            check(f"payload_at.{body}", "site", place, names_of(plain, "site"))
     address = _add_sensors(mujoco, spec, described.columns)
     for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
         if hasattr(body, "simple"):
             body.simple = False
-    model = spec.compile()
+    model = compiled(spec)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     simulator, warnings = _simulator(mujoco, model, described, address)
     simulator.spec = spec
@@ -129,178 +135,140 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     return Loaded(simulator, described, candidates, tuple(warnings), digest)
 
 
+# By thing and kind: MuJoCo's sensor, and the SI unit of what turns and of what slides.
+READ = {
+    ("joint", "position"): ("JOINTPOS", "rad", "m"),
+    ("joint", "velocity"): ("JOINTVEL", "rad/s", "m/s"),
+    ("joint", "torque"): ("JOINTACTFRC", "N m", "N"),
+    ("actuator", "force"): ("ACTUATORFRC", "N m", "N m"),
+    ("sensor", "position"): ("", "m", "m"),
+    ("sensor", "velocity"): ("", "m/s", "m/s"),
+    ("sensor", "force"): ("", "N", "N"),
+    ("sensor", "torque"): ("", "N m", "N m"),
+}
+
+
 def _add_sensors(mujoco: Any, spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[str, int]]:
     """A sensor for each compared column: column -> (sensor's name, component)."""
-    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
-    made = {
-        ("joint", "position"): (kinds.mjSENS_JOINTPOS, objects.mjOBJ_JOINT),
-        ("joint", "velocity"): (kinds.mjSENS_JOINTVEL, objects.mjOBJ_JOINT),
-        ("joint", "torque"): (kinds.mjSENS_JOINTACTFRC, objects.mjOBJ_JOINT),
-        ("actuator", "force"): (kinds.mjSENS_ACTUATORFRC, objects.mjOBJ_ACTUATOR),
-    }
     out: dict[str, tuple[str, int]] = {}
-    for column in columns.values():
-        if column.kind == "command":
+    for column, m in columns.items():
+        if m.kind == "command":
             continue
-        if column.thing == "sensor":
-            axis = {"x": 0, "y": 1, "z": 2, "": 0}.get(column.axis)
-            out[column.column] = (column.name, int(column.axis) if axis is None else axis)
+        if m.thing == "sensor":
+            axis = {"x": 0, "y": 1, "z": 2, "": 0}.get(m.axis)
+            out[column] = (m.name, int(m.axis) if axis is None else axis)
             continue
-        name = f"hmmseg:{column.column}"
-        if column.thing in ("body", "site"):
-            turning = column.axis.startswith("q")
-            what = objects.mjOBJ_XBODY if column.thing == "body" else objects.mjOBJ_SITE
-            spec.add_sensor(
-                name=name,
-                type=kinds.mjSENS_FRAMEQUAT if turning else kinds.mjSENS_FRAMEPOS,
-                objtype=what,
-                objname=column.name,
-            )
-            at = ("qw", "qx", "qy", "qz").index(column.axis) if turning else "xyz".index(column.axis)
-            out[column.column] = (name, at)
-        else:
-            kind, what = made[column.thing, column.kind]
-            spec.add_sensor(name=name, type=kind, objtype=what, objname=column.name)
-            out[column.column] = (name, 0)
+        kind, what, at = READ.get((m.thing, m.kind), ("",))[0], m.thing, 0
+        if m.thing in ("body", "site"):
+            turning = m.axis.startswith("q")
+            kind, what = "FRAMEQUAT" if turning else "FRAMEPOS", "xbody" if m.thing == "body" else "site"
+            at = POSE.index(m.axis) - (3 if turning else 0)
+        spec.add_sensor(
+            name=f"hmmseg:{column}", type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"),
+            objtype=getattr(mujoco.mjtObj, f"mjOBJ_{what.upper()}"), objname=m.name,
+        )  # fmt: skip
+        out[column] = (f"hmmseg:{column}", at)
     return out
 
 
-def _simulator(mujoco: Any, model: Any, described: Map, address: Mapping[str, tuple[str, int]]):
+def _simulator(
+    mujoco: Any, model: Any, described: Map, address: Mapping[str, tuple[str, int]]
+) -> tuple[MjcfSimulator, list[str]]:
+    """The simulator of a model and its map, without parameters; what its columns leave open."""
     from simgap.simulators.mjcf.model import MjcfSimulator
+    from simgap.simulators.mjcf.setting import name_of, object_id
 
-    identity = lambda kind, name: mujoco.mj_name2id(model, kind, name)  # noqa: E731
-    objects = mujoco.mjtObj
+    file, kinds = described.file, mujoco.mjtJoint
     channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
-    for column in described.columns.values():
-        unit = _unit(mujoco, model, column)
-        _check_unit(described, column, unit)
-        channels[column.column] = Channel(unit, column.kind, column.noise)
-        if column.kind == "command":
-            driven[column.column] = identity(objects.mjOBJ_ACTUATOR, column.name)
+    for column, m in described.columns.items():
+        unit = _unit(mujoco, model, m)
+        _check_unit(f"{file}: columns.{column}.unit", m, unit)
+        channels[column] = Channel(unit, m.kind, m.sd)
+        if m.kind == "command":
+            driven[column] = object_id(model, "actuator", m.name)
             continue
-        sensor, at = address[column.column]
-        number = identity(objects.mjOBJ_SENSOR, sensor)
+        sensor, at = address[column]
+        number = object_id(model, "sensor", sensor)
         if at >= model.sensor_dim[number]:
-            raise InputError(
-                f"{described.file}: columns.{column.column}.axis",
-                f"sensor {column.name} has no {column.axis}",
-            )
-        sensors[column.column] = int(model.sensor_adr[number]) + at
-        if column.thing == "joint" and column.kind == "position":
-            joint = identity(objects.mjOBJ_JOINT, column.name)
-            if int(model.jnt_type[joint]) not in (
-                int(mujoco.mjtJoint.mjJNT_HINGE),
-                int(mujoco.mjtJoint.mjJNT_SLIDE),
-            ):
-                raise InputError(
-                    f"{described.file}: columns.{column.column}.joint",
-                    f"{column.name} is no hinge or slide",
-                    "the seven columns of its body's pose",
-                )
-            joints[column.column] = joint
-        if column.thing == "body":
-            poses.setdefault(column.name, {})[column.axis] = column.column
+            raise InputError(f"{file}: columns.{column}.axis", f"sensor {m.name} has no {m.axis}")
+        sensors[column] = int(model.sensor_adr[number]) + at
+        if m.thing == "joint" and m.kind == "position":
+            joints[column] = object_id(model, "joint", m.name)
+            if int(model.jnt_type[joints[column]]) not in (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)):
+                raise InputError(f"{file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
+                                 "the seven columns of its body's pose")  # fmt: skip
+        if m.thing == "body":
+            poses.setdefault(m.name, {})[m.axis] = column
     free = {}
     for name, pose in poses.items():
-        body = identity(objects.mjOBJ_BODY, name)
-        first = int(model.body_jntadr[body])
-        if first < 0 or int(model.jnt_type[first]) != int(mujoco.mjtJoint.mjJNT_FREE):
+        first = int(model.body_jntadr[object_id(model, "body", name)])
+        if first < 0 or int(model.jnt_type[first]) != int(kinds.mjJNT_FREE):
             continue
-        missing = [a for a in ("x", "y", "z", "qw", "qx", "qy", "qz") if a not in pose]
+        missing = [a for a in POSE if a not in pose]
         if missing:
             warnings.append(
-                f"{described.file}: the free body {name} has no column for {', '.join(missing)}, so that "
+                f"{file}: the free body {name} has no column for {', '.join(missing)}, so that "
                 "it starts as the model has it"
             )
         else:
             free[first] = pose
-    untold = [n for n in _commands_untold(mujoco, model, driven)]
-    if untold:
-        warnings.append(
-            f"{described.file}: no column drives {', '.join(untold)}; they are left at zero or the keyframe"
-        )
+    idle = [i for i in range(model.nu) if i not in driven.values()]
+    if idle:
+        names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
+        warnings.append(f"{file}: no column drives {names}; they are left at zero or the keyframe")
     touching = bool(np.any((model.geom_contype != 0) | (model.geom_conaffinity != 0))) and not (
         model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
-    whole = {name: pose for name, pose in poses.items() if len(pose) == 7}
+    whole = {name: pose for name, pose in poses.items() if len(pose) == len(POSE)}
     made = MjcfSimulator(model, described, channels, {}, {}, sensors, joints, driven, free, touching, whole)
     return made, warnings
 
 
-def _commands_untold(mujoco: Any, model: Any, driven: Mapping[str, int]) -> list[str]:
-    driven_names = set(driven.values())
-    return [
-        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator {i}"
-        for i in range(model.nu)
-        if i not in driven_names
-    ]
-
-
-def _unit(mujoco: Any, model: Any, column: Mapped) -> str:
+def _unit(mujoco: Any, model: Any, m: Mapped) -> str:
     """The SI unit of a column as the model has it."""
-    if column.thing == "joint":
-        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, column.name)
-        turning = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-        return {
-            "position": "rad" if turning else "m",
-            "velocity": "rad/s" if turning else "m/s",
-            "torque": "N m" if turning else "N",
-        }[column.kind]
-    if column.thing == "actuator":
-        return "N m" if column.kind == "force" else "1" if column.unit is None else column.unit
-    if column.thing in ("body", "site"):
-        return "1" if column.axis.startswith("q") else "m"
-    return {"position": "m", "velocity": "m/s", "force": "N", "torque": "N m"}[column.kind]
+    if m.kind == "command":
+        return "1" if m.unit is None else str(m.unit)
+    if m.thing in ("body", "site"):
+        return "1" if m.axis.startswith("q") else "m"
+    turns = m.thing == "joint" and int(model.joint(m.name).type.item()) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    return READ[m.thing, m.kind][1 if turns else 2]
 
 
-def _check_unit(described: Map, column: Mapped, si: str) -> None:
+def _check_unit(where: str, m: Mapped, si: str) -> None:
     """InputError where a joint's, body's or site's column has the unit of something else."""
-    given = None if not isinstance(column.unit, str) else known_unit(column.unit)
-    if given is None or column.thing not in ("joint", "body", "site"):
+    given = known_unit(m.unit) if isinstance(m.unit, str) else None
+    if given is None or m.thing not in ("joint", "body", "site"):
         return
     wanted = UNITS[known_unit(si) or si][0]
     if UNITS[given][0] != wanted:
-        raise InputError(
-            f"{described.file}: columns.{column.column}.unit",
-            f"{column.unit!r} of a {column.kind} that is read in {si}",
-            f"a unit of {wanted}",
-        )
+        raise InputError(where, f"{m.unit!r} of a {m.kind} that is read in {si}", f"a unit of {wanted}")
 
 
 SHORTEST = 1e-6  # limit: s of a solver's step; a second of it would take minutes
 LATITUDE = 0.2  # limit: share of a joint's range by which a log may exceed it
+FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; the range of a joint that states none
 
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
     """InputError where angles are so large that they must be degrees, never guessed."""
     from simgap.simulators.mjcf.engine import mujoco
 
-    for column in columns.values():
-        if column.thing != "joint" or column.kind != "position":
+    for column, m in columns.items():
+        if m.thing != "joint" or m.kind != "position":
             continue
-        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, column.name)
+        joint = model.joint(m.name).id
         turning = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-        values = log[column.column]
+        values = log[column]
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        limited = bool(model.jnt_limited[joint])
-        reach = (
-            (float(model.jnt_range[joint][0]), float(model.jnt_range[joint][1]))
-            if limited
-            else (-math.tau * 4, math.tau * 4)
-        )
-        slack = LATITUDE * (reach[1] - reach[0])
-        if reach[0] - slack <= low and high <= reach[1] + slack:
-            continue
-        unit = "rad" if turning else "m"
-        guess = 'unit = "deg" in the map?' if turning else 'unit = "mm" in the map?'
-        raise InputError(
-            f"{file}: column {column.column}",
-            f"{low:.4g} to {high:.4g} {unit}, beyond joint {column.name}'s {reach[0]:.4g} to {reach[1]:.4g}",
-            guess,
-        )
+        least, most = (float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else FULL_TURNS
+        slack = LATITUDE * (most - least)
+        if not (least - slack <= low and high <= most + slack):
+            unit, guess = ("rad", "deg") if turning else ("m", "mm")
+            found = f"{low:.4g} to {high:.4g} {unit}, beyond joint {m.name}'s {least:.4g} to {most:.4g}"
+            raise InputError(f"{file}: column {column}", found, f'unit = "{guess}" in the map?')
 
 
-def _check_goals(simulator: Any, log: Recording, file: str) -> None:
+def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     """InputError where a servo's goals are its joint's angles in other units, never guessed."""
     from simgap.simulators.mjcf.engine import mujoco
 
@@ -328,7 +296,7 @@ def _check_goals(simulator: Any, log: Recording, file: str) -> None:
 SAME = math.log(2.0)  # limit: a servo that follows its goals at less or more than this factor follows none
 
 
-def _clipped(simulator: Any, log: Recording, file: str) -> list[str]:
+def _clipped(simulator: MjcfSimulator, log: Recording, file: str) -> list[str]:
     """The warning about commands that the model clips."""
     model, out = simulator.model, []
     for column, a in simulator.driven.items():

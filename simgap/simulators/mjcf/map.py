@@ -11,189 +11,160 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from hmmseg.errors import InputError, nearest
-from hmmseg.io.schema import LARGEST, read_toml
-from hmmseg.io.units import si_factor
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
+
+from hmmseg.errors import InputError
+from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable, read_toml, validated
+from hmmseg.io.units import Quantity
 from simgap.simulators.user import LONGEST
 
-THINGS = ("joint", "actuator", "sensor", "body", "site")
-AXES = {"body": ("x", "y", "z", "qw", "qx", "qy", "qz"), "site": ("x", "y", "z", "qw", "qx", "qy", "qz")}
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 KINDS = {
     "joint": ("position", "velocity", "torque"),
     "actuator": ("command", "force"),
     "sensor": ("position", "velocity", "force", "torque"),
     "body": ("position",),
     "site": ("position",),
-}
-KEYS = (*THINGS, "kind", "axis", "unit", "noise", "sign", "offset")
-TOP = ("columns", "time", "window", "keyframe", "uncertain", "sd", "payload_at")
+}  # what is read of a thing of the model; the first where none is stated
 
 
-@dataclass(frozen=True)
-class Mapped:
-    """One column: the `thing` of the model (`joint`, ...) by `name`, its `kind`, `axis`; `factor`, `offset`
-    take the column's values to SI, `noise` is in SI."""
-
-    column: str
-    thing: str
-    name: str
-    kind: str
-    axis: str
-    unit: str | None
-    factor: float
-    offset: float
-    noise: float
+def _placed(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
+    try:
+        return check(value)
+    except ValidationError:
+        raise ValueError(f"{value!r:.40}; expected the name of a site, or [x, y, z] in m") from None
 
 
-@dataclass(frozen=True)
-class Map:
-    """The columns, the `time` column with its factor to s, windows' `length` [s], the `keyframe` to start
-    what no column tells from; `uncertain`: patterns of what was never measured, `sd` by name of what was;
+Place = Annotated[Name | tuple[Finite, Finite, Finite], WrapValidator(_placed)]
+
+
+class Mapped(Quantity):
+    """One column: the joint, actuator, sensor, body or site of the model that it records.
+
+    `kind` says what of it, `axis` which component; SI = sign * unit * column + offset; `noise` is in the
+    column's unit.
+    """
+
+    joint: Name | None = None
+    actuator: Name | None = None
+    sensor: Name | None = None
+    body: Name | None = None
+    site: Name | None = None
+    kind: str = ""
+    axis: str = ""
+    noise: FinitePositive | None = None
+    sign: Finite = 1.0
+    offset: Finite = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual_kind(cls, entry: Any) -> Any:
+        thing = next((t for t in KINDS if t in entry), None) if isinstance(entry, dict) else None
+        return entry if thing is None else {"kind": KINDS[thing][0]} | entry
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> Mapped:
+        named = [t for t in KINDS if getattr(self, t) is not None]
+        if len(named) != 1:
+            found = f"names {' and '.join(named)}" if named else "names no thing of the model"
+            raise ValueError(f"{found}; expected one of {', '.join(KINDS)}")
+        for key, known in (
+            ("kind", KINDS[self.thing]),
+            ("axis", POSE if self.thing in ("body", "site") else ()),
+        ):
+            if known and getattr(self, key) not in known:
+                found = f"{key} {getattr(self, key)!r} of a {self.thing}"
+                raise ValueError(f"{found}; expected one of {', '.join(known)}")
+        return self
+
+    @property
+    def thing(self) -> str:
+        """Which kind of thing it is of."""
+        return next(t for t in KINDS if getattr(self, t) is not None)
+
+    @property
+    def name(self) -> str:
+        """The thing's name in the model."""
+        return str(getattr(self, self.thing))
+
+    @property
+    def factor(self) -> float:
+        """What the column is multiplied by to be in SI."""
+        return self.size * self.sign
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation of a sample's noise in SI; NaN where it is not stated."""
+        return math.nan if self.noise is None else abs(self.factor) * self.noise
+
+
+class Clock(Quantity):
+    """The column of times, and its unit."""
+
+    column: Name = "t"
+
+
+class Map(StrictTable):
+    """The columns, their `clock`, the length of the windows that are compared [s], the `keyframe` to start
+    from what no column gives; `uncertain`: patterns of what was never measured, `sd` by name of what was;
     `payload_at`: by body the site at which it carries a load, or that place [m] in the body's frame."""
 
-    file: str
-    columns: Mapping[str, Mapped]
-    time: str = "t"
-    time_factor: float = 1.0
-    length: float | None = None
-    keyframe: str | None = None
-    uncertain: tuple[str, ...] = ()
-    sd: Mapping[str, float] = field(default_factory=dict)
-    payload_at: Mapping[str, str | tuple[float, ...]] = field(default_factory=dict)
+    model_config = ConfigDict(populate_by_name=False)
+
+    columns: dict[Name, Mapped] = Field(min_length=1)
+    clock: Annotated[
+        Clock, BeforeValidator(lambda given: {"column": given} if isinstance(given, str) else given)
+    ] = Field(default=Clock(), alias="time")
+    length: Annotated[float, Field(gt=0, le=LONGEST, strict=True)] | None = Field(
+        default=None, alias="window"
+    )
+    keyframe: Name | None = None
+    uncertain: tuple[Name, ...] = ()
+    sd: dict[Name, FinitePositive] = Field(default_factory=dict)
+    payload_at: dict[Name, Place] = Field(default_factory=dict)
+    _file: str = ""
+
+    @field_validator("columns")
+    @classmethod
+    def _compared(cls, columns: dict[str, Mapped]) -> dict[str, Mapped]:
+        if all(m.kind == "command" for m in columns.values()):
+            raise ValueError("are all commands: nothing to compare; expected a joint, sensor or body")
+        return columns
+
+    @property
+    def file(self) -> str:
+        """The file that it was read from."""
+        return self._file
+
+    @property
+    def time(self) -> str:
+        """The name of the time column."""
+        return self.clock.column
+
+    @property
+    def time_factor(self) -> float:
+        """Its unit [s]."""
+        return self.clock.size
 
 
 def read_map(path: Path) -> Map:
     """The map of a TOML file; InputError names the key at fault."""
-    raw = read_toml(path)
-    for key in raw:
-        if key not in TOP:
-            raise InputError(f"{path}: {key}", "unknown key", nearest(key, TOP))
-    columns = raw.get("columns", {})
-    if not isinstance(columns, dict) or not columns:
-        raise InputError(f"{path}: columns", "missing", "a table [columns.NAME] for each column of the logs")
-    time = raw.get("time", {})
-    time = {"column": time} if isinstance(time, str) else time
-    if not isinstance(time, dict) or not isinstance(time.get("column", ""), str):
-        raise InputError(
-            f"{path}: time", f"found {time!r:.40}", 'a column\'s name, or {column = "...", unit = "..."}'
-        )
-    window, keyframe = _number(raw, "window", str(path)), raw.get("keyframe")
-    if window is not None and not 0 < window <= LONGEST:
-        raise InputError(f"{path}: window", f"found {window:g}", f"seconds above 0, {LONGEST:g} at most")
-    if keyframe is not None and not isinstance(keyframe, str):
-        raise InputError(
-            f"{path}: keyframe", f"found {keyframe!r:.40}", "the name of a keyframe of the model"
-        )
-    found = {name: _mapped(name, entry, f"{path}: columns.{name}") for name, entry in columns.items()}
-    if all(m.kind == "command" for m in found.values()):
-        raise InputError(
-            f"{path}: columns", "are all commands: nothing to compare", "a joint, sensor or body"
-        )
-    return Map(
-        str(path),
-        found,
-        time.get("column", "t"),
-        _unit(time.get("unit"), f"{path}: time.unit"),
-        window,
-        keyframe,
-        _patterns(raw.get("uncertain", []), f"{path}: uncertain"),
-        _deviations(raw.get("sd", {}), f"{path}: sd"),
-        _places(raw.get("payload_at", {}), f"{path}: payload_at"),
-    )
-
-
-def _patterns(names: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-        raise InputError(where, f"{names!r}", 'a list of names such as "joint:elbow.frictionloss"')
-    return tuple(names)
-
-
-def _deviations(stated: Any, where: str) -> dict[str, float]:
-    if not isinstance(stated, dict):
-        raise InputError(where, "is no table", '"body:arm.mass" = 0.01, say')
-    found = {name: _number(stated, name, where) for name in stated}
-    for name, sd in found.items():
-        if sd <= 0:
-            raise InputError(f"{where}.{name}", f"{sd:g}", "above 0")
+    found = validated(Map, read_toml(path), str(path))
+    found._file = str(path)
     return found
-
-
-def _places(stated: Any, where: str) -> dict[str, str | tuple[float, ...]]:
-    if not isinstance(stated, dict):
-        raise InputError(where, "is no table", '{arm = "hand"} or {arm = [0.3, 0.0, 0.0]}')
-    out: dict[str, str | tuple[float, ...]] = {}
-    for body, place in stated.items():
-        numbers = isinstance(place, list) and len(place) == 3
-        if not isinstance(place, str) and not numbers:
-            raise InputError(f"{where}.{body}", f"{place!r:.40}", "the name of a site, or [x, y, z] in m")
-        keys = dict(enumerate(place)) if numbers else {}
-        out[body] = place if isinstance(place, str) else tuple(
-            _number({"place": keys[k]}, "place", f"{where}.{body}") for k in range(3)
-        )  # fmt: skip
-    return out
-
-
-def _mapped(column: str, entry: Any, where: str) -> Mapped:
-    if not isinstance(entry, dict):
-        raise InputError(where, "is no table", '{joint = "..."}')
-    for key in entry:
-        if key not in KEYS:
-            raise InputError(f"{where}.{key}", "unknown key", nearest(key, KEYS))
-    things = [t for t in THINGS if t in entry]
-    if len(things) != 1:
-        raise InputError(
-            where,
-            "names no thing of the model" if not things else f"names {' and '.join(things)}",
-            f"one of {', '.join(THINGS)}",
-        )
-    thing = things[0]
-    kind = entry.get("kind", KINDS[thing][0])
-    if kind not in KINDS[thing]:
-        raise InputError(f"{where}.kind", f"{kind!r} of a {thing}", f"one of {', '.join(KINDS[thing])}")
-    axis = str(entry.get("axis", ""))
-    if thing in AXES and axis not in AXES[thing]:
-        raise InputError(
-            f"{where}.axis", f"{axis!r}" if axis else "missing", f"one of {', '.join(AXES[thing])}"
-        )
-    unit = entry.get("unit")
-    factor = _unit(unit, f"{where}.unit") * _number(entry, "sign", where, 1.0)
-    noise = _number(entry, "noise", where, math.nan)
-    if noise <= 0:
-        raise InputError(f"{where}.noise", f"{noise:g}", "above 0")
-    return Mapped(
-        column,
-        thing,
-        str(entry[thing]),
-        kind,
-        axis,
-        unit,
-        factor,
-        _number(entry, "offset", where, 0.0),
-        abs(factor) * noise,
-    )
-
-
-def _unit(unit: Any, where: str) -> float:
-    if unit is None:
-        return 1.0
-    try:
-        return si_factor(unit)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(where, f"{unit!r} is no known unit", str(error)) from None
-
-
-def _number(entry: Mapping[str, Any], key: str, where: str, default: Any = None) -> Any:
-    if key not in entry:
-        return default
-    value = entry[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise InputError(f"{where}.{key}", f"{value!r:.40}", "a number")
-    return float(value)
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -13,16 +14,12 @@ import numpy as np
 from hmmseg.robust import bridged
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
-from simgap.simulators.mjcf.map import Map
+from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
-from simgap.simulators.mjcf.runs import ACTS, HOLD, LATE, Runs
-from simgap.simulators.mjcf.setting import Changed, Setting
-from simgap.simulators.mjcf.signals import Held, body_rate
-from simgap.simulators.mjcf.touching import contact_labels, touching_pairs
+from simgap.simulators.mjcf.runs import ACTS, Held, Runs, body_rate
+from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
-
-POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 @dataclass
@@ -61,7 +58,7 @@ class MjcfSimulator:
         self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
-        self._nominal = {n: s.get(self.model) for n, s in self.settings.items()}
+        self._nominal = {n: s.nominal for n, s in self.settings.items()}
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
         """One run; channels that are not finite where it diverged."""
@@ -141,7 +138,7 @@ class MjcfSimulator:
         if self.map.keyframe is None:
             mujoco.mj_resetData(self.model, data)
         else:
-            mujoco.mj_resetDataKeyframe(self.model, data, _key(self.model, self.map.keyframe))
+            mujoco.mj_resetDataKeyframe(self.model, data, object_id(self.model, "key", self.map.keyframe))
         mujoco.mj_getState(self.model, data, state, int(self._spec))
         state[0] = 0.0
         return state
@@ -237,5 +234,66 @@ def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | N
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
 
 
-def _key(model: Any, name: str) -> int:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
+# What touches what along a recorded motion, in words.
+
+# chosen: s: a contact that is there again sooner was never lost: sensors' noise breaks it
+BROKEN = 0.04
+FREE = "free"
+GROUND = "ground"  # a geom of the world without a name
+
+Pairs = frozenset[tuple[int, int]]
+
+
+def contact_labels(model: Any, t: np.ndarray, touched: Sequence[Pairs]) -> list[str]:
+    """At times t `free`, or which bodies touch, such as `cube on board`.
+
+    A contact begins and ends between samples: those on either side count too.
+    """
+    sets = [frozenset(_pair(model, a, b) for a, b in pairs) for pairs in touched]
+    none: frozenset[str] = frozenset()
+    wide = [a | b | c for a, b, c in zip([none, *sets], sets, [*sets[1:], none], strict=False)]
+    return [", ".join(sorted(s)) or FREE for s in closed(t, wide)]
+
+
+def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
+    """What touches at times t, with gaps below BROKEN filled. A touch counts however brief it is, for an
+    impact is brief."""
+    out = [set(s) for s in sets]
+    for pair in frozenset().union(*sets):
+        rows = [i for i, s in enumerate(sets) if pair in s]
+        for a, b in itertools.pairwise(rows):
+            if t[b] - t[a] <= BROKEN:
+                for i in range(a, b):
+                    out[i].add(pair)
+    return [frozenset(s) for s in out]
+
+
+def _pair(model: Any, one: int, other: int) -> str:
+    """What moves, on what it touches; geoms of the world go last."""
+    return " on ".join(_name(model, g) for g in sorted((one, other), key=lambda g: _order(model, g)))
+
+
+def _order(model: Any, geom: int) -> tuple[bool, str]:
+    return int(model.geom_bodyid[geom]) == 0, _name(model, geom)
+
+
+def _name(model: Any, geom: int) -> str:
+    """The name of a geom's body; of the world's geoms, their own."""
+    body = int(model.geom_bodyid[geom])
+    kind, number = (mujoco.mjtObj.mjOBJ_BODY, body) if body else (mujoco.mjtObj.mjOBJ_GEOM, geom)
+    return mujoco.mj_id2name(model, kind, number) or (f"body {body}" if body else GROUND)
+
+
+def touching_pairs(
+    model: Any, data: Any, poses: np.ndarray, at: Sequence[int]
+) -> list[frozenset[tuple[int, int]]]:
+    """Pairs of geoms that touch in each pose (n, k), whose coordinates are `at` these of the model's."""
+    out, none = [], frozenset()
+    for pose in poses:
+        data.qpos[at] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        found = data.contact[: data.ncon] if data.ncon else ()
+        out.append(frozenset((int(c.geom1), int(c.geom2)) for c in found) or none)
+    return out

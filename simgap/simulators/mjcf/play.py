@@ -17,10 +17,8 @@ import numpy as np
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import mujoco, rollout
 from simgap.simulators.mjcf.laws import MOTOR
-from simgap.simulators.mjcf.runs import Runs
-from simgap.simulators.mjcf.settable import setting_of
-from simgap.simulators.mjcf.setting import Changed, Setting
-from simgap.simulators.mjcf.signals import Held
+from simgap.simulators.mjcf.runs import Held, Runs
+from simgap.simulators.mjcf.setting import Changed, Setting, compiled, setting_of
 from simgap.simulators.protocol import Channels, Job
 from simgap.simulators.recording import Recording
 
@@ -112,7 +110,7 @@ def played(
     tendon.wrap_joint(f"{name}{MOTOR}", 1.0)
     tendon.wrap_joint(name, -1.0)
     try:
-        model = spec.compile()
+        model = compiled(spec)
     except ValueError:
         return None
     if int(model.joint(f"{name}{MOTOR}").id) != model.njnt - 1:

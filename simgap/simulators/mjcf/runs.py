@@ -11,16 +11,104 @@ from typing import Any
 import numpy as np
 
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.engine import rollout
 from simgap.simulators.mjcf.laws import Laws
 from simgap.simulators.mjcf.laws import run as run_with
-from simgap.simulators.mjcf.signals import Held, Side, aligned
+from simgap.simulators.mjcf.setting import HOLD, LATE
 from simgap.simulators.protocol import Channel, Channels
 from simgap.simulators.recording import Recording
 
-APPLIED = "applied:"  # a column of torques along a log that act on a joint besides its actuators
-HOLD = "option.hold"  # the setting of how commands are held between samples
-LATE = "option.late"  # the setting of how late within a step they come
+
+class Held:
+    """Commands held from sample to sample, as each step of the simulator has them on average; of one window
+    (n,) or of many with as many samples each (B, n)."""
+
+    def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
+        self.since, self.times = since, times
+        self.edges = np.append(times, 2 * times[-1] - times[-2])
+        self.width = np.diff(self.edges)
+        self.at = self._at(since)
+
+    def __call__(self, values: np.ndarray, line: float = 0.0) -> np.ndarray:
+        """Means (..., steps) of a column (..., n); missing samples hold the one before. `line`: the share of
+        the line to the next sample, in the place of a step."""
+        seen = np.isfinite(values)
+        if seen.all():
+            t, u, k = self.since, values, self.at
+        elif values.ndim > 1:
+            each = zip(self.since, values, strict=True)
+            return np.stack([Held(t, self.times)(v, line) for t, v in each])
+        else:
+            t, u = self.since[seen], values[seen]
+            k = self._at(t)
+        rise, wide = np.diff(u), np.diff(t)
+        done = np.cumsum((u[..., :-1] + 0.5 * line * rise) * wide, -1)
+        area = np.concatenate([np.zeros((*done.shape[:-1], 1)), done], -1)
+        steep = line * rise / np.where(wide > 0, wide, np.inf)
+        slope = np.concatenate([steep, np.zeros((*done.shape[:-1], 1))], -1)
+        here, held, begun, steep = (np.take_along_axis(v, k, -1) for v in (area, u, t, slope))
+        late = self.edges - begun
+        return np.diff(here + (held + 0.5 * steep * late) * late) / self.width
+
+    def _at(self, t: np.ndarray) -> np.ndarray:
+        """The sample that is held at each edge."""
+        if t.ndim > 1:
+            return np.stack([self._at(one) for one in t])
+        return np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
+
+
+class Between:
+    """Between points of an even grid of `times` (T,), `at` (B, n) in B windows, by cubics through neighbours
+    (Catmull & Rom 1974)."""
+
+    def __init__(self, at: np.ndarray, times: np.ndarray) -> None:
+        place = np.clip(at / (times[1] - times[0]), 0, times.size - 1)
+        i = np.minimum(place.astype(int), times.size - 2)
+        self.s = (place - i)[..., None]
+        self.inner = ((i > 0) & (i < times.size - 2))[..., None]
+        first = times.size * np.arange(len(at))[:, None]
+        self.rows = [np.clip(i + k, 0, times.size - 1) + first for k in (-1, 0, 1, 2)]
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, n, k) of those on the grid (B, T, k)."""
+        flat, s = values.reshape(-1, values.shape[-1]), self.s
+        p0, p1, p2, p3 = (flat[rows] for rows in self.rows)
+        bend = s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0)
+        return np.where(self.inner, p1 + 0.5 * bend, p1 + s * (p2 - p1))
+
+
+@dataclass(frozen=True)
+class Side:
+    """Windows of as many samples, side by side: how their commands are held and their sensors read."""
+
+    held: Held
+    between: Between
+
+    @classmethod
+    def of(cls, since: np.ndarray, times: np.ndarray) -> Side:
+        """Of windows whose samples are at `since` (B, n) [s] of their begin."""
+        return cls(Held(since, times), Between(since, times))
+
+
+def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Angular velocity (3,) in the body's frame, 2 conj(q) dq/dt, of a unit quaternion, scalar first."""
+    w, x, y, z = quat
+    a, b, c, d = rate
+    return 2 * np.array(
+        [w * b - x * a - y * d + z * c, w * c - y * a - z * b + x * d, w * d - z * a - x * c + y * b]
+    )
+
+
+def aligned(log: Recording, out: dict[str, np.ndarray], columns: Mapping[str, str]) -> None:
+    """Turn the sign of simulated quaternions to the recorded ones': both are the same turn."""
+    turn = [columns[a] for a in ("qw", "qx", "qy", "qz") if columns[a] in out]
+    if len(turn) == 4:
+        dot = sum(np.nan_to_num(log[n]) * out[n] for n in turn)
+        sign = np.where(dot < 0, -1.0, 1.0)
+        for n in turn:
+            out[n] = out[n] * sign
+
+
 # A column of the times [s] from which on each row's commands are carried out; with "next" behind it when
 # those that follow are, and with a command's name what these are.
 ACTS = "acts:"
@@ -34,7 +122,7 @@ class Runs:
     """Runs of the `model` in threads, one for each of `data`; the rest as in `MjcfSimulator`.
 
     The same windows are run hundreds of times: how they lie on the steps is kept. So are the latest runs, for
-    many are asked for again: a finite difference in one number of the solver has all others' runs in it.
+    many are needed again: a finite difference in one number of the solver contains all others' runs.
     """
 
     model: Any
@@ -63,52 +151,39 @@ class Runs:
         h = float(self.model.opt.timestep)
         span = max(float(log.t[-1] - log.t[0]) for log in logs)
         times = np.arange(int(np.ceil(span / h - 1e-9)) + 2) * h
-        alike: dict[tuple, list[int]] = defaultdict(list)
+        alike: dict[int, list[int]] = defaultdict(list)
         for i, log in enumerate(logs):
-            alike[len(log), *(n for n in log.columns if n.startswith(APPLIED))].append(i)
-        parts = [(mine, [logs[i] for i in mine], applied) for (_, *applied), mine in alike.items()]
-        sides = [self._side(own, times) for _, own, _ in parts]
-        width = self.model.nu + (self.model.nv if any(applied for _, _, applied in parts) else 0)
-        control = np.zeros((len(logs), times.size, width))
+            alike[len(log)].append(i)
+        parts = [(mine, [logs[i] for i in mine]) for mine in alike.values()]
+        sides = [self._side(own, times) for _, own in parts]
+        control = np.zeros((len(logs), times.size, self.model.nu))
         line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
-        for (mine, own, applied), side in zip(parts, sides, strict=True):
+        for (mine, own), side in zip(parts, sides, strict=True):
             held = _carried_out(own, side.held, late * h)
             for column, place in self.driven.items():
                 control[mine, :, place] = held(np.array([_commanded(log, column) for log in own]), line)
-            for column in applied:
-                control[mine, :, self._pushed(column)] = side.held(np.array([log[column] for log in own]))
         sensed = self._sensed(first, control, changed)
         out: list[Channels | None] = [None] * len(logs)
-        for (mine, own, _), side in zip(parts, sides, strict=True):
+        for (mine, own), side in zip(parts, sides, strict=True):
             for i, channels in zip(mine, self._read(own, sensed[mine], side, times), strict=True):
                 out[i] = channels
         return out
 
-    def _pushed(self, column: str) -> int:
-        """Position of such a column among controls and applied torques."""
-        joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, column.removeprefix(APPLIED))
-        return self.model.nu + int(self.model.jnt_dofadr[joint])
-
     def _sensed(self, first: np.ndarray, control: np.ndarray, changed: tuple) -> np.ndarray:
         """Sensors (B, steps, sensors) of runs from these states."""
-        steps, width = control.shape[1:]
-        spec = int(mujoco.mjtState.mjSTATE_CTRL)
-        if width > self.model.nu:
-            spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
-
         laws = Laws.of(self.model, changed)
 
         def run() -> np.ndarray:
             if laws:
                 return run_with(self.model, self.data[0], laws, first, control)
             return rollout.rollout(
-                self.model, self.data, first, control if width else None,
-                control_spec=spec, nstep=steps, persistent_pool=True,
+                self.model, self.data, first, control if self.model.nu else None,
+                nstep=control.shape[1], persistent_pool=True,
             )[1]  # fmt: skip
 
         given = hashlib.blake2b(first.tobytes() + control.tobytes()).digest()
         key = (changed, first.shape, control.shape, given)
-        size = 8 * len(first) * steps * max(self.model.nsensordata, 1)
+        size = 8 * len(first) * control.shape[1] * max(self.model.nsensordata, 1)
         return latest(self._ran, key, run, int(KEPT / size))
 
     def _side(self, logs: Sequence[Recording], times: np.ndarray) -> Side:

@@ -1,4 +1,8 @@
-"""One thing of a MuJoCo model that can be set, objects by name, and a model with some of it changed."""
+"""What of a MuJoCo model can be set, by names such as `joint:elbow.damping`, and a model with some changed.
+
+A setting is a field of the compiled model, set in place and restored, or a parameter that no field holds: of
+a law that MuJoCo lacks (`laws.py`), or of how commands are held between samples (`runs.py`).
+"""
 
 from __future__ import annotations
 
@@ -8,22 +12,31 @@ from typing import Any
 
 import numpy as np
 
+from hmmseg.errors import InputError, nearest
 from simgap.simulators.mjcf.engine import mujoco
+
+Put = Callable[[Any, float], None]
+OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
+FADE = "fade"  # a law of an actuator
+HOLD = "option.hold"  # how commands are held between samples: 0 in steps, 1 in lines to the next
+LATE = "option.late"  # by which share of a step they come later
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One thing that can be set. `get(model)` is its value, `put(model, value)` sets it in a compiled model;
-    `derived`: whether constants derived from it (mj_setConst) must be recomputed. `xml`: the attribute, for a
-    patch, as (object kind, object name, attribute, index or None). `mixed`: what only comes in steps is mixed
-    in proportion of two runs, without it and with it at this value."""
+    """One quantity that can be set: its `nominal` value, and `put(model, value)`, which sets it.
+
+    `derived`: whether constants derived from it (mj_setConst) must be recomputed. `stored`: whether MuJoCo
+    writes it. `mixed`: what comes only in whole steps is interpolated between two runs, without it and with
+    it at this value.
+    """
 
     name: str
     unit: str
-    get: Callable[[Any], float]
-    put: Callable[[Any, float], None]
-    derived: bool
-    xml: tuple[str, str, str, int | None] | None
+    nominal: float
+    put: Put
+    derived: bool = False
+    stored: bool = True
     mixed: float | None = None
 
 
@@ -35,37 +48,261 @@ def object_id(model: Any, kind: str, name: str) -> int:
     return found
 
 
-def names_of(model: Any, kind: str) -> list[str]:
-    """Names of all objects of a kind, those without one left out."""
-    count = {
-        "joint": model.njnt,
-        "body": model.nbody,
-        "geom": model.ngeom,
-        "actuator": model.nu,
-        "sensor": model.nsensor,
-        "site": model.nsite,
-        "tendon": model.ntendon,
-        "equality": model.neq,
-    }[kind]
-    of = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    return [n for n in (mujoco.mj_id2name(model, of, i) for i in range(count)) if n]
-
-
-def array_setting(name: str, unit: str, array: str, at: Any, derived: bool, xml) -> Setting:
-    """The setting that is entry `at` of the model's array of that name."""
-
-    def get(model: Any) -> float:
-        return float(np.ravel(np.asarray(getattr(model, array)[at]))[0])
-
-    def put(model: Any, value: float) -> None:
-        getattr(model, array)[at] = value
-
-    return Setting(name, unit, get, put, derived, xml)
-
-
 def name_of(model: Any, kind: str, number: int) -> str:
     """The name of a joint, body, geom or actuator; empty where it has none."""
     return mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), number) or ""
+
+
+def names_of(model: Any, kind: str) -> list[str]:
+    """Names of all objects of a kind, those without one left out."""
+    count = model.nu if kind == "actuator" else getattr(model, {"joint": "njnt"}.get(kind, f"n{kind}"))
+    return [name for name in (name_of(model, kind, i) for i in range(count)) if name]
+
+
+def payload_place(model: Any, name: str) -> np.ndarray:
+    """Where a body carries a load (3,) [m], in its frame: at its farthest site, where it has one, else at the
+    farthest centre of its geoms; at its centre of mass if it has none."""
+    b = object_id(model, "body", name)
+    for places, owner in ((model.site_pos, model.site_bodyid), (model.geom_pos, model.geom_bodyid)):
+        mine = np.array(places[np.asarray(owner) == b])
+        if len(mine):
+            return mine[int(np.argmax(np.linalg.norm(mine, axis=1)))]
+    return np.array(model.body_ipos[b])
+
+
+def most_of(model: Any, actuator: int) -> float:
+    """The largest force that an actuator can give, 0 where the model states none."""
+    if model.actuator_forcelimited[actuator]:
+        return float(np.abs(model.actuator_forcerange[actuator]).max())
+    if model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator, 1]:
+        gain = abs(float(model.actuator_gainprm[actuator, 0]))
+        return gain * float(np.abs(model.actuator_ctrlrange[actuator]).max())
+    return 0.0
+
+
+def compiled(spec: Any) -> Any:
+    """The model of an MjSpec, such that gravity compensation can be set where the spec has none."""
+    own = [body.gravcomp for body in spec.bodies]
+    for body in spec.bodies:
+        body.gravcomp = 1.0
+    model = spec.compile()
+    for body, share in zip(spec.bodies, own, strict=True):
+        body.gravcomp = model.body_gravcomp[body.id] = share
+    return model
+
+
+def nothing(model: Any, value: float) -> None:
+    """Set nothing: the parameter acts while the model runs."""
+
+
+def _to(array: str, at: Any, factor: float = 1.0) -> Put:
+    """Set an entry of one of the model's arrays."""
+
+    def put(model: Any, value: float) -> None:
+        getattr(model, array)[at] = factor * value
+
+    return put
+
+
+def _larger(model: Any, *entries: tuple[str, Any]) -> Put:
+    """Set entries to 1 + value times what they are in the model."""
+    own = [(array, at, np.array(getattr(model, array)[at])) for array, at in entries]
+
+    def put(m: Any, value: float) -> None:
+        for array, at, nominal in own:
+            getattr(m, array)[at] = nominal * (1 + value)
+
+    return put
+
+
+def _joint(model: Any, name: str, attribute: str) -> Setting | None:
+    j = object_id(model, "joint", name)
+    turning = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    force, way = ("N m", "rad") if turning else ("N", "m")
+    laws = dict(zip(OF_JOINTS, ("1", force, force, f"{way}/s", f"{force} s^2/{way}^2"), strict=True))
+    if attribute in laws:
+        return Setting(f"joint:{name}.{attribute}", laws[attribute], 0.0, nothing, stored=False)
+    dofs = np.flatnonzero(np.asarray(model.dof_jntid) == j)
+    found = {
+        "damping": ("dof_damping", dofs, f"{force} s/{way}"),
+        "frictionloss": ("dof_frictionloss", dofs, force),
+        "armature": ("dof_armature", dofs, "kg m^2" if turning else "kg"),
+        "stiffness": ("jnt_stiffness", [j], f"{force}/{way}"),
+        "springref": ("qpos_spring", [int(model.jnt_qposadr[j])], way),
+    }.get(attribute)
+    if found is None:
+        return None
+    array, at, unit = found
+    nominal = float(getattr(model, array)[at[0]])
+    return Setting(f"joint:{name}.{attribute}", unit, nominal, _to(array, at), attribute == "armature")
+
+
+def _body(model: Any, name: str, attribute: str) -> Setting | None:
+    if attribute == "payload":
+        return payload(model, name, payload_place(model, name))
+    b, whole = object_id(model, "body", name), f"body:{name}.{attribute}"
+    if attribute == "mass":
+        mass, inertia = float(model.body_mass[b]), np.array(model.body_inertia[b])
+
+        def put(m: Any, value: float) -> None:
+            m.body_mass[b], m.body_inertia[b] = value, inertia * (value / mass)
+
+        return Setting(whole, "kg", mass, put, True)
+    if attribute in ("com_x", "com_y", "com_z"):
+        k = "xyz".index(attribute[-1])
+        return Setting(whole, "m", float(model.body_ipos[b, k]), _to("body_ipos", (b, k)), True)
+    if attribute == "length" and np.any(model.body_pos[b]):
+        return Setting(whole, "1", 0.0, _larger(model, ("body_pos", b)), True)
+    return None
+
+
+def payload(model: Any, name: str, place: np.ndarray) -> Setting:
+    """The mass [kg] of a point load on a body, at a place (3,) [m] in its frame."""
+    b = object_id(model, "body", name)
+    mass, inertia, com = (
+        float(model.body_mass[b]),
+        np.array(model.body_inertia[b]),
+        np.array(model.body_ipos[b]),
+    )
+
+    def load(m: Any, value: float) -> None:
+        total = mass + value
+        away, turn = place - com, np.zeros(9)
+        mujoco.mju_quat2Mat(turn, m.body_iquat[b])
+        arm = turn.reshape(3, 3).T @ away  # in the axes of inertia
+        m.body_mass[b], m.body_ipos[b] = total, com + value / total * away
+        # Both about the common centre (parallel axes); the axes of inertia stay.
+        m.body_inertia[b] = inertia + mass * value / total * (arm @ arm - arm**2)
+
+    return Setting(f"body:{name}.payload", "kg", 0.0, load, True)
+
+
+def _geom(model: Any, name: str, attribute: str) -> Setting | None:
+    g, whole = object_id(model, "geom", name), f"geom:{name}.{attribute}"
+    if attribute == "size" and int(model.geom_type[g]) != int(mujoco.mjtGeom.mjGEOM_MESH):
+        put = _larger(model, ("geom_size", g), ("geom_rbound", g))
+        return Setting(whole, "1", 0.0, put)
+    found = {
+        "friction": ("friction", 0, "1"),
+        "torsional": ("friction", 1, "m"),
+        "time_constant": ("solref", 0, "s"),
+        "damping_ratio": ("solref", 1, "1"),
+        "dmin": ("solimp", 0, "1"),
+    }.get(attribute)
+    if found is None:
+        return None
+    key, k, unit = found
+    array = f"geom_{key}"
+    return Setting(whole, unit, float(getattr(model, array)[g, k]), _to(array, (g, k)))
+
+
+def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
+    a, whole = object_id(model, "actuator", name), f"actuator:{name}.{attribute}"
+    if attribute == "gain":  # of a position servo its stiffness
+        put = _larger(model, ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1)))
+        return Setting(whole, "1", 0.0, put)
+    if attribute == "damping":
+        put = _to("actuator_biasprm", (a, 2), -1.0)
+        nominal = -float(model.actuator_biasprm[a, 2])
+        return Setting(whole, "N m s/rad", nominal, put)
+    if attribute == FADE and most_of(model, a):
+        return Setting(whole, "1", 0.0, nothing, stored=False)
+    if attribute == "limit" and model.actuator_forcelimited[a]:
+        put = _to("actuator_forcerange", a, np.array([-1.0, 1.0]))
+        nominal = float(model.actuator_forcerange[a, 1])
+        return Setting(whole, "N", nominal, put)
+    return None
+
+
+def _option(model: Any, _: str, attribute: str) -> Setting | None:
+    """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), iterations (0: as it
+    is, 1: ten times), and what acts on commands."""
+    down, step, count = np.array(model.opt.gravity), float(model.opt.timestep), int(model.opt.iterations)
+    whole, axis = f"option.{attribute}", np.eye(3)[int(attribute == "tilt_y")]
+
+    def tilt(m: Any, value: float) -> None:
+        m.opt.gravity[:] = np.array(m.opt.gravity) + np.cross(axis, down) * value
+
+    def scale(m: Any, value: float) -> None:
+        m.opt.timestep = step * (1 + value)
+
+    def more(m: Any, value: float) -> None:
+        m.opt.iterations = 10 * count
+
+    made = {
+        "tilt_x": Setting(whole, "rad", 0.0, tilt),
+        "tilt_y": Setting(whole, "rad", 0.0, tilt),
+        "timestep": Setting(whole, "1", 0.0, scale, mixed=-0.75),
+        "iterations": Setting(whole, "1", 0.0, more, stored=False, mixed=1.0),
+        "hold": Setting(whole, "1", 0.0, nothing, stored=False),
+        "late": Setting(whole, "1", 0.0, nothing, stored=False),
+    }
+    return made.get(attribute)
+
+
+def _drive(model: Any, _: str, attribute: str) -> Setting | None:
+    """gravity_compensation: the share of the weights that drives carry by themselves, of all bodies that
+    are not free."""
+    roots = np.asarray(model.body_rootid)
+    first = np.asarray(model.body_jntadr)[roots]
+    free = np.array([j >= 0 and int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) for j in first])
+    held, own = np.flatnonzero(~free), np.array(model.body_gravcomp)
+
+    def put(m: Any, value: float) -> None:
+        m.body_gravcomp[held] = own[held] + value
+
+    # Derived: mj_setConst counts the bodies that have it, and without any none is carried.
+    made = Setting("drive.gravity_compensation", "1", 0.0, put, derived=True, stored=False)
+    return made if attribute == "gravity_compensation" else None
+
+
+KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...]]] = {
+    "joint": (_joint, ("damping", "frictionloss", "armature", "stiffness", "springref", *OF_JOINTS)),
+    "body": (_body, ("mass", "com_x", "com_y", "com_z", "payload", "length")),
+    "geom": (_geom, ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size")),
+    "actuator": (_actuator, ("gain", "damping", "limit", FADE)),
+    "drive": (_drive, ("gravity_compensation",)),
+    "option": (_option, ("tilt_x", "tilt_y", "timestep", "iterations", "hold", "late")),
+}
+
+
+def setting_of(model: Any, name: str) -> Setting:
+    """The setting of a model by its name.
+
+    Args:
+        model: A compiled MuJoCo model.
+        name: `KIND:NAME.ATTRIBUTE`; `option.ATTRIBUTE` and `drive.ATTRIBUTE` of the whole model.
+
+    Returns:
+        The setting, whose nominal value is the model's.
+
+    Raises:
+        InputError: The name is unknown; the nearest known one is named.
+    """
+    where = f"--candidate {name}"
+    head, dot, attribute = name.rpartition(".")
+    kind, colon, thing = head.partition(":")
+    if not dot or kind not in KINDS or bool(colon) == (kind in ("option", "drive")):
+        raise InputError(
+            where, "names nothing of the model", "KIND:NAME.ATTRIBUTE, such as joint:elbow.damping"
+        )
+    if colon and thing not in (known := names_of(model, kind)):
+        raise InputError(where, f"the model has no {kind} {thing}", nearest(thing, known))
+    make, attributes = KINDS[kind]
+    found = make(model, thing, attribute)
+    if found is None:
+        raise InputError(
+            where, f"{kind} has no {attribute} that can be a candidate", nearest(attribute, attributes)
+        )
+    return found
+
+
+FIELDS = (
+    *("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness", "qpos_spring"),
+    *("body_mass", "body_inertia", "body_ipos", "body_pos", "body_gravcomp"),
+    *("geom_friction", "geom_solref", "geom_solimp", "geom_size", "geom_rbound"),
+    *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+)  # all that settings set
 
 
 class Changed:
@@ -74,18 +311,18 @@ class Changed:
     def __init__(
         self, model: Any, settings: Mapping[str, Setting], changed: Sequence[tuple[str, float]]
     ) -> None:
-        self.model, self.settings, self.changed = model, settings, changed
+        self.model = model
+        self.changed = [(settings[name], value) for name, value in changed]
 
     def __enter__(self) -> None:
         if not self.changed:
             return
         self.kept = {n: np.array(getattr(self.model, n)) for n in FIELDS}
         opt = self.model.opt
-        self.options = (np.array(opt.gravity), opt.timestep, opt.integrator, opt.iterations)
-        for name, value in self.changed:
-            self.settings[name].put(self.model, value)
-        if any(self.settings[n].derived for n, _ in self.changed):
-            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+        self.options = (np.array(opt.gravity), opt.timestep, opt.iterations)
+        for setting, value in self.changed:
+            setting.put(self.model, value)
+        self._derive()
 
     def __exit__(self, *exception: object) -> None:
         if not self.changed:
@@ -93,27 +330,10 @@ class Changed:
         for name, values in self.kept.items():
             getattr(self.model, name)[:] = values
         opt = self.model.opt
-        opt.gravity[:], opt.timestep, opt.integrator, opt.iterations = self.options
-        if any(self.settings[n].derived for n, _ in self.changed):
+        opt.gravity[:], opt.timestep, opt.iterations = self.options
+        self._derive()
+
+    def _derive(self) -> None:
+        """Recompute the constants that depend on what is set."""
+        if any(setting.derived for setting, _ in self.changed):
             mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
-
-
-FIELDS = (
-    "dof_damping",
-    "dof_frictionloss",
-    "dof_armature",
-    "jnt_stiffness",
-    "qpos_spring",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_pos",
-    "geom_friction",
-    "geom_solref",
-    "geom_solimp",
-    "geom_size",
-    "geom_rbound",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
-)

@@ -1,5 +1,4 @@
-"""What MuJoCo's models lack and the recorded motion shows: a drive that carries the arm's weight, gears that
-give under load."""
+"""The recorded motion: what torques it takes, and how far gears give under them behind an encoder."""
 
 from __future__ import annotations
 
@@ -13,7 +12,6 @@ from scipy.signal import savgol_filter
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
-from simgap.simulators.mjcf.runs import APPLIED
 from simgap.simulators.mjcf.setting import name_of, object_id
 from simgap.simulators.protocol import Channels, Parameter
 from simgap.simulators.recording import Recording
@@ -21,39 +19,6 @@ from simgap.simulators.recording import Recording
 LIGHT = 1e-6  # numerics: N m, m N m: what is less is nothing
 GIVES = 0.01  # prior: of a joint's reach: by how much its gears usually give
 SHARE = 0.03  # prior: of the torques that a joint shows: the usual size of what a model lacks there
-
-
-def gravity_compensation(
-    simulator: MjcfSimulator,
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion],
-    joints: Sequence[int],
-) -> list[RobotEffect]:
-    """A drive that carries a share of the weights: torques against gravity along the recorded motion."""
-    model, data = simulator.model, mujoco.MjData(simulator.model)
-    carried: dict[str, np.ndarray] = {}
-    for log, motion in zip(recordings, motions, strict=True):
-        carried[log.name] = np.zeros((len(joints), len(log)))
-        for i in range(len(log)):
-            for j, position in motion.position.items():
-                data.qpos[int(model.jnt_qposadr[j])] = position[i]
-            data.qvel[:] = 0.0
-            mujoco.mj_forward(model, data)
-            carried[log.name][:, i] = [data.qfrc_bias[int(model.jnt_dofadr[j])] for j in joints]
-    names = [f"{APPLIED}{name_of(model, 'joint', j)}" for j in joints]
-    if all(np.abs(v).max(initial=0.0) < LIGHT for v in carried.values()):
-        return []
-
-    def act(log: Recording, theta: Mapping[str, float]) -> Recording:
-        whole = carried[log.name][:, log.first : log.first + len(log)]
-        before = [log.columns.get(n, np.zeros(len(log))) for n in names]
-        return log.with_columns(
-            {n: b + theta["share"] * w for n, b, w in zip(names, before, whole, strict=True)}
-        )
-
-    share = {"share": Parameter(0.0, 0.1, "1", low=-0.5, high=1.5)}
-    says = "drives carry this share of the weights by themselves (gravity compensation)"
-    return [RobotEffect("drive.gravity_compensation", says, share, command=act)]
 
 
 def elasticity(
