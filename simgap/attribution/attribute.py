@@ -364,11 +364,12 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _needed(f: Forms, model: Model, effect: int) -> bool:
-    """Whether doing without an effect is ruled out by the evidence of its set, and by more of it than errors in
-    the forms of the set's others may feign."""
+    """Whether the evidence of a set rules out that its other effects do without this one, by more than errors
+    in their forms may feign. One alone is needed if there is a gap."""
     others = tuple(j for j in model.effects if j != effect)
-    form = max((f.gap.candidates[j].form for j in others), default=0.0)
-    feigned = form * (model.score - fitted(f, ()).score)
+    if not others:
+        return True
+    feigned = max(f.gap.candidates[j].form for j in others) * (model.score - fitted(f, ()).score)
     return model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned)
 
 
