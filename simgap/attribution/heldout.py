@@ -256,10 +256,10 @@ class Heldout:
         low, high = (np.where(loose, edge, model.x) for edge in (taken.low, taken.high))
         matrix, pull = taken.weighed(weight)
         x, _ = least(matrix + precision, pull + precision @ model.x, low, high)
-        squares, off = weight * taken.energy(x), x - model.x
+        squares, away = weight * taken.energy(x), x - model.x
         more = test.count * test.freed[list(effects)].sum(0)  # of the squares, so much is what they free
         left = np.maximum(squares - more, np.minimum(squares, test.count))
-        return float(left.sum() + off @ precision @ off), float(test.count @ taken.shift)
+        return float(left.sum() + away @ precision @ away), float(test.count @ taken.shift)
 
 
 def fraction_gone(gone: np.ndarray, there: np.ndarray) -> tuple[float, tuple[float, float]]:

@@ -257,13 +257,14 @@ def in_grip(
     grip, part = _others(arrays.onehot), _others(parts.reshape(*place.shape, -1))
     slide = SLIDE * world.slip
     walk = np.square(np.stack([_wider(each) for each in (arrays.pushed, slide, slide)], -1))
-    band = world.dead_band or DeadBand(*np.zeros((4, *place.shape, 0)), np.zeros((len(place), 0)))
+    none = np.zeros((*place.shape, 0))
+    band = world.dead_band or DeadBand(none, none > 0, none, none, none[:, 0])
     (x, y), apart = swung(world), np.array([-1.0, -1.0, 1.0, 1.0])
     levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)[..., : band.place.shape[-1]]
     return tracked(
         values - (levers @ band.place[..., None])[..., 0], weight, noise, -levers,
-        walk, np.stack([part, grip, grip], -1), ANYWHERE**2, band.pinned > 0, *band[:1], *band[2:],
-        SHARES, CHANCES,
+        walk, np.stack([part, grip, grip], -1), ANYWHERE**2, band.pinned, band.place, band.drift, band.wander,
+        band.jump, SHARES, CHANCES,
     )  # fmt: skip
 
 

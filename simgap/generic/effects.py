@@ -339,7 +339,7 @@ def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
     low, high = PERIODS * rate / max(windows.shape[1], 1), HIGHEST * rate
     ends = np.log([(low, high), (LIGHTEST, HEAVIEST)])
 
-    def refined(windows: np.ndarray, start: Sequence[float]) -> np.ndarray:
+    def refined(windows: np.ndarray, start: Sequence[float] | np.ndarray) -> np.ndarray:
         return minimize(
             lambda u: np.log(_left(windows, rate, *np.exp(u))), np.log(start), method="Nelder-Mead",
             bounds=[*map(tuple, ends)], options={"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},

@@ -95,7 +95,7 @@ def nothing(model: Any, value: float) -> None:
     """Set nothing: the parameter acts while the model runs."""
 
 
-def _to(array: str, at: Any, factor: float = 1.0) -> Put:
+def _to(array: str, at: Any, factor: float | np.ndarray = 1.0) -> Put:
     """Set an entry of one of the model's arrays."""
 
     def put(model: Any, value: float) -> None:
