@@ -209,9 +209,9 @@ def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ..
         rows, rises, labels = [], [], []
         for move, rise in height_equations(task):
             ends = [s for s in steps if s.move == move and s.name in ("pickup", "place")]
-            means = [trial.mean("y2", s) for s in ends]
-            if rise and all(means):
-                (low, sd, error), (high, high_sd, high_error) = means
+            first, last = (trial.mean("y2", s) for s in ends)
+            if rise and first and last:
+                (low, sd, error), (high, high_sd, high_error) = first, last
                 rows.append([float(rise.get(name, 0)) for name in task.objects])
                 rises.append((high - low, math.hypot(sd, high_sd), math.hypot(error, high_error)))
                 labels.append([s.label for s in ends])

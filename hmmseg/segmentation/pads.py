@@ -132,7 +132,7 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
     families = [(values, profiled(values, filtered) - np.log(2 * values.size), filtered)
                 for values, filtered in ((SHIFTS, False), (CONSTANTS, True))]  # fmt: skip
     evidence = [float(np.logaddexp.reduce(log_weight)) for _, log_weight, _ in families]
-    late = np.logaddexp(*evidence) - np.logaddexp.reduce(usual) > decisive(LATE_HANDS)
+    late = np.logaddexp.reduce(evidence) - np.logaddexp.reduce(usual) > decisive(LATE_HANDS)
     values, log_weight, filtered = families[int(np.argmax(evidence))] if late else (FINE, usual, False)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()

@@ -115,6 +115,7 @@ def _depths(
     Each stretch has a line of its own. Student-t, reweighted.
     """
     weight = np.broadcast_to(there, toes.shape).astype(float)
+    depth = residual = curved = np.zeros(0)
     for _ in range(ROUNDS):
         total = weight.sum(axis=-1, keepdims=True)
         x, bent, left = (v - (weight * v).sum(axis=-1, keepdims=True) / total for v in (load, toes, value))

@@ -379,8 +379,8 @@ def tables(body: Body) -> list[Table]:
     if body["causes"]:
         rows = []
         for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():
-            shown = shown_as(p["unit"])
-            rows.append((name, estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown)))
+            shown, (low, high) = shown_as(p["unit"]), p["interval_90"]
+            rows.append((name, estimate(p["mean"], p["sd"], shown), interval(low, high, shown)))
         out.append(listed("parameters", ("parameter", "estimate", "90 % interval"), rows))
     if (following := body["next_experiment"]) is not None:
         gain = f"by {following['expected_gain_nats']:.0f} nats at least"
