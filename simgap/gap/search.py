@@ -274,16 +274,15 @@ def _anew(
     gained = healthy.cost - best.cost
     if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
         return None
-    again = _recovered(every, aligned, given, best)
-    if again is None:
-        again = realigned(aligned, given, best)
-        if not SHIFT < moved(aligned, again) < np.inf:
-            return None
-        other = with_nuisances(rebased(build(again), given))
-        if fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size:
-            return None
-    else:
-        other = with_nuisances(rebased(build(again), given))
+    recovered = _recovered(every, aligned, given, best)
+    again = recovered or realigned(aligned, given, best)
+    if recovered is None and not SHIFT < moved(aligned, again) < np.inf:
+        return None
+    other = with_nuisances(rebased(build(again), given))
+    if recovered is None and (
+        fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size
+    ):
+        return None
     plain = fit(other, Start((), healthy.u))
     return again, other, plain, [fit(other, Start(f.effects, f.u), usual=plain.push) for f in fits]
 
