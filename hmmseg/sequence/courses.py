@@ -23,8 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.sequence.emissions import FLOORS, Learner
 from hmmseg.sequence.features import filled
-from hmmseg.sequence.learner import FLOORS, Learner
 
 MAX_BLOCKS = 250  # numerics: the cost table is quadratic in it
 
@@ -137,21 +137,19 @@ def _taught(
     """The course that starts from the optimal partition of one trial, whose stretches teach the others."""
     names, features = [f"{k}" for k in range(number)], values[0].shape[1]
     temper = 1 / features  # while learning, a cell counts as one observation
-    learner = Learner(values, names, [False] * number)
     cells = len(values[teacher])
     cuts = np.unique(np.clip((known[np.isfinite(known)] * cells).round().astype(int), 1, cells - 1))
     path = partition(np.arcsinh(filled(values[teacher])), number, floor, cuts)
     alone = Learner([values[teacher]], names, [False] * number)
-    taught, start = alone.run(alone.one_hot([path]), temper, FLOORS[1:3], steps=1)
-    if cuts.size:
-        learner.known[teacher] = path
+    taught, start = alone.run([np.eye(number)[path]], temper, FLOORS[1:3], steps=1)
+    paths = [path if cuts.size and i == teacher else None for i in range(len(values))]
+    learner = Learner(list(values), names, [False] * number, known=paths)
     aligned = learner.align(taught, learner.law(start))
-    emissions, probability = learner.run(
-        [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
+    emissions, probability = learner.run([a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
     paths = [p.argmax(1) for p in probability]
     cost = merged_costs(values, paths, number, MERGE_FLOOR) / features
-    share = learner.independent_share(emissions, probability) * features
+    share = learner.tempered(emissions, probability).temper * features
     return Course(probability, ends, cost, share, seen(values, paths, number, share))
 
 
