@@ -14,7 +14,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, check_unique, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
-from hmmseg.tables import Tabled
+from hmmseg.tables import Tabled, listed
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
@@ -82,17 +82,13 @@ class Trial(Tabled):
 
     def tables(self) -> list[Any]:
         """Its channels, with how many samples each lacks and how far it goes."""
-        from rich.table import Table as Shown
-
-        size = f"{self.t.size} samples at {self.rate:.4g} Hz, {self.t[0]:.4g} to {self.t[-1]:.4g} s"
-        table = Shown(title=f"{self.name}: {size}", title_justify="left")
-        for head in ("channel", "missing", "least", "most"):
-            table.add_column(head)
+        size, rows = f"{self.t.size} samples at {self.rate:.4g} Hz", []
         for name, values in self.channels.items():
             there = values[np.isfinite(values)]
             ends = (f"{there.min():.4g}", f"{there.max():.4g}") if there.size else ("", "")
-            table.add_row(name, str(values.size - there.size or ""), *ends)
-        return [table]
+            rows.append((name, str(values.size - there.size or ""), *ends))
+        title = f"{self.name}: {size}, {self.t[0]:.4g} to {self.t[-1]:.4g} s"
+        return [listed(title, ("channel", "missing", "least", "most"), rows, wraps=True)]
 
     @property
     def rate(self) -> float:

@@ -24,7 +24,7 @@ from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
 from hmmseg.sequence.emissions import LEAST_CELLS, Detectors, StudentEmissions, transitions, weighed
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
-from hmmseg.tables import Tabled
+from hmmseg.tables import Tabled, listed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -90,17 +90,13 @@ class SequenceModel(Tabled):
 
     def tables(self) -> list[Table]:
         """Its states: how long they usually last, and how surely the model has their beginnings."""
-        from rich.table import Table
-
-        table = Table(title=f"a model of {', '.join(self.mapping.channels)}", title_justify="left")
-        for head in ("state", "usually lasts [s]", "occurs", "begins here with probability"):
-            table.add_column(head)
-        surely = ["", *(f"{p:.2f}" for p in self.sure)]
+        surely, rows = ["", *(f"{p:.2f}" for p in self.sure)], []
         for k, name in enumerate(self.task.sequence):
             there = f"{100 * self.presence[k]:.0f} %" if name in self.task.optional else "always"
             lasts = f"{self.typical[k] * self.mapping.step:.3g}"
-            table.add_row(name, lasts, there, surely[k] if k < len(surely) else "")
-        return [table]
+            rows.append((name, lasts, there, surely[k] if k < len(surely) else ""))
+        heads = ("state", "usually lasts [s]", "occurs", "begins here with probability")
+        return [listed(f"a model of {', '.join(self.mapping.channels)}", heads, rows, wraps=True)]
 
     def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
         """Posterior alignment; InfeasibleAlignment for a trial with fewer cells than subtasks."""

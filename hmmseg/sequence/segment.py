@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import entr
 
 from hmmseg.errors import InputError
 from hmmseg.hmm.chain import InfeasibleAlignment
@@ -60,22 +61,15 @@ def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], la
                     moved = shift(moved, course.shift[b, j], order=1)
                 parts.append(moved)
                 weights.append(weight[j])
-        table = _normal(convolve1d(np.array(parts), _laplace(scale), axis=1, mode="constant"))
+        reach = int(np.ceil(FARTHEST * scale))
+        law = np.exp(-np.abs(np.arange(-reach, reach + 1)) / max(scale, 1e-9))
+        table = convolve1d(np.array(parts), law / law.sum(), axis=1, mode="constant")
+        table /= np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
         p = np.array(weights) / np.sum(weights)
         mixed = p @ table
-        gain.append(max(_entropy(mixed) - float(p @ [_entropy(part) for part in table]), 0.0))
+        gain.append(max(float(entr(mixed).sum() - p @ entr(table).sum(1)), 0.0))
         mixture.append((1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / len(mixed))
     return Boundaries(np.array(mixture).T, np.array(gain))
-
-
-def _laplace(scale: float) -> np.ndarray:
-    reach = int(np.ceil(FARTHEST * scale))
-    kernel = np.exp(-np.abs(np.arange(-reach, reach + 1)) / max(scale, 1e-9))
-    return kernel / kernel.sum()
-
-
-def _normal(table: np.ndarray) -> np.ndarray:
-    return table / np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
 
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
@@ -104,10 +98,6 @@ def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Plac
     if found[0].probability >= SURE or len(found) == 1:
         return ()
     return tuple(place for place in found if place.probability >= LISTED)
-
-
-def _entropy(p: np.ndarray) -> float:
-    return float(-(p * np.log(np.where(p > 0, p, 1.0))).sum())
 
 
 MAIN = 0.5  # chosen: least probability about a median for it to be the answer, not a time amid several places
@@ -301,18 +291,16 @@ def _boundary(
     at the very start) lies at the first edge. `scattered`: it may lie in places far apart, between which
     there is nothing; the interval is then the shortest instead of that of equal tails.
     """
-    step = edges[1] - edges[0]
-    middle = (edges[1:] + edges[:-1]) / 2
-    cumulative = np.concatenate([[0.0], np.cumsum(probability)])
+    middle, inner = (edges[1:] + edges[:-1]) / 2, edges[1:-1]
+    cumulative = np.r_[0.0, np.cumsum(probability)]
     total = max(cumulative[-1], np.finfo(float).tiny)
     low, median, high = np.interp([0.05, 0.5, 0.95], cumulative / total, middle)
     if scattered:
         low, high = _shortest(middle, cumulative / total)
-    inner = edges[1:-1]
-    mean = (probability * inner).sum() / total
-    variance = (probability * (inner - mean) ** 2).sum() / total + step**2 / 12
-    clip = lambda t: float(np.clip(t, first, last))  # noqa: E731
-    return clip(median), float(np.sqrt(variance)), (clip(low), clip(high))
+    mean = probability @ inner / total
+    variance = probability @ (inner - mean) ** 2 / total + (edges[1] - edges[0]) ** 2 / 12
+    low, median, high = np.clip([low, median, high], first, last).tolist()
+    return median, float(np.sqrt(variance)), (low, high)
 
 
 def _shortest(middle: np.ndarray, cumulative: np.ndarray) -> tuple[float, float]:
