@@ -116,13 +116,6 @@ class Parameters:
     levels: tuple[dict[int, float], ...] = ()
 
 
-def _log_mostly(residual: np.ndarray, scale: np.ndarray, span: float, stray: float) -> np.ndarray:
-    """Log density of a residual that is small but for a share `stray` of samples; 0 where missing."""
-    close = np.log1p(-stray) + log_student(residual, scale)
-    either = np.logaddexp(close, np.log(stray) - np.log(span))
-    return np.where(np.isfinite(residual), either, 0.0)
-
-
 def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.ndarray,
                  broad_up: np.ndarray, stray: float) -> np.ndarray:  # fmt: skip
     """Log density of the motion of a block on its support: at rest, pushed aside, or astray altogether.
@@ -236,8 +229,10 @@ def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:
     width = p.width.get(name)
     if width is None:  # the first pass knows neither widths nor where a block rests
         return _broad(f, "d")
-    spread = np.hypot(f.sd_d, p.scale["width"])
-    return _log_mostly(f.block_width(p.bias) - width, spread, f.span["d"], TOUCHING)
+    residual = f.block_width(p.bias) - width
+    close = np.log1p(-TOUCHING) + log_student(residual, np.hypot(f.sd_d, p.scale["width"]))
+    either = np.logaddexp(close, np.log(TOUCHING) - np.log(f.span["d"]))
+    return np.where(np.isfinite(residual), either, 0.0)
 
 
 def _log_gripped(
@@ -341,9 +336,8 @@ def without(f: Features, spans: Sequence[tuple[float, float]]) -> Features:
         out |= (f.t >= start) & (f.t <= end)
     if not out.any():
         return f
-    force = np.where(out[:, None], np.nan, f.force)
     blank = {name: np.where(out, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
-    return replace(f, force=force, **blank)
+    return replace(f, force=np.where(out[:, None], np.nan, f.force), **blank)
 
 
 def _range(values: np.ndarray, least: float) -> float:
