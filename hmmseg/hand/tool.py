@@ -131,25 +131,11 @@ def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WI
     period = float(even[1] - even[0])
     length = max(LEAST, round(window / period) // 2 * 2 + 1)
     length = min(length, (len(t) - 1) // 2 * 2 + 1)
-    gridded = np.stack([np.interp(even, t, column) for column in flat.T], axis=1)
-    found = np.stack([_parabolas(column, length, deriv) for column in gridded.T], axis=1) / period**deriv
-    out = np.stack([np.interp(t, even, column) for column in found.T], axis=1)
-    return out.reshape(values.shape)
+    from scipy.signal import savgol_filter  # slow to import
 
-
-def _parabolas(values: np.ndarray, length: int, deriv: int) -> np.ndarray:
-    """Values (N,), or their derivative a step, of parabolas through `length` (odd) of them about each.
-
-    The first and the last half of `length` are on the first and the last parabola. As
-    scipy.signal.savgol_filter, whose import takes longer than most recordings.
-    """
-    half = length // 2
-    steps = np.vander(np.arange(-half, half + 1), 3, increasing=True)
-    fit = np.linalg.pinv(steps)
-    slopes = [steps, np.pad(steps[:, :2], ((0, 0), (1, 0))) * (0, 1, 2), np.eye(3)[[2] * length] * 2]
-    middle = np.convolve(values, (slopes[deriv][half] @ fit)[::-1], mode="valid")
-    first, last = (slopes[deriv] @ (fit @ end) for end in (values[:length], values[-length:]))
-    return np.concatenate([first[:half], middle, last[half + 1 :]])
+    gridded = np.stack([np.interp(even, t, column) for column in flat.T])
+    found = savgol_filter(gridded, length, 2, deriv, period)
+    return np.stack([np.interp(t, even, column) for column in found], axis=1).reshape(values.shape)
 
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner

@@ -20,7 +20,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense
 from hmmseg.levels import FIRM, MOVED, SURE
-from hmmseg.robust import NORMAL, median_of_known
+from hmmseg.robust import NORMAL, median_of_known, runs
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
@@ -125,12 +125,6 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
     least = np.maximum(4 * f.sd_y[span], MOVED)
     ends = np.median(height[:ENDS]), np.median(height[-ENDS:])
     return moving | np.all([np.abs(height - end) > least for end in ends[: 1 if guessing else 2]], axis=0)
-
-
-def runs(found: np.ndarray) -> list[tuple[int, int]]:
-    """Where each stretch of true samples starts and stops."""
-    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
