@@ -238,16 +238,11 @@ def slopes_within(
         known = sd[np.isfinite(sd)]
         noise = float(np.median(known)) if known.size else 0.0
         # What readings are rougher than places is noise of the forces: they ring, what they move does not.
-        rough = [_rough(values[key][group]) for group in together]
+        seen = [values[key][group & np.isfinite(values[key])] for group in together]
+        rough = [white_sd(one) for one in seen if one.size >= MIN_SAMPLES]
         ringing = np.sqrt(max(max(rough, default=0.0) ** 2 - noise**2, 0.0))
         sds = (max(sd_force * compliance, ringing), noise)
         found = slope(signals.t, values[key], place, give, together, scales[key], sds)
         if found is not None:
             out[name] = found
     return out
-
-
-def _rough(readings: np.ndarray) -> float:
-    """White noise (sd) of readings (num_samples,), 0 of too few [m]."""
-    there = readings[np.isfinite(readings)]
-    return white_sd(there) if there.size >= MIN_SAMPLES else 0.0

@@ -239,7 +239,11 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     error = scale * np.sqrt(together) * fitted.errors
     if not between and np.all(np.abs(fitted.drift) < SURE * error[2:]):
         axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
-    _check(where, gripper, fitted.inertia, float(error[0]))
+    left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
+    if (left_open or gripper.reaction is None) and abs(fitted.inertia) < SURE * float(error[0]):
+        problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
+        raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
+                         "under [gripper], as they are mounted")  # fmt: skip
     mass = fitted.mass if fitted.mass is not None else fitted.inertia
     offset, drift = axes @ fitted.offset, axes @ fitted.drift
     against = gripper.reaction is not None and fitted.inertia < -SURE * float(error[0])
@@ -321,15 +325,6 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
     if gripper.reaction is not None or size[2] < 1e-3 * size[0]:
         flip[2] = (-1.0 if gripper.reaction else 1.0) * np.linalg.det(left @ right)
     return (left * flip) @ right
-
-
-def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
-    """InputError where free motion does not determine what the rig leaves open."""
-    left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
-    if (left_open or gripper.reaction is None) and abs(inertia) < SURE * error:
-        problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
-        raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
-                         "under [gripper], as they are mounted")  # fmt: skip
 
 
 def _centre_of_mass(trial: Trial, gripper: Gripper, tool: Tool, free: np.ndarray,

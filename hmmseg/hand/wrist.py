@@ -476,7 +476,16 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     held = held_by(trial, rig, pose, opening, pressing)
     signs: tuple[str, ...] = ()
     if held.lifts and max(held.lifts) < 0:
-        held, rig, signs = _with_other_sign(trial, rig, pose, opening, pressing, held)
+        # What is lifted hangs on the hand: that shows the sign before the hand's own inertia does.
+        least = min(held.lifts)
+        for reaction in (True, False) if gripper.reaction is None else ():
+            other = rig.model_copy(update={"gripper": gripper.model_copy(update={"reaction": reaction})})
+            found = held_by(trial, other, pose, opening, pressing)
+            if found.lifts and max(found.lifts) > 0:
+                held, rig, signs = found, other, (pose_remark(trial, other, max(found.lifts)),)
+                break
+        if not signs:
+            raise other_sign(trial, rig, least)
     elif held.lifts and held.tool.against:
         signs = (pose_remark(trial, rig, max(held.lifts)),)
     elif held.tool.against:
@@ -490,21 +499,6 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     order = order_warnings(trial, rig, held.tool, held.free)
     named = order or tool_warnings(trial, rig, held.tool)
     return replace(found, warnings=(*found.warnings, *signs, *named))
-
-
-def _with_other_sign(
-    trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None, held: Held
-) -> tuple[Held, Rig, tuple[str, ...]]:
-    """What is held with the other sign, where lifts pull up and none is stated; else InputError.
-
-    What is lifted hangs on the hand: that shows the sign before the hand's own inertia does.
-    """
-    for reaction in (True, False) if rig.wrist.reaction is None else ():
-        other = rig.model_copy(update={"gripper": rig.wrist.model_copy(update={"reaction": reaction})})
-        found = held_by(trial, other, pose, opening, pressing)
-        if found.lifts and max(found.lifts) > 0:
-            return found, other, (pose_remark(trial, other, max(found.lifts)),)
-    raise other_sign(trial, rig, min(held.lifts))
 
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,

@@ -274,7 +274,11 @@ def conformity(
     for assignment in ways:
         c = _compare(free, steps, assignment)
         while c.failing is not None and (lost := _lapses(c)):
-            c = _compare(_unread(c.free, lost), steps, assignment)
+            table, ringing, opened = c.free.table.copy(), c.free.ringing.copy(), c.free.opened.copy()
+            for span in lost:  # these samples say nothing
+                table[span], ringing[span], opened[span] = 0.0, 0.0, 0.0
+            unread = replace(c.free, table=table, ringing=ringing, opened=opened)
+            c = _compare(unread, steps, assignment)
         found.append(c)
         if c.failing is None:
             return c
@@ -293,14 +297,6 @@ def _lapses(c: Conformity) -> list[slice]:
         if brief and lost.state == FREE and before.block == after.block and c.free.table[span].any():
             out.append(span)
     return out
-
-
-def _unread(free: FreeContacts, spans: Sequence[slice]) -> FreeContacts:
-    """The alternative without what some samples say."""
-    table, ringing, opened = free.table.copy(), free.ringing.copy(), free.opened.copy()
-    for span in spans:
-        table[span], ringing[span], opened[span] = 0.0, 0.0, 0.0
-    return replace(free, table=table, ringing=ringing, opened=opened)
 
 
 def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, int | None]]:
