@@ -15,9 +15,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
 
@@ -26,11 +24,6 @@ if TYPE_CHECKING:
     from hmmseg.io.task import BlockTask
     from hmmseg.segmentation.spans import Segmentation
 
-WorkersOption = Annotated[int | None, typer.Option(
-    "--workers", metavar="N", min=1, help="Fit each recording by itself, in N processes.")]  # fmt: skip
-SchedulerOption = Annotated[str | None, typer.Option(
-    "--scheduler", metavar="ADDRESS",
-    help="The same on a Dask cluster, as tcp://host:8786; local: one of this machine.")]  # fmt: skip
 LOCAL = "local"
 PATIENCE = 10.0  # limit: s; how long a cluster is waited for
 

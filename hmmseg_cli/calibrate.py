@@ -2,39 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.table import Table
 
 from hmmseg.errors import InputError
-from hmmseg_cli.console import JsonOption, Output, QuietOption, TrialsArgument, UnusedSeed, distinct_trials
-from hmmseg_cli.diagnose_robot import (
-    MapOption,
-    OwnSimulator,
-    PatchOption,
-    SimulatorOption,
-    read_logs,
-    show_stages,
-    warn_of_engine,
-)
-
-ModelOption = Annotated[
-    Path | None,
-    typer.Option("--model", "--mjcf", metavar="XML", help="The robot's model, as MuJoCo reads it."),
-]
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, distinct_trials
+from hmmseg_cli.diagnose_robot import OwnSimulator, read_logs, show_stages, warn_of_engine
 
 
 def calibrate(
-    logs: TrialsArgument,
-    model: ModelOption = None,
-    map_file: MapOption = None,
-    simulator: SimulatorOption = None,
-    patch: PatchOption = None,
-    json: JsonOption = None,
-    seed: UnusedSeed = 0,
-    quiet: QuietOption = False,
+    logs: opt.Trials,
+    model: opt.RobotModel = None,
+    map_file: opt.Map = None,
+    simulator: opt.Simulator = None,
+    patch: opt.Patch = None,
+    json: opt.Json = None,
+    seed: opt.UnusedSeed = 0,
+    quiet: opt.Quiet = False,
 ) -> None:
     """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these leave open."""
     with Output("calibrate", json=json, seed=seed, quiet=quiet) as out:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.table import Table
@@ -34,35 +34,6 @@ ROBOT = "A robot against your own model of it"
 
 def _option(flag: str, metavar: str, text: str) -> Any:
     return typer.Option(flag, metavar=metavar, rich_help_panel=ROBOT, help=text)
-
-
-SimulatorOption = Annotated[
-    str | None, _option("--simulator", "FILE.py:NAME", "Your own model instead of the virtual blocks.")
-]
-MjcfOption = Annotated[
-    Path | None, _option("--mjcf", "XML", "Your own model, as MuJoCo reads it; it needs --map.")
-]
-MapOption = Annotated[
-    Path | None,
-    _option("--map", "MAP.toml", "Which column of the logs is which joint, actuator, sensor "
-            "or body of the MJCF model, in what unit."),
-]  # fmt: skip
-CandidateOption = Annotated[
-    list[str] | None,
-    _option("--candidate", "NAME", "Add a parameter of the MJCF model to the candidates, such as "
-            "joint:elbow.frictionloss."),
-]  # fmt: skip
-HistoryOption = Annotated[
-    Path | None,
-    _option("--history", "FILE.jsonl", "Add this run's intervals to that file, and say what has moved."),
-]
-RerunOption = Annotated[
-    Path | None, _option("--rerun", "FILE.rrd", "Recorded, simulated and corrected, for Rerun's viewer.")
-]
-PatchOption = Annotated[
-    Path | None,
-    typer.Option("--patch", metavar="DIR", help="Write the corrected model and its ranges into this folder."),
-]
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
 from hmmseg.io.formats import kind_of, read_table, split_part
@@ -27,10 +25,6 @@ if TYPE_CHECKING:
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.spans import Span
 
-WriteOption = Annotated[Path | None, typer.Option(
-    "--write", metavar="FILE",
-    help="Write the recording with subtask columns (.csv, .parquet) or a topic (.mcap); for several "
-    "recordings, or a LeRobot data set, a folder.")]  # fmt: skip
 KINDS = (".csv", ".parquet", ".mcap")
 
 

@@ -121,8 +121,16 @@ def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     }[channel]  # fmt: skip
 
 
-def draw_signal(found: Diagnosis, path: Path) -> None:
-    """The channel and trial of the largest excess: the signal, and its whitened residual beneath."""
+def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
+    """The signal where the excess is largest, with its whitened residual beneath."""
+    if isinstance(found, GenericDiagnosis):
+        _draw_mean_course(found, path)
+    else:
+        _draw_trial(found, path)
+
+
+def _draw_trial(found: Diagnosis, path: Path) -> None:
+    """The channel and trial of the largest excess: recorded, simulated, corrected."""
     frame = found.problem.frame
     cell = max(found.cells, key=lambda c: c.energy - c.count)
     r, c, n = cell.trial, list(CHANNELS).index(cell.channel), frame.lengths[cell.trial]
@@ -150,7 +158,7 @@ def draw_signal(found: Diagnosis, path: Path) -> None:
         above.set_title(f"{cell.channel} in {frame.files[r]}, largest gap shaded", loc="left")
 
 
-def draw_generic(found: GenericDiagnosis, path: Path) -> None:
+def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
     """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
     lay = found.scene.layout
     excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance

@@ -8,7 +8,6 @@ Neurosci. 3, 1991); physiological tremor lies at 6-12 Hz.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
-from hmmseg.io.schema import read_toml
+from hmmseg.io.schema import read_json, read_toml
 from hmmseg.io.task import BlockTask, Move
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.properties import Blocks, Tabletop, lay_out
@@ -80,15 +79,7 @@ class OperatorSettings:
 def read_operator(path: str | Path) -> OperatorSettings:
     """Settings from a TOML or JSON file: [low, high] or one number by name; InputError for others."""
     path = Path(path)
-    if path.suffix.lower() == ".json":
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(str(path), f"cannot be read ({error})", "operator settings") from None
-    else:
-        table = read_toml(path)
-    if not isinstance(table, dict):
-        raise InputError(str(path), "holds no table", "operator settings by name")
+    table = read_json(path, "operator settings") if path.suffix.lower() == ".json" else read_toml(path)
     settings = {}
     for name, value in table.items():
         if name not in OperatorSettings.__dataclass_fields__:

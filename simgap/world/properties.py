@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from copy import deepcopy
@@ -16,6 +15,7 @@ from rich.table import Table
 from estimation.report import LIMITS, number, read_actual
 from hmmseg.contact.decompose import UNITS
 from hmmseg.errors import InputError
+from hmmseg.io.schema import read_json
 from hmmseg.io.task import GROUND, BlockTask, Move
 
 DEFAULT_FRICTION = 1.2  # prior: of foam on a block, where nothing says otherwise
@@ -78,13 +78,7 @@ def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
     """
     path = Path(path)
     if path.suffix.lower() == ".json":
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(str(path), "no such file", "identify's JSON or an actual.toml") from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(str(path), f"not valid JSON ({error})") from None
-        table = table.get("properties") if isinstance(table, dict) else None
+        table = read_json(path, "identify's JSON or an actual.toml").get("properties")
         if not isinstance(table, dict):
             raise InputError(f"{path}: key properties", "missing", "the JSON of identify")
     else:
