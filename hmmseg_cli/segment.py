@@ -14,7 +14,6 @@ from hmmseg.segmentation.spans import most_telling, spans_table, trials_table
 from hmmseg_cli import options as opt
 from hmmseg_cli.batch import recordings_in, segment_apart
 from hmmseg_cli.console import Output, described, distinct_trials, needed, read_trials
-from hmmseg_cli.labels import check_destination, write_labels
 from hmmseg_cli.options import Segmenter
 
 if TYPE_CHECKING:
@@ -35,6 +34,8 @@ def segment(
     With --workers or --scheduler each recording is fitted by itself, not pooled with the others, and a folder
     means all recordings in it.
     """
+    from hmmseg_cli.labels import check_destination, write_labels
+
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
         apart, recordings = workers is not None or scheduler is not None, []
         paths = distinct_trials(recordings_in(trials) if apart else trials)

@@ -21,7 +21,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.effects import catalogue, effect_named
 from simgap.effects.base import KINEMATICS, Performance
-from simgap.gap.twins import carried, recorded, scene_of
+from simgap.gap.twins import altered, carried, recorded, scene_of
 from simgap.gap.twins import performed as perform
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
@@ -178,11 +178,9 @@ def replayed(
         found.t, found.motion.position, found.motion.velocity, force.reshape(n, 2, 2),
         np.asarray(boundaries, float), rig, *carried(found.t, boundaries, task, blocks),
     )  # fmt: skip
-    rng = np.random.default_rng(0)
-    acting = sorted((effect_named(name) for name in rig.effects), key=lambda e: -e.stage)
-    for effect in acting:
-        if effect.apply is not None and effect.stage != KINEMATICS:
-            truth = effect.apply(truth, dict(rig.effects[effect.name]), rng)
+    acting = sorted(map(effect_named, rig.effects), key=lambda e: -e.stage)
+    felt = {e.name: rig.effects[e.name] for e in acting if e.stage != KINEMATICS}
+    truth = altered(truth, felt, np.random.default_rng(0))
     force = np.stack([np.interp(found.signals.t, found.t, c) for c in truth.force.reshape(n, 4).T], 1)
     for effect in acting:
         if effect.finish is not None:

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
 from simgap.generic.diagnose import GenericDiagnosis
-from simgap.generic.trials import SLOW, bin_edges
+from simgap.generic.trials import SLOW
 from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
 from simgap.report.robot import Course, Own, courses
 from simgap.robots.changes import Changes
@@ -165,9 +165,7 @@ def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
     courses = [(c, k) for c in range(len(lay.ensembles.channels)) for k in range(len(lay.ensembles.subtasks))]
     channel, worst = max(courses, key=lambda cell: excess[lay.where(SLOW, *cell)].mean())
     index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
-    ends = found.scene.edges
-    edges = [bin_edges(lay, ends[k], ends[k + 1], k) for k in range(ends.size - 1)]
-    t = np.concatenate([(e[1:] + e[:-1]) / 2 for e in edges])
+    t = (found.scene.bins[1:] + found.scene.bins[:-1]) / 2
     real, sim = found.real[:, index], found.sim[:, index]
     with canvas(path, height=3.8) as figure:
         above, below = figure.subplots(2, 1, sharex=True)

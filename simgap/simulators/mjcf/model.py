@@ -13,10 +13,10 @@ import numpy as np
 
 from hmmseg.robust import bridged
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
-from simgap.simulators.mjcf.runs import ACTS, Held, Runs, body_rate
+from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
 from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
@@ -180,17 +180,7 @@ class MjcfSimulator:
             return
         for log in recordings:
             first = self._state(Job({}, log, None))
-            h = float(self.model.opt.timestep)
-            times = np.arange(int(np.ceil((log.t[-1] - log.t[0]) / h)) + 2) * h
-            held = Held(log.t - log.t[0], times)
-            control = np.zeros((1, times.size, max(self.model.nu, 1)))
-            for column, actuator in self.driven.items():
-                control[0, :, actuator] = held(log[column])
-            states, _ = rollout.rollout(
-                self.model, self._data[0], first[None], control if self.model.nu else None, nstep=times.size
-            )
-            rows = np.clip(np.searchsorted(times, log.t - log.t[0]) - 1, 0, times.size - 1)
-            found = states[0][rows]
+            found = free_run(self.model, self._data[0], log, first, self.driven)
             found[0] = first
             found[:, 0] = 0.0
             self._runs[log.name] = np.where(np.isfinite(found), found, first)
