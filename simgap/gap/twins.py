@@ -258,13 +258,11 @@ def settings(found: Search) -> OperatorSettings:
         return float(max(a, low)), float(max(b, low))
 
     pace = _carrying(usual) / max(float(np.median(spans.get("carry", [_carrying(usual)]))), 0.2)
-    out = replace(usual, pace=(pace, pace))
-    if grip:
-        out = replace(out, grip=between(grip, 0.3))
+    seen = {"pace": (pace, pace)} | ({"grip": between(grip, 0.3)} if grip else {})
     for name, own in (("pickup", "hold"), ("place", "place")):
         if name in spans:
-            out = replace(out, **{own: between([v * pace for v in spans[name]], 0.02)})
-    return out
+            seen[own] = between([v * pace for v in spans[name]], 0.02)
+    return OperatorSettings(**seen)
 
 
 def _carrying(usual: OperatorSettings) -> float:

@@ -315,7 +315,7 @@ def _fitted(
         return shift_at(given, block, mine, u)
 
     def push(u: np.ndarray) -> np.ndarray:
-        return np.stack([(at(u + step) - at(u)) / STEP for step in STEP * priors], 1)
+        return (np.stack([at(u + step) for step in STEP * priors], 1) - at(u)[:, None]) / STEP
 
     def left(u: np.ndarray) -> np.ndarray:
         return np.concatenate([root @ (target - at(u)), u])

@@ -205,7 +205,7 @@ def _as_read(given: Scene, cut: Cut, channel: int, acting: Acting, rung: np.ndar
     t, values = cut.trial.t, cut.trial.channels[given.layout.ensembles.channels[channel]]
     there = np.isfinite(values)
     values = values if there.all() else np.interp(t, t[there], values[there])
-    m = min(t.size - 1, int(cut.trial.rate))
+    m = min(t.size - 1, int(np.searchsorted(t, t[0] + 1.0)))
     every = np.concatenate([2 * t[0] - t[m:0:-1], t]) - cut.edges[0]
     values = read(every, np.concatenate([values[m:0:-1], values]), acting)[m:]
     return values + _rung(given, t, cut.edges[:-1], rung)

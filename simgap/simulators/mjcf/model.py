@@ -13,11 +13,11 @@ import numpy as np
 
 from hmmseg.robust import bridged
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
-from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting, object_id
+from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
@@ -53,8 +53,6 @@ class MjcfSimulator:
 
     def __post_init__(self) -> None:
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
-        self._spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        self._size = mujoco.mj_stateSize(self.model, self._spec)
         self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
@@ -89,7 +87,7 @@ class MjcfSimulator:
         """Every job's channels with some settings changed."""
         if plays := [n for n, _ in changed if n in self.played]:
             return self.played[plays[0]](jobs, self._states(jobs), changed, self.model)
-        with Changed(self.model, self.settings, changed):
+        with changed_model(self.model, self.settings, changed):
             return self._runs_of([j.recording for j in jobs], self._states(jobs), changed)
 
     def _states(self, jobs: Sequence[Job]) -> np.ndarray:
@@ -134,12 +132,12 @@ class MjcfSimulator:
 
     def _reset(self) -> np.ndarray:
         """The model's own state, or its keyframe's."""
-        data, state = self._data[0], np.empty(self._size)
+        data, state = self._data[0], np.empty(mujoco.mj_stateSize(self.model, FULL))
         if self.map.keyframe is None:
             mujoco.mj_resetData(self.model, data)
         else:
             mujoco.mj_resetDataKeyframe(self.model, data, object_id(self.model, "key", self.map.keyframe))
-        mujoco.mj_getState(self.model, data, state, int(self._spec))
+        mujoco.mj_getState(self.model, data, state, FULL)
         state[0] = 0.0
         return state
 
@@ -214,7 +212,7 @@ class MjcfSimulator:
 
         def made() -> list[frozenset[tuple[int, int]]]:
             data = self._data[0]
-            mujoco.mj_setState(self.model, data, self._reset(), int(self._spec))
+            mujoco.mj_setState(self.model, data, self._reset(), FULL)
             return touching_pairs(self.model, data, poses, at)
 
         return latest(self._touched, (poses.shape, poses.tobytes()), made)

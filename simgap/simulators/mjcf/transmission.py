@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -75,23 +75,24 @@ def _of_motor(model: Any, motion: Motion, joint: int, row: int) -> float:
     return rotor * float(motion.acceleration[joint][row]) + damping * float(motion.rate[joint][row])
 
 
-class Sizes:
+class Sizes(NamedTuple):
     """What a joint shows along the logs, root mean squares."""
 
-    def __init__(self, torque: float, rate: float, acceleration: float, reach: float) -> None:
-        self.torque, self.rate = max(torque, 1e-9), max(rate, 1e-6)
-        self.acceleration, self.reach = max(acceleration, 1e-6), max(reach, 1e-6)
+    torque: float
+    rate: float
+    acceleration: float
+    reach: float
 
 
 def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
     """Sizes of one joint's motion along all logs."""
-    rms = lambda values: float(np.sqrt(np.mean(np.concatenate(values) ** 2)))  # noqa: E731
-    return Sizes(
-        rms([m.torque[joint] for m in motions]),
-        rms([m.rate[joint] for m in motions]),
-        rms([m.acceleration[joint] for m in motions]),
-        rms([m.position[joint] - m.position[joint].mean() for m in motions]),
-    )
+
+    def rms(values: Iterable[np.ndarray], least: float = 1e-6) -> float:
+        return max(float(np.sqrt(np.mean(np.concatenate([*values]) ** 2))), least)
+
+    reach = rms(m.position[joint] - m.position[joint].mean() for m in motions)
+    rate, acceleration = rms(m.rate[joint] for m in motions), rms(m.acceleration[joint] for m in motions)
+    return Sizes(rms((m.torque[joint] for m in motions), 1e-9), rate, acceleration, reach)
 
 
 SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
