@@ -17,7 +17,7 @@ from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
-from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, object_id
+from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, name_of, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
@@ -246,30 +246,25 @@ def contact_labels(model: Any, t: np.ndarray, touched: Sequence[Pairs]) -> list[
 def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
     """What touches at times t, with gaps below BROKEN filled. A touch counts however brief it is, for an
     impact is brief."""
-    out = [set(s) for s in sets]
+    out = list(sets)
     for pair in frozenset().union(*sets):
         rows = [i for i, s in enumerate(sets) if pair in s]
         for a, b in itertools.pairwise(rows):
             if t[b] - t[a] <= BROKEN:
-                for i in range(a, b):
-                    out[i].add(pair)
-    return [frozenset(s) for s in out]
+                out[a:b] = [s | {pair} for s in out[a:b]]
+    return out
 
 
-def _pair(model: Any, one: int, other: int) -> str:
-    """What moves, on what it touches; geoms of the world go last."""
-    return " on ".join(_name(model, g) for g in sorted((one, other), key=lambda g: _order(model, g)))
-
-
-def _order(model: Any, geom: int) -> tuple[bool, str]:
-    return int(model.geom_bodyid[geom]) == 0, _name(model, geom)
-
-
-def _name(model: Any, geom: int) -> str:
-    """The name of a geom's body; of the world's geoms, their own."""
-    body = int(model.geom_bodyid[geom])
-    kind, number = (mujoco.mjtObj.mjOBJ_BODY, body) if body else (mujoco.mjtObj.mjOBJ_GEOM, geom)
-    return mujoco.mj_id2name(model, kind, number) or (f"body {body}" if body else GROUND)
+def _pair(model: Any, *geoms: int) -> str:
+    """What moves, on what it touches: names of geoms' bodies, then those of the world's geoms."""
+    named = []
+    for geom in geoms:
+        body = int(model.geom_bodyid[geom])
+        own = (
+            name_of(model, "body", body) or f"body {body}" if body else name_of(model, "geom", geom) or GROUND
+        )
+        named.append((body == 0, own))
+    return " on ".join(name for _, name in sorted(named))
 
 
 def touching_pairs(
