@@ -95,9 +95,7 @@ def recorded(
         *carried(simulated.t, simulated.boundaries, task, simulated.blocks),
     )
     chosen = [effect_named(n) for n in effects]
-    for effect in sorted(chosen, key=lambda e: -e.stage):
-        if effect.apply is not None:
-            truth = effect.apply(truth, dict(effects[effect.name]), rng)
+    truth = altered(truth, effects, rng)
     truth = truth if change is None else change(truth)
     t = times = simulated.trial.t
     for effect in chosen:
@@ -115,6 +113,14 @@ def recorded(
             changed = {c: finish(trial.channels[c], values) for c in FORCE_CHANNELS}
             trial = replace(trial, channels=trial.channels | changed)
     return trial
+
+
+def altered(truth: Performance, effects: Values, rng: np.random.Generator) -> Performance:
+    """A performance as these effects change what sensors see of it, from the truth outwards."""
+    for effect in sorted(map(effect_named, effects), key=lambda e: -e.stage):
+        if effect.apply is not None:
+            truth = effect.apply(truth, dict(effects[effect.name]), rng)
+    return truth
 
 
 def carried(
@@ -258,13 +264,11 @@ def settings(found: Search) -> OperatorSettings:
         return float(max(a, low)), float(max(b, low))
 
     pace = _carrying(usual) / max(float(np.median(spans.get("carry", [_carrying(usual)]))), 0.2)
-    out = replace(usual, pace=(pace, pace))
-    if grip:
-        out = replace(out, grip=between(grip, 0.3))
+    seen = {"pace": (pace, pace)} | ({"grip": between(grip, 0.3)} if grip else {})
     for name, own in (("pickup", "hold"), ("place", "place")):
         if name in spans:
-            out = replace(out, **{own: between([v * pace for v in spans[name]], 0.02)})
-    return out
+            seen[own] = between([v * pace for v in spans[name]], 0.02)
+    return OperatorSettings(**seen)
 
 
 def _carrying(usual: OperatorSettings) -> float:
