@@ -43,7 +43,7 @@ from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
 from simgap.robots.linear import base_at
-from simgap.robots.model import Composed, Point
+from simgap.robots.model import Composed, Point, is_numeric
 from simgap.robots.rows import noises
 from simgap.robots.unchanged import (
     WIDER,
@@ -483,7 +483,7 @@ def changes(
         calibration = calibrate(simulator, old, effects)
     noise = noises(simulator, old)
     point: Point = {} if calibration is None else calibration.point
-    candidates = [n for n, e in effects.items() if not _numeric(simulator, e)]
+    candidates = [n for n, e in effects.items() if not is_numeric(simulator, e)]
 
     def along(logs: Sequence[Recording]) -> Composed:
         made = Composed.of(simulator, logs, effects, noise, LONGEST)
@@ -499,10 +499,6 @@ def changes(
     tell("changes in the new logs")
     found = Comparison(composed, known, candidates, units[1])
     return _concluded(found.searched(), found, (*broken, *more), calibration)
-
-
-def _numeric(simulator: Simulator, effect: RobotEffect) -> bool:
-    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
 
 
 def _concluded(
