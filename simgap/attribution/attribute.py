@@ -365,13 +365,11 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
 def _needed(f: Forms, model: Model, effect: int) -> bool:
     """Whether the evidence of a set rules out that its other effects do without this one, by more than errors
-    in their forms may feign: what only scatters has none. One alone is needed if there is a gap."""
+    in their forms may feign. One alone is needed if there is a gap."""
     others = tuple(j for j in model.effects if j != effect)
     if not others:
         return True
-    scattering = tuple(j for j in others if not f.gap.candidates[j].parameters)
-    off = max((f.gap.candidates[j].form for j in {*others} - {*scattering}), default=0.0)
-    feigned = off * (model.score - fitted(f, scattering).score)
+    feigned = max(f.gap.candidates[j].form for j in others) * (model.score - fitted(f, ()).score)
     return model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned)
 
 
