@@ -238,7 +238,7 @@ def gap_of(
         expected[block.index] = block.expected
     residual = np.concatenate([_whitened(white, row) for row in real - sim.mean(0)])
     return Gap(parts, residual, np.zeros((residual.size, 0)), tuple(candidates),
-               told=np.tile(expected, count), parts_alike=True)  # fmt: skip
+               told=np.tile(expected, count))  # fmt: skip
 
 
 def _whitened(white: Sequence[Block], values: np.ndarray) -> np.ndarray:
