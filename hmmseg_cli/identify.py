@@ -132,7 +132,7 @@ def _draw(
 ) -> None:  # fmt: skip
     """Signals with subtasks a trial, estimates, and of a Bayesian result corner and predictive check."""
     from estimation.plots import draw_check, draw_corner, draw_estimates
-    from hmmseg.plot.signals import draw_signals
+    from hmmseg.plot.spans import draw_signals
 
     for i, (s, trial, segmentation) in enumerate(zip(signals, trials, segmentations, strict=True)):
         stem = Path(trial.name).stem

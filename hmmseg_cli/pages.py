@@ -28,7 +28,7 @@ from hmmseg.numbers import (
     property_shown_as,
     shown_as,
 )
-from hmmseg.plot.signals import draw_signals
+from hmmseg.plot.spans import draw_signals
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
 from simgap.report.finding import plain_name

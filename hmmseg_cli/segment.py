@@ -121,7 +121,7 @@ def _segment_blocks(
 
         found = segment(recordings, task, rig)
     if out.figures is not None:
-        from hmmseg.plot.signals import draw_signals
+        from hmmseg.plot.spans import draw_signals
 
         for trial, s, segmentation in zip(recordings, signals, found, strict=True):
             draw_signals(s, segmentation, out.figure(f"{trial.stem}_segments.png"))
@@ -180,7 +180,7 @@ def _segment_sequence(
     learned = None if model_file is None else load_model(model_file, task)
     found = segment_sequence(recordings, task, learned)
     if out.figures is not None:
-        from hmmseg.plot.channels import draw_channels
+        from hmmseg.plot.spans import draw_channels
 
         for trial, segmentation in zip(recordings, found, strict=True):
             draw_channels(trial, segmentation, out.figure(f"{trial.stem}_segments.png"))

@@ -70,20 +70,13 @@ def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose
         where = f"{trial.file}: [gripper] closing"
         problem = f"the pads close along {gripper.closing}, which is mostly up and down"
         raise InputError(where, problem, "the axis along which they close, and a quaternion x, y, z, w")
-    window = _window(t, position) if window is None else window
+    if window is None:  # as wide as leaves little noise in the acceleration
+        # Of a parabola through n samples the second derivative's variance is 720 s^2 / (n^5 dt^4).
+        period, sd = float(np.median(np.diff(t))), max(white_sd(c) for c in position.T)
+        needed = (720 * sd**2 / period**4 / QUIET**2) ** 0.2 * period
+        window = float(np.clip(needed, WINDOW, WIDEST))
     velocity, acceleration = (smooth(t, position, deriv, window) for deriv in (1, 2))
     return Pose(t, position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)
-
-
-def _window(t: np.ndarray, position: np.ndarray) -> float:
-    """Smoothing window [s] that leaves little noise in the acceleration.
-
-    Of a parabola through n samples, the second derivative's variance is 720 s^2 / (n^5 dt^4) for large n.
-    """
-    period = float(np.median(np.diff(t)))
-    sd = max(white_sd(c) for c in position.T)
-    needed = (720 * sd**2 / period**4 / QUIET**2) ** 0.2 * period
-    return float(np.clip(needed, WINDOW, WIDEST))
 
 
 def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
