@@ -3,10 +3,8 @@
 The wrist feels the sum of what both fingers do; each finger's channels hold half of it. What
 they press against each other with does not reach the wrist. Where no grip force is recorded, the
 pads' own spring gives it: their squeeze is the opening at which they touched less the one they are
-held at (`hmmseg.hand.opening`). That says when something is held, and where the touch lies within what
+held at. That says when something is held, and where the touch lies within what
 the slowing of the closing leaves open, but is no measured force: friction is not bounded by it.
-
-What a gripper holds between its closings, and how its load tells a mapping that cannot be.
 
 A hand that is raised with what it holds bears it. Where no hold lifts anything, the columns are read the
 other ways that a rig may have it, and the way in which the hand lifts something every time is what to write.
