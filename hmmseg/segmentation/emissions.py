@@ -284,13 +284,10 @@ def thin(
     width = int(np.clip(min(window, 1.0) * rate, 1, group))
     thinned = {}
     for name, values in vars(signals).items():
-        if not isinstance(values, np.ndarray):
-            thinned[name] = values
-            continue
-        mean, count = grouped(values, group, width)
-        thinned[name] = mean / np.sqrt(np.maximum(count, 1)) if name.startswith("sd_") else mean
-    thinned["sd_force"] = signals.sd_force / np.sqrt(width)
-    return Signals(**thinned)
+        if isinstance(values, np.ndarray):
+            mean, count = grouped(values, group, width)
+            thinned[name] = mean / np.sqrt(np.maximum(count, 1)) if name.startswith("sd_") else mean
+    return replace(signals, **thinned, sd_force=signals.sd_force / np.sqrt(width))
 
 
 def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:

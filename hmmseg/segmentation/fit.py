@@ -144,9 +144,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
         gamma = every[:, held].sum(axis=1)
         if not (np.isfinite(unsqueezed) & (gamma > 0)).any():
             continue  # never held where the distance is known
-        start = old.width.get(name, None)
-        if start is None:
-            start = weighted_median(unsqueezed, gamma)
+        start = old.width.get(name) or weighted_median(unsqueezed, gamma)
         width[name] = _location(unsqueezed, gamma, spread, start)
         residuals.append(unsqueezed - width[name])
         weights.append(gamma)
