@@ -136,7 +136,12 @@ def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
 
 def clear(value: float, most: float) -> bool:
     """Whether a statistic is that of a gap for certain, were a healthy one twice the `most` that was seen."""
-    return value - 2 * max(0.0, most) > -np.log(SURE)
+    return max(0.0, most) < doubtful(value)
+
+
+def doubtful(value: float) -> float:
+    """The least statistic [nats] of a healthy recording that leaves a gap's `value` in doubt."""
+    return (value + float(np.log(SURE))) / 2
 
 
 def detected(value: float, twins: Iterable[float] | None = None) -> Detection:

@@ -21,6 +21,7 @@ from simgap.gap.problem import (
     Fitted,
     Problem,
     columns_of,
+    cost_at,
     evaluated,
     free_of,
     limits,
@@ -230,7 +231,8 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
 def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:
     """A fit's residual and derivatives at the same coordinates on another recording; `usual`: those by the
     properties, where they are known."""
-    now = evaluated(other, f.effects, f.u, f.columns, [], usual)
+    at = cost_at(other, f.effects, f.u, f.columns, [])
+    now = evaluated(other, f.effects, f.u, f.columns, at, usual)
     return replace(f, residual=now.residual, push=now.push)
 
 

@@ -27,6 +27,7 @@ from simgap.gap.problem import (
     Problem,
     Start,
     columns_of,
+    cost_at,
     evaluated,
     fit,
     limits,
@@ -73,8 +74,9 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
     return out
 
 
-def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
-    """The best fit of one form of an effect, properties refitted; not refined where that promises nothing.
+def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMISING) -> Fitted:
+    """The best fit of one form of an effect, properties refitted; not refined where a linear step gains less
+    than what is `promising` [nats].
 
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
     what swings with it has no size. Properties start as they were measured: without the effect they may have
@@ -84,7 +86,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     base[: given.num_properties][given.measured.ravel()] = 0.0
     every, usual = starts(given, key, base), healthy.push
     ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < PROMISING:
+    if healthy.cost - ranked[0][0] < promising:
         return fit(given, ranked[0][2], 0, usual)
     leading = [start for _, start, _ in ranked[:LEADERS]]
     if len(leading) > 1:
@@ -106,7 +108,8 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Sta
     columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
     u = start.u.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    now = evaluated(given, start.effects, u, columns, [], usual)
+    at = cost_at(given, start.effects, u, columns, [])
+    now = evaluated(given, start.effects, u, columns, at, usual)
     bend = given.product(now.push, now.push) + np.eye(columns.size)
     pull = -given.product(now.push, now.residual) - u[columns]
     step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
@@ -210,12 +213,13 @@ def search(
     tell: Progress = silent,
     identified: Identified | None = None,
     noisy: bool = True,
+    promising: float = PROMISING,
 ) -> Search:
     """Fit the catalogue, and what is `forced`, to aligned trials; InputError where none fits its task.
 
     `identified`: what `identify` made of the same trials, where that is known already. `noisy`: whether to
     see what sensors' noise makes of the candidates (`simgap.gap.assemble.redrawn`), which takes half of the
-    time.
+    time. `promising`: see `best_fit`.
     """
     misled: list[str] = []
     names, trials = candidate_names(aligned.rig, excluded, forced), [one.trial for one in aligned.trials]
@@ -234,7 +238,7 @@ def search(
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, Start((), neutral(given)))
-    fits = [best_fit(given, key, healthy) for key in keys]
+    fits = [best_fit(given, key, healthy, promising) for key in keys]
     others = redrawn(given) if noisy else ()
     for _ in range(ROUNDS if noisy else 0):
         again = _anew(every, aligned, given, healthy, fits, others)

@@ -23,11 +23,11 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.posterior import forms
-from simgap.attribution.search import clear, sought, statistic
+from simgap.attribution.search import clear, doubtful, sought, statistic
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.gap.frame import as_from_wrist, of_wrist
-from simgap.gap.search import Identified, Search, search
+from simgap.gap.search import PROMISING, Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.source_digest import source_digest
 from simgap.world.operator import OperatorSettings, Plan
@@ -136,6 +136,7 @@ def carried(
 
 
 BATCHES = (1, 3, 4)  # numerics: twins that are simulated at once: the first alone is mostly enough
+PROMISES = 0.5  # numerics: share of what leaves doubt, below which no effect of a twin is refined
 LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
 QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
 
@@ -174,7 +175,7 @@ def twin_statistics(
             with suppress(InputError):  # a twin that drops its block is none
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
-                most = healthy_statistic(twin, actual, found.identified, noisy=False)
+                most = healthy_statistic(twin, actual, found.identified, False, PROMISES * doubtful(value))
                 sure = most <= 0 or clear(value, most)  # what is no sign of a gap counts as nothing
                 known.append(most if sure else healthy_statistic(twin, actual, found.identified))
                 keep_numbers(file, known)
@@ -182,10 +183,15 @@ def twin_statistics(
 
 
 def healthy_statistic(
-    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None, noisy: bool = True
-) -> float:
-    """The statistic of one healthy recording, through the whole search; its blocks as `identified`."""
-    f = forms(search(aligned, actual, identified=identified, noisy=noisy).gap)
+    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None, noisy: bool = True,
+    promising: float = 0.0,
+) -> float:  # fmt: skip
+    """The statistic of one healthy recording, through the whole search; its blocks as `identified`.
+
+    Effects are refined where a linear step gains as much as is `promising` [nats].
+    """
+    promising = max(promising, PROMISING)
+    f = forms(search(aligned, actual, identified=identified, noisy=noisy, promising=promising).gap)
     return statistic(f, sought(f, 1))
 
 

@@ -23,7 +23,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import FINEST, Whiten, moved_to
 from simgap.robots.heldout import folds_of
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
-from simgap.robots.model import Composed, Point
+from simgap.robots.model import Composed, Point, is_numeric
 from simgap.robots.rows import noises
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import LENGTH
@@ -190,7 +190,7 @@ def calibrate(
     """
     mine = {n: e for n, e in effects.items() if e.fitted or n in (begin or {})}
     fitted = [n for n, e in mine.items() if e.fitted]
-    if all(_numeric(simulator, mine[n]) for n in fitted):
+    if all(is_numeric(simulator, mine[n]) for n in fitted):
         raise InputError("calibrate", "nothing of the model is uncertain", "uncertain = [..] in the map")
     noise = noises(simulator, recordings)
     point: Point = {n: (begin or {}).get(n, e.neutral()) for n, e in mine.items()}
@@ -216,10 +216,6 @@ def calibrate(
     tell("held-out logs")
     before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})
     return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
-
-
-def _numeric(simulator: Simulator, effect: RobotEffect) -> bool:
-    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
 
 
 def _stretches(recordings: Sequence[Recording]) -> list[Recording]:

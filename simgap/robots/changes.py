@@ -9,17 +9,19 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
 * *How large*: delta's variance is what leaving out OLD's motions one by one makes of it, and NEW's (the
   delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
   degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
-  how little they tell of theta. Where the prior decides, motions agree and yet nothing is known: to it comes
-  what delta moves by when the prior's mean, one more observation, moves by its sd. And what a model gets
-  wrong alike in all motions shows in what a second small change would do to the first: to it comes how far
-  such pairs scatter, as Bayesian model averaging has it.
-* *Whether*: a change is one where delta is that far from nothing and which predicts motions of NEW that took
-  no part better than nothing does, by a share that matters. Where OLD made the same motions, what the model
-  gets wrong in them is known, and the nats gained must outweigh the number of candidates; a row counts as
-  many times less as rows depend on each other. Of other motions, and of a second change beyond a first, only
-  how gains scatter from motion to motion says what they are worth: a paired t.
-* *Which*: every explanation predicts each motion of NEW from OLD and NEW's others; one is ruled out where
-  another predicts better from motion to motion, by a paired t.
+  how little they tell of theta. Motions do not disagree in what is wrong alike in all of them. So to it
+  comes what delta moves by when the prior's mean, one more observation, moves by its sd; and what it moves by
+  when all else that was fitted to OLD is by DRIFT otherwise in NEW: laws of friction hold about the load and
+  speed that they were fitted at, and no robot is on two days the same.
+* *Which*: an explanation's energy is minus its log evidence (Laplace's, delta's prior a Cauchy in its
+  coordinates) by the fit to all motions together. A row counts as many times less as rows depend on each
+  other, which OLD's motions show by how far each pulls theta. What one motion says of delta alone is little:
+  a free swing tells mass from length only because slower motions know the friction. An explanation is ruled
+  out where it is less likely than RIVAL of the best, and the odds are worth no more than what a second
+  small change of anything gains beyond the best: as much is the model's own error.
+* *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and that
+  predicts motions of NEW that took no part better, by a share that matters; where OLD never made these
+  motions, so that what a model gets wrong in them is not known, from motion to motion, by Student's t.
 * *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
   to motion, and most of that is left.
 
@@ -29,8 +31,8 @@ A change of what is positive is of its logarithm (a gain doubled: log 2), of all
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +43,7 @@ from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
 from simgap.robots.linear import base_at
-from simgap.robots.model import Composed, Point
+from simgap.robots.model import Composed, Point, is_numeric
 from simgap.robots.rows import noises
 from simgap.robots.unchanged import (
     WIDER,
@@ -69,6 +71,7 @@ CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
 MATTERS = (
     0.1  # chosen: of what is missed of new logs, what a change must take to be more than a day's difference
 )
+DRIFT = 0.1  # prior: of a parameter, or of its usual size: by how much what is fitted differs in NEW
 RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
 UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
 
@@ -76,16 +79,15 @@ UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called 
 @dataclass(frozen=True)
 class Change:
     """One explanation: coordinates `x` (k,) of changed `effects`, by how much they change, standard
-    deviations `sd` (k,) with `freedom` (k,) degrees, `p_value` of no change,
-    `left` (M,): how motions of NEW
-    that took no part are missed [nats a row], and `theta` (p,): OLD's coordinates as NEW's logs have moved
-    them."""
+    deviations `sd` (k,) with `freedom` (k,) degrees, minus its log evidence (`energy` [nats]), `left` (M,):
+    how motions of NEW that took no part are missed [nats a row], and `theta` (p,): OLD's coordinates as NEW's
+    logs have moved them."""
 
     effects: tuple[str, ...]
     x: np.ndarray
     sd: np.ndarray
     freedom: np.ndarray
-    p_value: float
+    energy: float
     left: np.ndarray
     theta: np.ndarray
 
@@ -166,12 +168,9 @@ class Comparison:
             z = descended(lambda z: self.cost(z, of, mine), local, z)
             begun = [z]
         information, pull = self.runs.told(*self._columns(z, of, mine))
-        before = np.zeros((len(self.old.units), p + k, p + k))
-        before[:, :p, :p] = self.old.information
-        tug = np.zeros((len(self.old.units), p + k))
-        tug[:, :p] = self.old.pull - self.old.information @ z[:p]
         total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
-        left, moved = np.zeros(len(self.runs.units)), [np.zeros((n, k)) for n in map(len, (pull, tug))]
+        left = np.zeros(len(self.runs.units))
+        moved = [np.zeros((n, k)) for n in map(len, (self.runs.units, self.old.units))]
         none = np.zeros(len(self.old.units), bool)
         for number in range(len(self.runs.units)):
             step = np.linalg.lstsq(total - information[number], rest - pull[number], rcond=None)[0]
@@ -179,20 +178,24 @@ class Comparison:
             left[number] = self.runs.losses(of.point(self.old.point, self._at(there, of, mine)), number)[1]
             moved[0][number] = (there - z)[p:]
         for number in range(len(self.old.units) if k else 0):
-            step = np.linalg.lstsq(total - before[number], rest - tug[number], rcond=None)[0]
             without = np.arange(len(self.old.units)) == number
+            less, push = total.copy(), rest.copy()
+            less[:p, :p] -= self.old.information[number]
+            push[:p] -= self.old.pull[number] - self.old.information[number] @ z[:p]
+            step = np.linalg.lstsq(less, push, rcond=None)[0]
             moved[1][number] = (self._without(z, of, mine, -1, step, without) - z)[p:]
         pushed = np.sqrt(self.old.dependence * np.diag(self.old.prior))  # by a prior's mean one sd away
-        by_prior = np.linalg.solve(total, np.eye(p + k, p) * pushed)[p:] if k else np.zeros((0, p))
-        sd, freedom = jackknife(moved, np.sum(by_prior**2, 1))
+        by_prior = np.linalg.solve(total, np.eye(p + k, p) * pushed)
+        own = {of.names[m] for m in mine}
+        drift = np.array([0.0 if n in own else DRIFT**2 for n in self.old.theta.names])
+        by_drift = added_by_drift(total, bend[:p, :p], drift / self.old.dependence) * self.old.dependence
+        sd, freedom = jackknife(moved, (np.sum(by_prior**2, 1) + by_drift)[p:])
         x = z[p:]
-        p_value = 1.0
-        if k:  # of an effect with several parameters the surest, of two effects the less sure
-            each = 2 * student.sf(np.abs(x) / np.maximum(sd, 1e-12), freedom)
-            own = [[of.names[m][0] == e for m in mine] for e in effects]
-            others = 1 if self.paired else len(self.candidates)
-            p_value = min(1.0, others * float(max(each[m].min() * sum(m) for m in own)))
-        return Change(effects, x, sd, freedom, p_value, left, z[:p])
+        schur = total[p:, p:] - total[p:, :p] @ np.linalg.solve(total[:p, :p], total[:p, p:])
+        occam = float(np.sum(np.log(np.pi * (1 + x**2)))) - 0.5 * k * np.log(2 * np.pi)
+        occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence)[1]) if k else 0.0
+        energy = self.cost(z, of, mine) / self.old.dependence + occam
+        return Change(effects, x, sd, freedom, energy, left, z[:p])
 
     def scanned(self, about: Change | None = None) -> dict[str, tuple[float, np.ndarray]]:
         """By candidate the least cost over a ladder of changes of it, theta held, and where that is."""
@@ -222,19 +225,16 @@ class Comparison:
         """Whether OLD made all motions of NEW."""
         return bool(np.isin(self.runs.units, self.old.units).all())
 
-    def nats(self, gains: np.ndarray) -> np.ndarray:
-        """What gains (M,) [nats a row] by motion are together (M,), as rows depend on each other."""
-        return gains * np.bincount(np.searchsorted(self.runs.units, self.runs.unit)) / self.old.dependence
+    def chance(self, change: Change, beyond: Change) -> float:
+        """How likely one of all candidates is as much likelier than a simpler explanation by chance."""
+        return min(1.0, len(self.candidates) * float(np.exp(min(change.energy - beyond.energy, 0.0))))
 
     def needed(self, change: Change, beyond: Change) -> bool:
         """Whether an explanation is one that a simpler one cannot do without (see above)."""
-        gains = beyond.left - change.left
-        shares = gains / np.maximum(beyond.left, 1e-12)
-        if change.p_value >= CHANGED or shares.mean() < MATTERS:
+        shares = 1 - change.left / np.maximum(beyond.left, 1e-12)
+        if self.chance(change, beyond) >= CHANGED or shares.mean() < MATTERS:
             return False
-        if self.paired and not beyond.effects:
-            return bool(self.nats(gains).sum() > np.log(len(self.candidates) / CHANGED))
-        return by_chance(shares) < CHANGED
+        return self.paired or by_chance(shares) < CHANGED
 
     def searched(self) -> list[Change]:
         """Nothing, the most promising single changes, and pairs about the best of them."""
@@ -243,7 +243,7 @@ class Comparison:
         scan = self.scanned()
         names = sorted(scan, key=lambda n: scan[n][0])[:TRIED]
         singles = [self.fit((n,), [scan[n][1], *self._rungs(scan[n][1])]) for n in names]
-        fit = sorted(singles, key=lambda c: c.left.mean())
+        fit = sorted(singles, key=lambda c: c.energy)
         best = [c for c in fit if self.needed(c, nothing)][:PAIRED]
         if not best:
             return [nothing, *singles]
@@ -262,20 +262,17 @@ class Comparison:
             )
             for one, name, x in pairs.values()
         ]
-        rivals = {n for c in singles if beaten(c, best[0]) > RIVAL for n in c.effects}
-        return [nothing, *(widened(c, both, rivals) for c in singles), *both]
+        return [nothing, *singles, *both]
 
 
-def widened(change: Change, pairs: Sequence[Change], rivals: Collection[str]) -> Change:
-    """With the variance by what else may be a little otherwise: a second effect, no rival of the first, moves
-    it, and counts as much as it cannot be ruled out."""
-    own, k = {*change.effects}, change.x.size
-    both = [c for c in pairs if own < {*c.effects} and not ({*c.effects} - own) & {*rivals}]
-    if not both:
-        return change
-    moved = np.array([(c.x[:k] if c.effects[0] in own else c.x[-k:]) - change.x for c in both])
-    weight = np.array([beaten(c, change) for c in both])
-    return replace(change, sd=np.sqrt(change.sd**2 + weight @ moved**2 / (1 + weight.sum())))
+def added_by_drift(total: np.ndarray, before: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """What is added to the variances (q,) of coordinates that are known by an information of `total` (q, q)
+    if the first p of them, of which OLD's is `before` (p, p), differ by independent amounts of variance
+    `drift` (p,) in NEW."""
+    loose, p = total.copy(), drift.size
+    if p:
+        loose[:p, :p] += np.linalg.inv(np.linalg.inv(before) + np.diag(drift)) - before
+    return np.diag(np.linalg.inv(loose) - np.linalg.inv(total))
 
 
 def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -303,12 +300,6 @@ def by_chance(gains: np.ndarray) -> float:
     return float(student.sf(gains.mean() / sd * np.sqrt(gains.size), gains.size - 1))
 
 
-def beaten(one: Change, by: Change) -> float:
-    """How often another predicts motions by as large a share of a change's loss better where it is no better:
-    shares, as some motions are missed by far more than others."""
-    return by_chance(1 - by.left / np.maximum(one.left, 1e-12))
-
-
 @dataclass(frozen=True)
 class Changes:
     """What was found: `verdict` none, named, set or unknown; the `best` explanation and `others` that NEW's
@@ -322,6 +313,7 @@ class Changes:
     tried: tuple[Change, ...]
     probabilities: Mapping[str, float]
     worse: float
+    p_value: float
     old: Old
     runs: Runs
     composed: Composed
@@ -348,7 +340,7 @@ class Changes:
         chances = self.probabilities
         calibrated = {} if self.calibration is None else self.calibration.body()
         acting = {n: sum(p for e, p in chances.items() if n in e.split("+")) for n in (*names, *others)}
-        p_none = min((c.p_value for c in (best, *self.others) if c.effects), default=1.0)
+        p_none = self.p_value
         return {
             "verdict": self.verdict, "causes": names if self.verdict in ("named", "set") else [],
             "indistinguishable": others if self.verdict == "set" else [],
@@ -491,7 +483,7 @@ def changes(
         calibration = calibrate(simulator, old, effects)
     noise = noises(simulator, old)
     point: Point = {} if calibration is None else calibration.point
-    candidates = [n for n, e in effects.items() if not _numeric(simulator, e)]
+    candidates = [n for n, e in effects.items() if not is_numeric(simulator, e)]
 
     def along(logs: Sequence[Recording]) -> Composed:
         made = Composed.of(simulator, logs, effects, noise, LONGEST)
@@ -509,33 +501,32 @@ def changes(
     return _concluded(found.searched(), found, (*broken, *more), calibration)
 
 
-def _numeric(simulator: Simulator, effect: RobotEffect) -> bool:
-    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
-
-
 def _concluded(
     tried: Sequence[Change], found: Comparison, broken: Sequence[Broken], calibration: Calibration | None
 ) -> Changes:
-    """The verdict: the simplest explanation that no other beats from motion to motion."""
+    """The verdict: the simplest explanation that is needed, and those that are as likely."""
     nothing, old = tried[0], found.old
-    every = sorted(tried[1:], key=lambda c: c.left.mean())
+    every = sorted(tried[1:], key=lambda c: c.energy)
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
     best = next((c for c in singles if found.needed(c, nothing)), nothing)
-    if best.effects and found.excess(best).mean() > 0:  # more is left than of old logs
-        best = next((c for c in pairs if found.needed(c, best)), best)
-    others = [
-        c
-        for c in (singles if len(best.effects) == 1 else pairs)
-        if c is not best and best.effects and beaten(c, best) > RIVAL
-    ]
+    left = best.effects and found.excess(best).mean() > 0  # more than of old logs
+    more = next((c for c in pairs if left and found.needed(c, best)), best)
+    slack = max((best.energy - c.energy for c in pairs if {*best.effects} < {*c.effects}), default=0.0)
+    best, slack = more, max(slack, 0.0) if more is best else 0.0
+    least = best.energy + slack
+    alike = [c for c in (singles, pairs)[len(best.effects) == 2] if c is not best and best.effects]
+    weight = {"+".join(sorted(c.effects)): float(np.exp(min(least - c.energy, 0.0))) for c in alike}
+    others = [c for c in alike if weight["+".join(sorted(c.effects))] > RIVAL]
     excess = found.excess(best)
+    p_value = found.chance(best, nothing) if best.effects else 1.0
     worse = by_chance(excess) if found.paired else _unlike(best.left, old.missed)
     verdict = "none" if not best.effects else "set" if others else "named"
     if worse < UNKNOWN and excess.mean() > (nothing.left - best.left).mean():
         verdict = "unknown"
+    chances = _chances(best, weight, p_value, worse)
     return Changes(
-        verdict, best, tuple(others), nothing, tuple(tried), _chances(tried, best, worse), worse, old,
-        found.runs, found.composed, tuple(broken), calibration,
+        verdict, best, tuple(others), nothing, tuple(tried), chances, worse, p_value, old, found.runs,
+        found.composed, tuple(broken), calibration,
     )  # fmt: skip
 
 
@@ -549,20 +540,18 @@ def _unlike(new: np.ndarray, old: np.ndarray) -> float:
     return float(student.sf((a.mean() - b.mean()) / sd, b.size - 1))
 
 
-def _chances(tried: Sequence[Change], best: Change, worse: float) -> dict[str, float]:
-    """A probability of nothing, of the unknown, and of every explanation. Of a p-value the odds of nothing
-    are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55, 2001); explanations as simple
-    as the best share what is left as the paired tests have it."""
+def _chances(best: Change, weight: Mapping[str, float], p_value: float, worse: float) -> dict[str, float]:
+    """A probability of nothing, of the unknown, and of the explanations as simple as the best by weight. Of a
+    p-value the odds of nothing are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55,
+    2001)."""
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)
         return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
 
-    changed = [c for c in tried if c.effects and len(c.effects) == max(len(best.effects), 1)]
-    none, unknown = odds(best.p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
-    weight = {"+".join(sorted(c.effects)): beaten(c, best) for c in changed if c is not best}
-    weight |= {"+".join(sorted(best.effects)): 1.0} if best.effects else {}
-    total = max(sum(weight.values()), 1e-300)
-    seen = 1 - none / (1 + none) if best.effects else min(0.5, total)
+    none, unknown = odds(p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
+    every = {**weight, **({"+".join(sorted(best.effects)): 1.0} if best.effects else {})}
+    total = max(sum(every.values()), 1e-300)
+    seen = 1 - none / (1 + none) if best.effects else 0.0
     out = {"none": (1 - seen) * (1 - unknown), "unknown": unknown}
-    return out | {n: seen * (1 - unknown) * w / total for n, w in weight.items()}
+    return out | {n: seen * (1 - unknown) * w / total for n, w in every.items()}

@@ -16,7 +16,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.heldout import Shrinkage, folds_of, shrinkage
 from simgap.robots.linear import Linear
-from simgap.robots.model import Composed, Point, motions
+from simgap.robots.model import Composed, Point, is_numeric, motions
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.rows import noises
 from simgap.robots.search import Search, Settled
@@ -139,8 +139,7 @@ class _Calibrated:
     def _by(self, patterns: Sequence[str], begin: Point | None) -> Calibration | None:
         simulator, recordings, effects, length = self._given
         wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
-        numerics = getattr(simulator, "numerics", ())
-        if not any(e.fitted and not any(p in numerics for p in e.model.values()) for e in wide.values()):
+        if not any(e.fitted and not is_numeric(simulator, e) for e in wide.values()):
             return None
         return calibrate(simulator, recordings, wide, length=length, begin=begin, judged=False)
 

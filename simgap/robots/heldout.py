@@ -73,7 +73,7 @@ def shrinkage(best: Settled, nothing: Settled, composed: Composed, fold: np.ndar
     usable = np.isfinite(after) & np.isfinite(before) & ~np.isin(rows.window, list(best.wide))
     sensor = best.covariances.whitener()
     white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (before, after)]
-    floor = best.covariances.floor() / max(np.isfinite(best.linear.residual).sum(), 1)
+    floor = best.noise
     square = np.array([[*(w[usable & (fold == n)].sum() for w in white), floor * np.sum(usable & (fold == n))]
                        for n in np.unique(fold)])  # fmt: skip
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]

@@ -51,18 +51,6 @@ class Linear:
         """With some effects' columns added or replaced."""
         return replace(self, moved={**self.moved, **more}, diverged=(*self.diverged, *diverged))
 
-    def among(self, part: Composed, kept: np.ndarray) -> Linear:
-        """The same in some of the windows alone: those of `part`, whose rows are `kept` (N,)."""
-        return replace(
-            self,
-            rows=part.rows,
-            residual=self.residual[kept],
-            starts={n: v[kept] for n, v in self.starts.items()},
-            moved={n: Moved(m.at, m.shift[kept], m.jacobian[kept]) for n, m in self.moved.items()},
-            rates=self.rates[kept],
-            wobble=part.wobble,
-        )
-
 
 @dataclass(frozen=True)
 class Base:

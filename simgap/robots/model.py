@@ -9,7 +9,7 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.rows import Rows, rows_of
-from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, alike, cut, start_of
+from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, cut, start_of
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 
@@ -54,12 +54,6 @@ class Composed:
         """With windows of about `length` [s] cut, and their rows laid out."""
         windows = tuple(cut(simulator, recordings, noise, length))
         return cls(simulator, tuple(recordings), windows, effects, noise, rows_of(recordings, windows, noise))
-
-    def like(self, recordings: Sequence[Recording]) -> Composed:
-        """The same windows of other recordings of the same times."""
-        windows = tuple(alike(self.simulator, recordings, self.windows, self.noise))
-        rows = rows_of(recordings, windows, self.noise)
-        return replace(self, recordings=tuple(recordings), windows=windows, rows=rows)
 
     def along(self, logs: Sequence[int]) -> Composed:
         """The same along some of the logs alone, which keep their numbers."""
@@ -117,8 +111,7 @@ class Composed:
 
     def numeric(self, effect: str) -> bool:
         """Whether an effect is of the simulator's own numerics."""
-        numerics = getattr(self.simulator, "numerics", ())
-        return any(p in numerics for p in self.effects[effect].model.values())
+        return is_numeric(self.simulator, self.effects[effect])
 
     def moved(self, point: Point) -> Composed:
         """The same, with what the simulator's own numbers do as it is at this point."""
@@ -237,6 +230,11 @@ class Composed:
     def run(self, point: Point) -> list[Channels | None]:
         """True channels of every window."""
         return self.rolled(point, self.starts(point))
+
+
+def is_numeric(simulator: Simulator, effect: RobotEffect) -> bool:
+    """Whether an effect is of the simulator's own numerics: its step, how it holds commands."""
+    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
 
 
 def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:

@@ -80,6 +80,16 @@ class Settled:
         """Squares (N,) of what is left, whitened by the sensors' noise and the starts alone."""
         return self.covariances.whitener()(np.nan_to_num(self.linear.residual)) ** 2
 
+    @cached_property
+    def fine(self) -> np.ndarray:
+        """Rows (N,) of windows that did not diverge, and are not off for reasons of their own."""
+        return np.isfinite(self.linear.residual) & ~np.isin(self.linear.rows.window, list(self.wide))
+
+    @cached_property
+    def noise(self) -> float:
+        """The mean square of a row if there is noise alone."""
+        return self.covariances.floor() / max(int(np.isfinite(self.linear.residual).sum()), 1)
+
 
 @dataclass
 class Search:
@@ -112,7 +122,7 @@ class Search:
         """The best set: from nothing on, and where that leaves more than calibration does, from there
         back."""
         best = self._from(self.nothing(), tell)
-        if best.squares.sum() < LEAVES * best.covariances.floor():
+        if best.squares[best.fine].mean() < LEAVES * best.noise:
             return best
         tell("from the calibration")
         self.columns.clear()

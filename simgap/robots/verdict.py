@@ -67,8 +67,7 @@ def verdict_on(
 ) -> RobotVerdict:
     """The verdict, from the best set and all others that a search has fitted."""
     nothing = search.known[frozenset()]
-    fine = np.isfinite(best.linear.residual) & ~np.isin(best.linear.rows.window, list(best.wide))
-    floor = best.covariances.floor() * fine.sum() / max(np.isfinite(best.linear.residual).sum(), 1)
+    fine, floor = best.fine, best.noise * best.fine.sum()
     before, after = float(nothing.squares[fine].sum()), float(best.squares[fine].sum())
     over_noise = float(np.sqrt(after / max(floor, 1e-9)))
     without = {out: search.known.get(frozenset({*best.names} - {out})) for out in best.names}

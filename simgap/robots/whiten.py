@@ -72,12 +72,6 @@ class Source:
     rows: np.ndarray
     covariance: np.ndarray
 
-    @property
-    def trace(self) -> float:
-        """The sum of its variances."""
-        own = self.covariance
-        return float(own.sum() if own.ndim == 1 else np.trace(own))
-
     def add(self, total: np.ndarray, variance: float) -> None:
         """Add it to a block's covariance, in place."""
         total[self._where] += variance * self.covariance
@@ -120,13 +114,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Whitener:
-    """Inverse lower Cholesky factors of blocks of rows; by block half the log determinant of their
-    covariance, and the mean square of a row, whitened: less than 1 where repeats tell one thing together."""
+    """Inverse lower Cholesky factors of blocks of rows, and by block half the log determinant of their
+    covariance."""
 
     blocks: tuple[np.ndarray, ...]
     inverses: tuple[np.ndarray, ...]
     half_logs: tuple[float, ...]
-    told: tuple[float, ...]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Rows (N,) or columns (N, k), whitened; rows of diverged windows become 0."""
@@ -143,13 +136,6 @@ class Whitener:
     def half_log_dets(self, group: np.ndarray) -> np.ndarray:
         """The same by group of rows; `group` (N,), blocks are within groups."""
         return np.bincount(group[[block[0] for block in self.blocks]], self.half_logs, group.max() + 1)
-
-    def counted(self, rows: int) -> np.ndarray:
-        """By how much each of so many rows counts (N,)."""
-        out = np.ones(rows)
-        for block, told in zip(self.blocks, self.told, strict=True):
-            out[block] = told
-        return out
 
 
 @dataclass(frozen=True)
@@ -212,12 +198,11 @@ class Covariances:
         factor = [1.0 if wide is None else wide.get(block.window, 1.0) for block in self.blocks]
         return Whitener(
             tuple(block.rows for block in self.blocks),
-            tuple(dtrtri(one, lower=1)[0] / f**0.5 for (one, _, _), f in zip(made, factor, strict=True)),
+            tuple(dtrtri(one, lower=1)[0] / f**0.5 for (one, _), f in zip(made, factor, strict=True)),
             tuple(
                 h + 0.5 * b.rows.size * np.log(f)
-                for (_, h, _), b, f in zip(made, self.blocks, factor, strict=True)
+                for (_, h), b, f in zip(made, self.blocks, factor, strict=True)
             ),
-            tuple(told for _, _, told in made),
         )
 
     def off_alone(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
@@ -237,8 +222,8 @@ class Covariances:
         return found
 
 
-def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float, float]:
-    """A block's factor, half log determinant, and the mean square of its whitened rows.
+def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float]:
+    """A block's factor and half log determinant.
 
     Of G repeats with one discrepancy d of covariance K between them, what they tell together of anything that
     they have in common is what each tells by N + G K, added up: (N / G + K)^-1 = G (N + G K)^-1. The mean has
@@ -249,12 +234,9 @@ def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float
     factor = _factored(block.covariance(shared))
     half = float(np.log(np.diag(factor)).sum())
     if again == 1:
-        return factor, half, 1.0
-    plain = block.covariance()
-    apart = _factored(plain)
-    own = float(np.sum(solved_by(factor, apart) ** 2)) / len(plain)
-    share = 1 / again
-    return factor, share * half + (1 - share) * float(np.log(np.diag(apart)).sum()), share + (1 - share) * own
+        return factor, half
+    apart = float(np.log(np.diag(_factored(block.covariance()))).sum())
+    return factor, half / again + (1 - 1 / again) * apart
 
 
 @dataclass(frozen=True)
@@ -376,8 +358,8 @@ def solved_by(factor: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return out
 
 
-def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = None) -> Covariances:
-    """Covariances of all windows that did not diverge; `factor` (N,) multiplies the noise's sd."""
+def covariances(composed: Composed, linear: Linear) -> Covariances:
+    """Covariances of all windows that did not diverge."""
     kinds = {n: c.kind for n, c in composed.simulator.channels.items()}
     blocks = []
     free, repeats = bool(linear.starts), composed.repeats()
@@ -385,10 +367,9 @@ def covariances(composed: Composed, linear: Linear, factor: np.ndarray | None = 
         if mine.stop == mine.start or not np.isfinite(linear.residual[mine]).all():
             continue
         for rows in [np.arange(mine.start, mine.stop)] if free else _by_channel(linear, mine):
-            scale = 1.0 if factor is None else factor[rows]
             moved = [linear.starts[n][rows] * doubt for n, doubt in composed.windows[number].doubt.items()]
             start = np.array(moved).reshape(-1, rows.size).T
-            variance = linear.rows.variance[rows] * scale**2
+            variance = linear.rows.variance[rows]
             sources = _sources(linear, rows, kinds, free)
             blocks.append(
                 Block(rows, number, variance, start, sources, linear.rows.channel[rows], repeats[number])

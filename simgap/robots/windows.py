@@ -79,20 +79,6 @@ def cut(
     return out
 
 
-def alike(
-    simulator: Simulator,
-    recordings: Sequence[Recording],
-    windows: Sequence[Window],
-    noise: Mapping[str, float],
-) -> list[Window]:
-    """The same windows of other recordings of the same times, begun as those have it."""
-    jumped = [jumps(simulator, log) for log in recordings]
-    return [
-        w if w.start is None else _begun(simulator, recordings[w.log], w, noise, jumped[w.log])
-        for w in windows
-    ]
-
-
 def _begun(
     simulator: Simulator, log: Recording, window: Window, noise: Mapping[str, float], jumped: np.ndarray
 ) -> Window:

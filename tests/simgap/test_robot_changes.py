@@ -11,7 +11,7 @@ from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Change, Changes, _unlike, by_chance, changes, jackknife, widened
+from simgap.robots.changes import Changes, _unlike, added_by_drift, by_chance, changes, jackknife
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -165,19 +165,19 @@ def test_leaving_one_out_of_means_is_welchs_test():
     assert np.isinf(jackknife([without[0], np.zeros((1, 1))])[0][0])  # of one unit nothing is sure
 
 
-def test_a_size_takes_in_what_a_second_small_change_would_do_to_it():
-    left = np.array([1.0, 1.0, 1.1, 0.9])
-
-    def change(effects: tuple[str, ...], *x: float) -> Change:
-        x_ = np.array(x)
-        return Change(effects, x_, np.full(x_.size, 0.01), np.full(x_.size, 8.0), 0.0, left, np.zeros(0))
-
-    one = change(("gain",), 0.7)
-    pairs = [change(("gain", "lag"), 0.73, 1.0), change(("mass", "gain"), 0.4, 0.1)]
-    found = widened(one, pairs, {"mass"})  # what could stand in its place says nothing of its size
-    weight = 0.5  # as good from motion to motion: by chance in half of cases
-    assert found.sd[0] == pytest.approx(np.sqrt(0.01**2 + weight * 0.03**2 / (1 + weight)))
-    assert widened(one, pairs[1:], {"mass"}) is one
+def test_a_size_takes_in_that_all_else_may_have_drifted():
+    """Drifts as parameters of their own, with the prior that they have, leave the same variances."""
+    rng = np.random.default_rng(0)
+    p, k, drift = 3, 2, np.array([0.1, 0.0, 0.4])
+    before, new = (a.T @ a for a in (rng.normal(size=(6, p)), rng.normal(size=(9, p + k))))
+    total = new.copy()
+    total[:p, :p] += before
+    whole = np.zeros((2 * p + k, 2 * p + k))  # OLD's theta, changes, drifts
+    whole[: p + k, : p + k] = total
+    whole[: p + k, p + k :] = new[:, :p]
+    whole[p + k :] = np.hstack([new[:p], new[:p, :p] + np.diag(1 / np.maximum(drift, 1e-12))])
+    wanted = np.diag(np.linalg.inv(whole))[p : p + k] - np.diag(np.linalg.inv(total))[p:]
+    np.testing.assert_allclose(added_by_drift(total, before, drift)[p:], wanted, rtol=1e-6)
 
 
 def test_gains_from_motion_to_motion_are_judged_by_student():

@@ -79,10 +79,5 @@ def test_where_the_model_is_right_repeats_count_each():
     made = composed(np.zeros((LOGS, T.size)), rng)
     linear = linearise(made, {}, ["size"])
     cov = covariances(made, linear)
-    assert set(cov.whitener().told) == {1.0}
     least = cov.whitener(Discrepancy({"y": 1e-9}))
-    assert min(least.told) == pytest.approx(1.0) and least.half_log_det == pytest.approx(
-        cov.whitener().half_log_det
-    )
-    large = cov.whitener(Discrepancy({"y": 100.0}))
-    assert max(large.told) == pytest.approx(1 / LOGS, rel=0.01)
+    assert least.half_log_det == pytest.approx(cov.whitener().half_log_det)
