@@ -18,7 +18,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.robust import bridged
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
-from simgap.effects import catalogue, fitted, forms_of, free_parameters
+from simgap.effects import catalogue, forms_of, free_parameters
 from simgap.effects.base import World
 from simgap.gap.sensor_noise import (
     between_samples,
@@ -72,7 +72,7 @@ def shown(names: Sequence[str]) -> list[str]:
     Offsets, drift, drag and the tool's own mass are not among them: free motion takes them out
     (`hmmseg.hand.tool`).
     """
-    return [n for n in names if fitted()[n].wrist]
+    return [n for n in names if catalogue()[n].wrist]
 
 
 def shown_forms(names: Sequence[str]) -> list[str]:

@@ -13,8 +13,7 @@ from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from hmmseg.contact.decompose import PROPERTIES
 from simgap.bounded import least
 from simgap.effect import Parameter
-from simgap.effects import fitted as known_effects
-from simgap.effects import free_parameters, name_of
+from simgap.effects import catalogue, free_parameters, name_of
 from simgap.effects.base import HandEffect, World
 from simgap.gap.frame import CHANNELS, Frame
 from simgap.gap.residuals import contact, residuals
@@ -84,7 +83,7 @@ class Slot:
 def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
     """Slots of all deterministic effects in order of correction, and the number of columns."""
     out, at = [], num_properties
-    known = [e for e in known_effects().values() if e.correct is not None]
+    known = [e for e in catalogue().values() if e.correct is not None]
     for effect in sorted(known, key=lambda e: (e.stage, e.name)):
         out.append(Slot(effect, at))
         at += len(effect.parameters)
@@ -170,7 +169,7 @@ def _bare(frame: Frame, centre: np.ndarray, sd: np.ndarray, measured: np.ndarray
 
 def free_of(key: str) -> list[Parameter]:
     """The free parameters of an effect's form, in the order of its columns."""
-    return [p for p in known_effects()[name_of(key)].parameters.values() if p.name in free_parameters(key)]
+    return [p for p in catalogue()[name_of(key)].parameters.values() if p.name in free_parameters(key)]
 
 
 def neutral(given: Problem) -> np.ndarray:

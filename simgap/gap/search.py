@@ -17,7 +17,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.problem import Gap
 from simgap.bounded import least
-from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
+from simgap.effects import catalogue, forms_of, free_parameters, name_of
 from simgap.effects.base import tips
 from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
@@ -47,14 +47,14 @@ PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be 
 
 
 def candidate_names(rig: Rig, excluded: Sequence[str] = (), forced: Sequence[str] = ()) -> list[str]:
-    """The effects to choose from, decoys included, or that are `forced`: a Cartesian hand has no joints."""
-    chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced} | decoys()
+    """The effects to choose from, or that are `forced`: a Cartesian hand has no joints."""
+    chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced}
     return [n for n, e in chosen.items() if n not in excluded and (rig.jointed or e.acts_on != "kinematics")]
 
 
 def shifting(names: Sequence[str]) -> list[str]:
     """Keys of all forms of those effects that shift signals (the others only scatter them)."""
-    return [key for n in names if fitted()[n].correct is not None for key in forms_of(n)]
+    return [key for n in names if catalogue()[n].correct is not None for key in forms_of(n)]
 
 
 def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
@@ -274,7 +274,7 @@ def _anew(
 
     Late, slow or soft contacts displace boundaries, and what displaces fingers may look like a dropped block.
     """
-    best = _known(fits)[0]
+    best = min(fits, key=lambda f: f.cost)
     gained = healthy.cost - best.cost
     if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
         return None
@@ -303,11 +303,6 @@ def _recovered(
     return replace(again, trials=fit_now) if len(fit_now) > len(aligned.trials) else None
 
 
-def _known(fits: Sequence[Fitted]) -> list[Fitted]:
-    """The candidates of the catalogue, best first; decoys fit anything and move no boundary."""
-    return sorted((f for f in fits if name_of(f.effects[0]) not in decoys()), key=lambda f: f.cost)
-
-
 def _aligned_all(
     failed: AlignedTrials, actual: dict | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
@@ -322,7 +317,7 @@ def _aligned_all(
         healthy = fit(given, Start((), neutral(given)))
         if healthy.cost > HOPELESS * given.size:
             break
-        found = _known([best_fit(given, key, healthy) for key in keys])
+        found = sorted((best_fit(given, key, healthy) for key in keys), key=lambda f: f.cost)
         for f in found[:ATTEMPTS]:
             again = realigned(aligned, given, f)
             if 2 * sum(t.segmentation.complete for t in again.trials) > len(again.trials):
