@@ -19,9 +19,10 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
   a free swing tells mass from length only because slower motions know the friction. An explanation is ruled
   out where it is less likely than RIVAL of the best, and the odds are worth no more than what a second
   small change of anything gains beyond the best: as much is the model's own error.
-* *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and that
-  predicts motions of NEW that took no part better, by a share that matters; where OLD never made these
-  motions, so that what a model gets wrong in them is not known, from motion to motion, by Student's t.
+* *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and takes a
+  share that matters, of the energy and of what motions of NEW that took no part are missed by. Where OLD
+  never made these motions, what a model gets wrong in them is not known: then this must hold from motion to
+  motion, and delta be that far from nothing, both by Student's t.
 * *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
   to motion, and most of that is left.
 
@@ -68,9 +69,7 @@ LADDER = (-1.2, -0.6, -0.25, 0.25, 0.6, 1.2)  # numerics: changes to rank candid
 RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: from which one is fitted; a free swing has narrow valleys
 TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted exactly, of those joined in pairs, and with them
 CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
-MATTERS = (
-    0.1  # chosen: of what is missed of new logs, what a change must take to be more than a day's difference
-)
+MATTERS = 0.1  # chosen: of what is missed of new logs, what a change must take; less a day may make
 DRIFT = 0.1  # prior: of a parameter, or of its usual size: by how much what is fitted differs in NEW
 RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
 UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
@@ -90,6 +89,12 @@ class Change:
     energy: float
     left: np.ndarray
     theta: np.ndarray
+
+    @property
+    def by_chance(self) -> float:
+        """How often its surest coordinate is as far from nothing where nothing changed."""
+        each = 2 * student.sf(np.abs(self.x) / np.maximum(self.sd, 1e-12), self.freedom)
+        return min(1.0, self.x.size * float(each.min()))
 
 
 class Comparison:
@@ -232,9 +237,10 @@ class Comparison:
     def needed(self, change: Change, beyond: Change) -> bool:
         """Whether an explanation is one that a simpler one cannot do without (see above)."""
         shares = 1 - change.left / np.maximum(beyond.left, 1e-12)
-        if self.chance(change, beyond) >= CHANGED or shares.mean() < MATTERS:
+        taken = min(float(shares.mean()), 1 - change.energy / beyond.energy)
+        if self.chance(change, beyond) >= CHANGED or taken < MATTERS:
             return False
-        return self.paired or by_chance(shares) < CHANGED
+        return self.paired or max(by_chance(shares), len(self.candidates) * change.by_chance) < CHANGED
 
     def searched(self) -> list[Change]:
         """Nothing, the most promising single changes, and pairs about the best of them."""
