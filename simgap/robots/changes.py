@@ -22,7 +22,8 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
 * *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and takes a
   share that matters, of the energy and of what motions of NEW that took no part are missed by. Where OLD
   never made these motions, what a model gets wrong in them is not known: then this must hold from motion to
-  motion, and delta be that far from nothing, both by Student's t.
+  motion, and delta be that far from nothing, both by Student's t. A second change is sought only where the
+  first fits NEW's logs worse than OLD's motions are predicted.
 * *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
   to motion, and most of that is left.
 
@@ -220,10 +221,22 @@ class Comparison:
         """Changes to begin a fit from: of one coordinate many."""
         return [np.zeros(x.size)] if x.size > 1 else [np.array([r]) for r in RUNGS]
 
-    def excess(self, change: Change) -> np.ndarray:
-        """By how much more each motion of NEW is missed (M,) than OLD's, the same one where OLD made all."""
+    @property
+    def missed(self) -> np.ndarray:
+        """How each motion of NEW would be missed (M,) by OLD's others: as OLD's own, if OLD made all, or as
+        its mean."""
+        old = self.old.missed
         mine = np.searchsorted(self.old.units, self.runs.units)
-        return change.left - (self.old.missed[mine] if self.paired else self.old.missed.mean())
+        return old[mine] if self.paired else np.full(mine.size, old.mean())
+
+    def excess(self, change: Change) -> np.ndarray:
+        """By how much more each motion of NEW is missed (M,) than OLD's."""
+        return change.left - self.missed
+
+    def leaves(self, change: Change) -> bool:
+        """Whether NEW's logs are fitted worse than OLD's motions are by fits that did not see them."""
+        count = np.bincount(np.searchsorted(self.runs.units, self.runs.unit))
+        return change.energy > float(count @ self.missed) / self.old.dependence
 
     @property
     def paired(self) -> bool:
@@ -260,7 +273,7 @@ class Comparison:
             pairs[frozenset((best[0].effects[0], name))] = (best[0], name, scan[name][1])
         for one, two in itertools.combinations(best, 2):
             pairs.setdefault(frozenset((*one.effects, *two.effects)), (one, two.effects[0], two.x))
-        more = self.excess(best[0]).mean() > 0  # else no second change is sought, only what it would do
+        more = self.leaves(best[0])  # else no second change is sought, only what it would do
         both = [
             self.fit(
                 (*one.effects, name),
@@ -515,8 +528,8 @@ def _concluded(
     every = sorted(tried[1:], key=lambda c: c.energy)
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
     best = next((c for c in singles if found.needed(c, nothing)), nothing)
-    left = best.effects and found.excess(best).mean() > 0  # more than of old logs
-    more = next((c for c in pairs if left and found.needed(c, best)), best)
+    left = pairs if best.effects and found.leaves(best) else ()
+    more = next((c for c in left if found.needed(c, best)), best)
     slack = max((best.energy - c.energy for c in pairs if {*best.effects} < {*c.effects}), default=0.0)
     best, slack = more, max(slack, 0.0) if more is best else 0.0
     least = best.energy + slack
