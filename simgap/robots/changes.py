@@ -199,7 +199,7 @@ class Comparison:
         x = z[p:]
         schur = total[p:, p:] - total[p:, :p] @ np.linalg.solve(total[:p, :p], total[:p, p:])
         occam = float(np.sum(np.log(np.pi * (1 + x**2)))) - 0.5 * k * np.log(2 * np.pi)
-        occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence)[1]) if k else 0.0
+        occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence + np.eye(k))[1]) if k else 0.0
         energy = self.cost(z, of, mine) / self.old.dependence + occam
         return Change(effects, x, sd, freedom, energy, left, z[:p])
 
